@@ -129,8 +129,8 @@ class SeenLines(NamedTuple):
 
         The normal obeys n.a = -R, n.b = -R, n.n = 1. Differentiating these three,
         ``[a b n]^T dn = (-dR - n.da, -dR - n.db, 0)``. With ``v = w + (sine / cosine) m``, which is
-        square to u and n and has v.a = v.b = distance, the solution is
-        ``dn = u (n.da - n.db) / length + v ((before n.db - behind n.da) / length - dR) / distance``.
+        square to u and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) /
+        length + v ((before n.db - behind n.da) / length - dR) / distance``.
         """
         found = edge_planes(self.distance, radius, SIDE_SIGNS[side])
         sine, cosine = (x[..., None] for x in found)

@@ -14,7 +14,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import Eliminated, divisions, eliminated
+from pkmcal.solver import Eliminated, divisions, eliminated, flat
 
 EDGES, POSES, READINGS = range(3)
 """Kinds of rows in the axes of :class:`KindSums`."""
@@ -59,7 +59,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
             normal[:, k] += square
             for m, (others, beside, _) in enumerate(kinds):
                 own[:, k, m] += np.sum(squares * others, axis=(1, 2, 3))
-                cross[:, k, m] += _flat(along).mT @ _flat(beside)
+                cross[:, k, m] += flat(along).mT @ flat(beside)
         chi2 += _chi2(part, rows.value, by_reading)
     return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
 
@@ -80,14 +80,9 @@ def _of_kinds(
             _readings(problem, found.rows[:, :, :equations], by_reading),
         ),
     ):
-        flat = _flat(rows)
-        out.append((part.mT @ part, part.mT @ rows, flat.mT @ flat))
+        every = flat(rows)
+        out.append((part.mT @ part, part.mT @ rows, every.mT @ every))
     return tuple(out)
-
-
-def _flat(rows: Array) -> Array:
-    """Rows (B, K, r, n) of all configurations, (B, K r, n)."""
-    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:

@@ -74,7 +74,7 @@ class _Turn(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Integers, turn: Array) -> _Turn:
-        """Of strips with these columns (groups, w); turn (width, na) from all columns to unknowns."""
+        """Of strips with these columns (groups, w); turn (width, na) from all columns."""
         used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
         most = max((len(own) for own in used), default=0)
         columns = np.full((len(used), most), turn.shape[1])

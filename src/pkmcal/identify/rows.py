@@ -25,10 +25,11 @@ from itertools import pairwise
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
 from pkmcal.geometry.batches import NEXT
+from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
 from pkmcal.geometry.rigid import dot, inverse, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
@@ -40,6 +41,7 @@ PERFECT = 1e-6
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
 Item = TypeVar("Item", covariant=True)
+Scalar = TypeVar("Scalar", bound=np.generic)
 Numbers = TypeVar("Numbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
@@ -141,8 +143,8 @@ class EdgeViews:
     """What is seen of one leg in one photograph, N times: up to m blocks, whose edges are those of
     one line. Views of one leg from one station stand side by side.
 
-    configuration, leg, station, camera : (N,). place : (m, N) where each block is among those of all
-    configurations, (K G). present : (m, N) False for padding, which has another block's place.
+    configuration, leg, station, camera : (N,). place : (m, N) where each block is among those of
+    all configurations, (K G). present : (m, N) False for padding, which has another block's place.
     """
 
     configuration: Integers
@@ -152,7 +154,7 @@ class EdgeViews:
     place: Integers
     present: Booleans
 
-    def taken(self, numbers: Array, axis: int = 0) -> Array:
+    def taken(self, numbers: NDArray[Scalar], axis: int = 0) -> NDArray[Scalar]:
         """Numbers of the blocks (..., K, G, ...) by view, (..., m, N, ...); axis : that of K."""
         shape = numbers.shape
         flat = numbers.reshape(*shape[:axis], shape[axis] * shape[axis + 1], *shape[axis + 2 :])
@@ -276,8 +278,9 @@ class EdgeRows:
     answer to all else. Arrays have the views (B, N) last, or the blocks (B, m, N).
 
     rot_camera_base : (3, 3, ...) of the views' stations. ends : (2, 3, ...) base frame. lines : the
-    same from the camera's centre. frame : (3, 3, ...) their u, m and w. sine (...), cosine (g, ...) :
-    :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a leg passes through the camera.
+    same from the camera's centre. frame : (3, 3, ...) their u, m and w. sine (...) and cosine
+    (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a leg passes through the
+    camera.
     by_frame : (3, g, 2g, ...) rows by changes of the normals along u, m and w.
     """
 
@@ -299,7 +302,9 @@ class EdgeRows:
         data, views = self.data, self.blocks.views
         _, along_m, along_w = self.by_frame
         rows = np.sum(self.cosine[:, None] * along_m - self.sine * along_w, axis=0)
-        for by_unknown, unknown in zip(data.by_optics, state.optics.transpose(2, 0, 1), strict=True):
+        for by_unknown, unknown in zip(
+            data.by_optics, state.optics.transpose(2, 0, 1), strict=True
+        ):
             rows += by_unknown * unknown[:, None, views.camera]
         if state.shading.shape[-1]:
             rows += data.by_line * state.shading[:, views.taken(self.blocks.line)]
@@ -316,7 +321,9 @@ class EdgeRows:
         turn = along_w + (self.sine / self.cosine)[:, None] * along_m
         shift = along_u / line.length[:, None]
         turn = turn / line.distance[:, None]
-        before, behind = (x[:, None] for x in (line.before / line.length, line.behind / line.length))
+        before, behind = (
+            x[:, None] for x in (line.before / line.length, line.behind / line.length)
+        )
         return shift - behind * turn, before * turn - shift, -turn
 
     def by_ends(self) -> Array:
@@ -338,8 +345,8 @@ class EdgeRows:
 
     def ends_by(self, freedoms: slice) -> Array:
         """How both ends, a before b, answer in the base frame, (B, N, 6, d + n_a + n_b + 6): to the
-        configuration's own unknowns, to the parameters of either end, and to their station, which
-        moves the camera frame by (omega, tau) as if it moved the ends by ``R^T (omega x R p + tau)``.
+        configuration's own unknowns, to the parameters of either end, and to their station, whose
+        (omega, tau) acts as if it moved the ends p by ``R^T (omega x R p + tau)``.
         """
         ends, views = self.closure.ends, self.blocks.views
         own = ends.b_by_pose[..., freedoms]

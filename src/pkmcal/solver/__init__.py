@@ -17,6 +17,7 @@ from pkmcal.solver.elimination import (
     condensed,
     divisions,
     eliminate,
+    flat,
     own_factors,
     stacked,
 )
@@ -77,6 +78,7 @@ __all__ = [
     "eliminate",
     "eliminated",
     "final_weights",
+    "flat",
     "inverse_root",
     "minimise",
     "normal_inverse",

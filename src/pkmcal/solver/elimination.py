@@ -98,7 +98,7 @@ def left_of(by_shared: Array, q: Array, along: Array) -> Array:
     return out
 
 
-def _flat(rows: Array) -> Array:
+def flat(rows: Array) -> Array:
     """Rows (B, K, r, n) of all configurations, (B, K r, n); n may be none."""
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
@@ -109,7 +109,7 @@ def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
     """
     n_runs = len(reduced.rows)
     shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
-    rows = np.concatenate([_flat(reduced.rows), shared], axis=1)
+    rows = np.concatenate([flat(reduced.rows), shared], axis=1)
     value = [reduced.value.reshape(n_runs, -1), linear.shared_value]
     return rows, np.concatenate(value, axis=1)
 

@@ -204,7 +204,7 @@ def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solutio
 
 
 class _Divided(NamedTuple):
-    """A problem with its parts of some configurations each, small enough for the processor's cache."""
+    """A problem with its parts of some configurations, small enough for the processor's cache."""
 
     problem: LeastSquares
     parts: list[tuple[slice, LeastSquares]]

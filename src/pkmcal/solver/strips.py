@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, squares
+from pkmcal.solver.elimination import Linear, flat, squares
 from pkmcal.solver.ranks import unit_diagonal
 
 
@@ -95,7 +95,10 @@ class Compact(NamedTuple):
         """The same with the Jacobian in memory as a whole."""
         layout, numbers = self.strips
         (*batch, n_rows), d, na = self.value.shape, layout.n_own, layout.n_shared
-        by_own, by_shared = np.zeros((*batch, n_rows + 1, d)), np.zeros((*batch, n_rows + 1, na + 1))
+        by_own, by_shared = (
+            np.zeros((*batch, n_rows + 1, d)),
+            np.zeros((*batch, n_rows + 1, na + 1)),
+        )
         at = layout.configuration[:, None]
         by_own[:, at, layout.rows] = numbers[..., :d]
         for cut, columns in zip(layout.groups, layout.columns, strict=True):
@@ -104,9 +107,7 @@ class Compact(NamedTuple):
         by_own, by_shared = by_own[:, :, :-1], by_shared[:, :, :-1, :-1]
         rest = slice(n_rows - self.by_own.shape[2], None)
         by_own[:, :, rest], by_shared[:, :, rest] = self.by_own, self.by_shared
-        return Linear(
-            self.value, by_shared, by_own, self.usable, self.shared_value, self.shared_by
-        )
+        return Linear(self.value, by_shared, by_own, self.usable, self.shared_value, self.shared_by)
 
 
 def compact(linear: Linear) -> Compact:
@@ -121,8 +122,9 @@ def compact(linear: Linear) -> Compact:
 class Eliminated(NamedTuple):
     """Configurations with their own unknowns eliminated, ``by_own = Q R``.
 
-    inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), J the Jacobian by the shared unknowns;
-    fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns' squares.
+    inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), with J the Jacobian by the shared
+    unknowns. fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns'
+    squares.
 
     Of rows in no strip q (B, K, r', d), the reduced rows (B, K, r', na) and what of their residuals
     is left, (B, K, r').
@@ -153,13 +155,13 @@ class Eliminated(NamedTuple):
         units of the own unknowns' directions, of which edges see as much as of the shared ones.
         """
         half = self.along_strips - 0.5 * (self.own @ self.along)
-        both = _flat(half).mT @ _flat(self.along)
+        both = flat(half).mT @ flat(self.along)
         return self.normal - both - both.mT
 
     @property
     def rows_normal(self) -> Array:
         """The same of the rows in no strip."""
-        rows = _flat(self.rows)
+        rows = flat(self.rows)
         return rows.mT @ rows
 
 
@@ -206,7 +208,7 @@ def _group_sums(layout: StripLayout, numbers: Array) -> tuple[Array, Array]:
     n_runs, na, width = len(numbers), layout.n_shared, numbers.shape[-1]
     products = np.empty((n_runs, len(layout.groups), width, width))
     for k, cut in enumerate(layout.groups):
-        rows = _flat(numbers[:, cut])
+        rows = flat(numbers[:, cut])
         np.matmul(rows.mT, rows, out=products[:, k])
     sums = _summed(products, layout.shared_target, (n_runs, na + 2, na + 2))
     return sums[:, :na, :na], sums[:, :na, -1]
@@ -227,11 +229,6 @@ def _root(square: Array) -> Array:
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(square)
         return np.sqrt(np.maximum(values, 0.0))[..., None] * vectors.mT
-
-
-def _flat(rows: Array) -> Array:
-    """Rows (B, K, r, n) of all configurations, (B, K r, n)."""
-    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
 class NormalPart(NamedTuple):
@@ -260,8 +257,8 @@ class NormalPart(NamedTuple):
 def _part(rows: Compact, damping: Array) -> NormalPart:
     """A part's normal equations."""
     found = eliminated(rows, damping)
-    taken_up = _flat(found.along_strips).mT @ _flat(found.fitted[..., None])
-    left = _flat(rows.by_shared).mT @ _flat(found.left[..., None])
+    taken_up = flat(found.along_strips).mT @ flat(found.fitted[..., None])
+    left = flat(rows.by_shared).mT @ flat(found.left[..., None])
     gradient = found.slope + (left - taken_up)[..., 0]
     return NormalPart(
         found.strips_normal + found.rows_normal + rows.shared_by.T @ rows.shared_by,
