@@ -156,7 +156,7 @@ def test_traces_are_those_of_the_hat_matrix(name):
     every = np.eye(k * r).reshape(k, r, k * r)
     of = [every[:, edges], every[:, poses], pick @ every]
     of = [part.reshape(-1, k * r) for part in of]
-    used = problem._in_use()[0].ravel()
+    used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
     found = components(information(problem, state), weight)

@@ -12,8 +12,9 @@ from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver import (
     Compact,
     Linear,
-    Memory,
     Stop,
+    StripLayout,
+    Strips,
     column_space,
     damped_step,
     eliminate,
@@ -23,13 +24,12 @@ from pkmcal.solver import (
     minimise,
     normal_root,
     of_runs,
-    own_factors,
     put,
     soft_weights,
     stacked,
-    strips,
     take,
 )
+from pkmcal.solver.strips import normal_equations
 from test_identify_scene import guess, make_scene
 
 
@@ -110,50 +110,43 @@ def test_reduced_normal_is_the_schur_complement():
         np.testing.assert_allclose(reduced.gradient[run], g, atol=1e-11)
 
 
-def in_strips(rng, sharp, damping, runs=2, k=11, own=3, na=9):
-    """A problem whose first rows are two strips of four rows and three columns, one of them shared
-    and one of them none, before five rows of all columns that are ``sharp`` times as sharp."""
-    strips = np.array([[0, 2, 4], [3, 2, na]])
-    numbers, rest = rng.normal(size=(runs, 2, k, 4, 3)), sharp * rng.normal(size=(runs, k, 5, na))
-    by_own = rng.normal(size=(runs, k, 13, own))
-    by_own[:, :, 8:] *= sharp
+def in_strips(rng, sharp, runs=2, k=11, own=3, na=9):
+    """A problem whose first eight rows are two strips of four rows and three columns, one of them
+    shared and one of them none, before five rows of all columns that are ``sharp`` times as sharp.
+    One configuration has one strip alone, of one row and padding."""
+    configuration = np.concatenate([np.arange(k), np.arange(k - 1)])
+    rows = np.where(np.arange(2 * k - 1)[:, None] < k, np.arange(4), np.arange(4, 8))
+    rows[k - 1, 1:] = -1
+    groups, columns = [slice(0, k), slice(k, 2 * k - 1)], np.array([[0, 2, 4], [3, 2, na]])
+    layout = StripLayout(na, own, k, configuration, rows, groups, columns)
+    numbers = rng.normal(size=(runs, 2 * k - 1, 4, own + 3 + 1))
+    numbers[:, rows < 0] = 0
     value = rng.normal(size=(runs, k, 13))
-
-    def write(run, some, memory):
-        return numbers[run][:, some], rest[run, some]
-
+    value[:, :, :8] = 0
+    value[:, configuration[:, None], rows] = numbers[..., -1]
+    rest, by_own = rng.normal(size=(runs, k, 5, na)), rng.normal(size=(runs, k, 5, own))
     prior = rng.normal(size=(runs, 4)), rng.normal(size=(4, na))
-    rows = Compact(value, by_own, np.ones(value.shape, dtype=bool), *prior, na, strips, write)
-    return rows, np.full(runs, damping)
+    usable = np.ones(value.shape, dtype=bool)
+    return Compact(value, usable, *prior, Strips(layout, numbers), sharp * rest, sharp * by_own)
 
 
-@pytest.mark.parametrize("piece", [2**17, 13 * 3 * 4])
 @pytest.mark.parametrize("sharp", [1.0, 1e6])
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_products_of_strips_are_those_of_their_rows(monkeypatch, damping, sharp, piece):
-    """To the last digits, however sharp the rows after them, a few configurations at a time."""
-    monkeypatch.setattr(strips, "PIECE", piece)
-    rows, damping = in_strips(np.random.default_rng(12), sharp, damping)
+def test_products_of_strips_are_those_of_their_rows(damping, sharp):
+    """To the last digits, however sharp the rows in none of them."""
+    rows, damping = in_strips(np.random.default_rng(12), sharp), np.full(2, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
-    reduced = eliminate(linear, damping)
-    q = own_factors(rows.by_own, damping)[0]
-    q = q if damping.any() else q[:, :, :13]
-    wanted = reduced_normal(reduced)
-    for run in range(2):
-        pieces = list(eliminated(rows, run, q[run], reduced.value[run], Memory()))
-        assert len(pieces) == (1 if piece == 2**17 else 3)
-        assert [part.cut.start for part in pieces[1:]] == [part.cut.stop for part in pieces[:-1]]
-        assert (pieces[0].cut.start, pieces[-1].cut.stop) == (0, 11)
-        normal, slope = np.zeros((9, 9)), np.zeros(9)
-        for part in eliminated(rows, run, q[run], reduced.value[run], Memory()):
-            flat = part.rest.reshape(-1, 9)
-            normal += part.strips_normal + flat.T @ flat
-            slope += part.gradient
-        np.testing.assert_allclose(normal, wanted[run], atol=1e-9 * np.abs(wanted[run]).max())
-        slope += rows.shared_value[run] @ rows.shared_by
-        atol = 1e-9 * np.abs(reduced.gradient[run]).max()
-        np.testing.assert_allclose(slope, reduced.gradient[run], atol=atol)
+    reduced, found = eliminate(linear, damping), eliminated(rows, damping)
+    normal, wanted = found.strips_normal + found.rows_normal, reduced_normal(reduced)
+    np.testing.assert_allclose(normal, wanted, atol=1e-9 * np.abs(wanted).max())
+    whole = normal_equations([rows], damping)
+    np.testing.assert_array_equal(whole.matrix, normal + rows.shared_by.T @ rows.shared_by)
+    atol = 1e-9 * np.abs(reduced.gradient).max()
+    np.testing.assert_allclose(whole.gradient, reduced.gradient, atol=atol)
+    steps = whole.step(damping), damped_step(linear, damping)
+    np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(steps[0][1][0], steps[1][1], rtol=1e-8, atol=1e-10)
 
 
 def test_runs_of_a_batch_do_not_touch_each_other():

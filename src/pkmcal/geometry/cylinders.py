@@ -96,22 +96,68 @@ def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
     return np.stack([edge_normal(u_camera, m, radius, sign) for sign in SIDE_SIGNS], axis=-2)
 
 
+class SeenLines(NamedTuple):
+    """Lines from a to b before a camera at the origin, and how the edges around them move.
+
+    u : (..., 3) direction from a to b. m : unit moment, along ``a x u``. w : ``u x m``, towards the
+    line's nearest point. distance, length, before, behind : (...) m, with
+    ``a = distance w + before u`` and ``b = distance w + behind u``.
+    """
+
+    u: Array
+    m: Array
+    w: Array
+    distance: Array
+    length: Array
+    before: Array
+    behind: Array
+
+    @classmethod
+    def between(cls, a: Array, b: Array) -> SeenLines:
+        """Those of points (..., 3)."""
+        line = b - a
+        length = np.sqrt(dot(line, line))
+        u = line / length[..., None]
+        moment = cross(a, u)
+        distance = np.sqrt(dot(moment, moment))
+        m = moment / distance[..., None]
+        before = dot(a, u)
+        return cls(u, m, cross(u, m), distance, length, before, before + length)
+
+    def edges(self, radius: Array, side: Integers) -> EdgeNormals:
+        """Their edges' normals with exact derivatives.
+
+        The normal obeys n.a = -R, n.b = -R, n.n = 1. Differentiating these three,
+        ``[a b n]^T dn = (-dR - n.da, -dR - n.db, 0)``. With ``v = w + (sine / cosine) m``, which is
+        square to u and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) /
+        length + v ((before n.db - behind n.da) / length - dR) / distance``.
+        """
+        found = edge_planes(self.distance, radius, SIDE_SIGNS[side])
+        sine, cosine = (x[..., None] for x in found)
+        turn = (self.w + (sine / cosine) * self.m) / self.distance[..., None]
+        shift = self.u / self.length[..., None]
+        by_a = shift - (self.behind / self.length)[..., None] * turn
+        by_b = (self.before / self.length)[..., None] * turn - shift
+        return EdgeNormals(cosine * self.m - sine * self.w, by_a, by_b)
+
+
+def edge_planes(distance: Array, radius: Array, sign: Array) -> tuple[Array, Array]:
+    """Sine and signed cosine of the angle between an edge's plane and its axis's, so that the
+    normal is ``n = cosine m - sine w``, [B] eq. 3; NaN where the centre of projection lies inside
+    the cylinder. distance, radius : (...) m. sign : (...) of SIDE_SIGNS.
+    """
+    sine = radius / distance
+    return sine, sign * np.sqrt(np.where(np.abs(sine) < 1, 1 - sine**2, np.nan))
+
+
 def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> EdgeNormals:
     """One edge's normal and its exact derivatives, from two points of the axis.
 
     a, b : (..., 3) points of the axis in the camera frame, a towards the base (m).
-    radius, side : (...,) m, and 0 or 1.
-
-    The normal obeys n.a = -R, n.b = -R, n.n = 1. Differentiating these three,
-    ``[a b n]^T dn = (-dR - n.da, -dR - n.db, 0)``, so dn needs one 3x3 inverse, written
-    with cross products. Where the centre of projection is inside the cylinder the
+    radius, side : (...,) m, and 0 or 1. Where the centre of projection is inside the cylinder the
     values are NaN: the caller leaves such edges out with :func:`leg_is_seen`.
     """
-    u, m = line_through(a, b)
-    n = edge_normal(u, m, radius, SIDE_SIGNS[side])
-    # less the columns of the inverse of the matrix with rows a, b, n
-    less = -1 / dot(cross(a, b), n)[..., None]
-    return EdgeNormals(n, cross(b, n) * less, cross(n, a) * less)
+    return SeenLines.between(a, b).edges(radius, side)
 
 
 def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:

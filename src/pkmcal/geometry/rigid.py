@@ -14,6 +14,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 
+LEAST_ANGLE = 1e-150
+"""rad; below it a turn is none."""
+
 
 def skew(v: Array) -> Array:
     """Cross-product matrices: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
@@ -65,16 +68,12 @@ def of_components(*parts: Array) -> Array:
 def rotation(omega: Array) -> Array:
     """Rotation matrices Exp(omega) of rotation vectors (rad), (..., 3) -> (..., 3, 3).
 
-    Rodrigues' formula, with its series near zero so that the limit is exact.
+    Rodrigues' formula by half the angle; the least length keeps its limit at zero exact.
     """
     omega = np.asarray(omega, dtype=float)
-    angle2 = dot(omega, omega)[..., None, None]
-    small = angle2 < 1e-8
-    angle = np.sqrt(np.where(small, 1.0, angle2))
-    sinc = np.where(small, 1 - angle2 / 6, np.sin(angle) / angle)
-    cosc = np.where(small, 0.5 - angle2 / 24, 2 * (np.sin(angle / 2) / angle) ** 2)
-    k = skew(omega)
-    return np.eye(3) + sinc * k + cosc * (k @ k)
+    angle = np.sqrt(dot(omega, omega))[..., None]
+    half = skew(omega * (np.sin(angle / 2) / np.maximum(angle, LEAST_ANGLE)))
+    return np.eye(3) + 2 * np.cos(angle / 2)[..., None] * half + 2 * half @ half
 
 
 def axial(matrix: Array) -> Array:

@@ -143,6 +143,8 @@ def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -
         out[..., group.index, :] = group.carrier.by_frames(group.of(theta))
     out = out[..., :-1, :]
     for body, axes in enumerate(layout.turning):
+        if not axes.size:
+            continue
         at = slice(6 * body, 6 * body + 3)
         out[..., axes, at] = -skew(theta[..., axes])
         if drawing is not None:

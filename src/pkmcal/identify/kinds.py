@@ -14,7 +14,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import Eliminated, Memory, divisions, eliminated, own_factors
+from pkmcal.solver import Eliminated, divisions, eliminated, flat
 
 EDGES, POSES, READINGS = range(3)
 """Kinds of rows in the axes of :class:`KindSums`."""
@@ -42,7 +42,7 @@ class KindSums(NamedTuple):
 
 def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     """Those of a problem's rows at a state."""
-    n_runs, na, memory = len(state.z), problem.unknowns.count, Memory()
+    n_runs, na = len(state.z), problem.unknowns.count
     own, trace = np.zeros((n_runs, 3, 3)), np.zeros((n_runs, 3))
     cross, normal = np.zeros((n_runs, 3, 3, na, na)), np.zeros((n_runs, 3, na, na))
     every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3))
@@ -50,53 +50,49 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
-        q = own_factors(rows.by_own, np.zeros(n_runs))[0][..., : part.n_rows, :]
+        found = eliminated(rows, np.zeros(n_runs))
         values.append(rows.value)
-        for run in range(n_runs):
-            for piece in eliminated(rows, run, q[run], rows.value[run], memory):
-                flat = piece.rest.reshape(-1, na)
-                every[run] += piece.strips_normal + flat.T @ flat
-                kinds = _of_kinds(part, piece, q[run], by_reading[run])
-                for k, (squares, along, square) in enumerate(kinds):
-                    trace[run, k] += np.einsum("cii->", squares)
-                    normal[run, k] += square
-                    for m, (others, beside, _) in enumerate(kinds):
-                        own[run, k, m] += np.sum(squares * others)
-                        cross[run, k, m] += along.reshape(-1, na).T @ beside.reshape(-1, na)
-            chi2[run] += _chi2(part, rows.value[run], by_reading[run])
+        every += found.strips_normal + found.rows_normal
+        kinds = _of_kinds(part, found, by_reading)
+        for k, (squares, along, square) in enumerate(kinds):
+            trace[:, k] += np.einsum("bcii->b", squares)
+            normal[:, k] += square
+            for m, (others, beside, _) in enumerate(kinds):
+                own[:, k, m] += np.sum(squares * others, axis=(1, 2, 3))
+                cross[:, k, m] += flat(along).mT @ flat(beside)
+        chi2 += _chi2(part, rows.value, by_reading)
     return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
 
 
 def _of_kinds(
-    problem: Problem, piece: Eliminated, q: Array, by_reading: Array
+    problem: Problem, found: Eliminated, by_reading: Array
 ) -> tuple[tuple[Array, Array, Array], ...]:
-    """Of each kind in some configurations Q_k^T Q_k (k, d, d), Q_k^T A_k (k, d, na) and the sum of
-    A_k^T A_k (na, na); q (K, r, d) and by_reading (K, E) of all.
+    """Of each kind in some configurations Q_k^T Q_k (B, K, d, d), Q_k^T A_k (B, K, d, na) and the
+    sum of A_k^T A_k (B, na, na); by_reading (B, K, E).
     """
-    na, equations = piece.rest.shape[-1], problem.layout.n_equations
-    along = piece.along_strips - piece.own @ piece.along
-    out = [(piece.own, along, piece.strips_normal)]
-    after, slopes = q[piece.cut, problem.closure_rows.start :], by_reading[piece.cut]
+    equations = problem.layout.n_equations
+    along = found.along_strips - found.own @ found.along
+    out = [(found.own, along, found.strips_normal)]
     for part, rows in (
-        (after[:, equations:], piece.rest[:, equations:]),
+        (found.q[:, :, equations:], found.rows[:, :, equations:]),
         (
-            _readings(problem, after[:, :equations], slopes),
-            _readings(problem, piece.rest[:, :equations], slopes),
+            _readings(problem, found.q[:, :, :equations], by_reading),
+            _readings(problem, found.rows[:, :, :equations], by_reading),
         ),
     ):
-        flat = rows.reshape(-1, na)
-        out.append((part.mT @ part, part.mT @ rows, flat.T @ flat))
+        every = flat(rows)
+        out.append((part.mT @ part, part.mT @ rows, every.mT @ every))
     return tuple(out)
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
-    """Of the closures' rows (K, E, n) those of the readings, (K, m, n)."""
-    return joint_rows(problem.layout, by_reading[:, None], closures.mT).mT
+    """Of the closures' rows (B, K, E, n) those of the readings, (B, K, m, n)."""
+    return joint_rows(problem.layout, by_reading[:, :, None], closures.mT).mT
 
 
 def _chi2(problem: Problem, value: Array, by_reading: Array) -> Array:
-    """Sums of squares of each kind, (3,), of residuals (K, r)."""
+    """Sums of squares of each kind, (B, 3), of residuals (B, K, r)."""
     closures = problem.closure_rows
-    parts = value[:, : closures.start], value[:, closures.stop :]
-    readings = _readings(problem, value[:, closures, None], by_reading)
-    return np.array([np.sum(part**2) for part in (*parts, readings)])
+    readings = _readings(problem, value[..., closures, None], by_reading)[..., 0]
+    parts = value[..., : closures.start], value[..., closures.stop :], readings
+    return np.stack([np.sum(part**2, axis=(1, 2)) for part in parts], axis=-1)

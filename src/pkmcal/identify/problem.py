@@ -34,16 +34,18 @@ from pkmcal.identify.rows import (
     PoseBlocks,
     PoseData,
     PoseRows,
+    ViewData,
     by_noise,
     edge_rows,
     joint_rows,
     least_joint_noise,
+    placed,
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, by_own, closure, dense, on_tangents
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
+from pkmcal.solver import Compact, Linear, StripLayout, Strips, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -53,43 +55,34 @@ class _Evaluated(NamedTuple):
     """Residuals at a point, and what they were found from."""
 
     value: Array
+    of_edges: Array
     shared_value: Array
     closure: Closure
     edges: EdgeRows
     poses: PoseRows
 
 
-class _Strips(NamedTuple):
-    """The strips of L legs' edges, see :class:`pkmcal.solver.Compact`.
+class _Turn(NamedTuple):
+    """From a strip's columns, which are parameters, to the unknowns' where these differ.
 
-    parameters : (L, w) columns that are written, of ``width`` that there are. place : (L, width)
-    where each of them is among a strip's, the last place for what is none of its. turn : (L, w, w')
-    from these columns to the shared unknowns', where they differ. columns : (L, w') which of the
-    shared unknowns these are.
+    by : (groups, w, w') of the strips with the same columns. columns : (groups, w') which of the
+    shared unknowns they are.
     """
 
-    parameters: Integers
-    place: Integers
-    turn: Array | None
+    by: Array
     columns: Integers
 
     @classmethod
-    def of(cls, parameters: Integers, count: int, width: int, turn: Array | None) -> _Strips:
-        """Strips of these columns out of ``width``, of ``count`` shared unknowns; turn (width, na)
-        from all columns to the shared unknowns.
-        """
-        n_strips, w = parameters.shape
-        place = np.full((n_strips, width), w - 1)
-        np.put_along_axis(place, parameters, np.arange(w)[None], axis=1)
-        if turn is None:
-            return cls(parameters, place, None, parameters)
+    def of(cls, parameters: Integers, turn: Array) -> _Turn:
+        """Of strips with these columns (groups, w); turn (width, na) from all columns."""
         used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
         most = max((len(own) for own in used), default=0)
-        columns, turns = np.full((n_strips, most), count), np.zeros((n_strips, w, most))
+        columns = np.full((len(used), most), turn.shape[1])
+        by = np.zeros((*parameters.shape, most))
         for k, own in enumerate(used):
             columns[k, : len(own)] = own
-            turns[k, :, : len(own)] = turn[parameters[k]][:, own]
-        return cls(parameters, place, turns, columns)
+            by[k, :, : len(own)] = turn[parameters[k]][:, own]
+        return cls(by, columns)
 
 
 @dataclass(frozen=True)
@@ -211,73 +204,89 @@ class Problem:
         return self.compact(state).linear()
 
     def compact(self, state: BatchState) -> Compact:
-        """The same with the Jacobian written a few configurations at a time; each leg's edges are
-        a strip.
-        """
+        """The same with the edges of each view as a strip."""
         return self._rows(self._evaluated(state))
 
     def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses = self._edges(state, c), self._poses(state)
-        value = self._values(state, c, edges, poses)
-        return _Evaluated(value, self.prior_values(state) - self.prior_target, c, edges, poses)
+        of_edges = edges.value(state)
+        parts = (
+            _in_rows(placed(self.blocks, of_edges)[..., None]),
+            self._by_noise(c, c.value[..., None]),
+            _in_rows(poses.value[..., None]),
+        )
+        value = np.concatenate(parts, axis=2)[..., 0]
+        shared_value = self.prior_values(state) - self.prior_target
+        return _Evaluated(value, of_edges, shared_value, c, edges, poses)
 
     def _rows(self, found: _Evaluated) -> Compact:
         """The rows at a point, from what was needed of it for its residuals."""
-        value, shared_value, c, edges, poses = found
-        finite = np.isfinite(value)
-        usable = finite & self._in_use()
-        by_edges, own = self._of_edges(edges)
-        by_closures, by_pose = self._of_closures(c)
-        by_boards, by_board = self._of_boards(poses)
-        by_own = np.concatenate([own, by_pose, by_board], axis=2)
-        if not (finite.all() and np.isfinite(by_own.sum())):
-            by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
+        usable = np.isfinite(found.value) & self._in_use
+        by_closures, by_pose = self._of_closures(found.closure)
+        by_boards, by_board = self._of_boards(found.poses)
+        by_own = np.concatenate([by_pose, by_board], axis=2)
+        by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
+        return Compact(
+            np.where(usable, found.value, 0.0),
+            usable,
+            found.shared_value,
+            self.prior,
+            Strips(self._strips, self._of_edges(found.edges, found.of_edges)),
+            self._of_rest(by_closures, by_boards),
+            by_own,
+        )
 
-        def write(run: int, some: slice, memory: Memory) -> tuple[Array, Array]:
-            strips = self._strips_written([part[:, :, run] for part in by_edges], some, memory)
-            rest = self._rest_written(by_closures[run, some], by_boards[run, some], memory)
-            return strips, rest
-
-        value, count = np.where(usable, value, 0.0), self.unknowns.count
-        strips = self._strips.columns
-        return Compact(value, by_own, usable, shared_value, self.prior, count, strips, write)
-
-    def _strips_written(self, edges: list[Array], some: slice, memory: Memory) -> Array:
-        """Derivatives (L, k, n, w) of each leg's edges in some configurations of one run by the
-        columns of its strip, from those of the edges, (m, 2g, K, G) in parts of m.
+    def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
+        """The strips' numbers (B, N, n, d + w + 1), n = m 2g edges' rows in each view, from their
+        values (2g, B, m, N): by own unknowns, by the columns of :attr:`_strip_parameters`, and the
+        residuals. Zero where they are lost.
         """
-        strips, k, rows = self._strips, len(self.blocks.present[some]), self._strip_rows
-        shape = len(strips.parameters), k, rows, strips.parameters.shape[1]
-        out = memory.empty("strips", shape)
-        out.fill(0.0)
-        size = rows * shape[-1]  # of a configuration in a strip
-        strip = np.repeat(np.arange(shape[0]), self.blocks.leg.shape[1] // max(shape[0], 1))
-        begin = (k * strip - (some.start or 0)) * size
-        places, numbers = self._edge_places[:, :, some] + begin, out.reshape(-1)
-        first = 0
-        for part in edges:
-            numbers[places[first : first + len(part)]] = part[:, :, some]
-            first += len(part)
-        if strips.turn is None:
-            return out
-        flat = out.reshape(shape[0], k * rows, shape[-1])
-        width = strips.turn.shape[-1]
-        turned = memory.empty("turned", (*flat.shape[:2], width))
-        return np.matmul(flat, strips.turn, out=turned).reshape(*shape[:3], width)
+        data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
+        tube, line = self._own_columns
+        (n_rows, n_runs, m, n), c = value.shape, ends_by.shape[-1]
+        ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], u.n_breathing, 1]
+        of_ends, _, of_optics, of_line, of_breathing, residual = (
+            slice(stop - width, stop)
+            for width, stop in zip(ends, np.cumsum(ends).tolist(), strict=True)
+        )
+        out = np.empty((n_runs, n, m, n_rows, sum(ends)))
+        rows = out.reshape(n_runs, n, m * n_rows, sum(ends))
+        by_ends = edges.by_ends().reshape(n_runs, n, m * n_rows, 6)
+        np.matmul(by_ends, ends_by, out=rows[..., of_ends])
+        by_radius = _views_first(edges.by_radius())
+        for k in range(tube.shape[-1]):
+            np.multiply(by_radius, tube[..., k], out=out[..., c + k])
+        out[..., of_optics] = np.moveaxis(_views_first(data.by_optics), 0, -1)
+        if u.n_lines:
+            out[..., of_line] = _views_first(data.by_line)[..., None] * line
+        if u.n_breathing:
+            out[..., of_breathing] = np.moveaxis(_views_first(data.by_breathing), 0, -1)
+        out[..., residual] = _views_first(value)[..., None]
+        lost = ~np.isfinite(value)
+        if lost.any():
+            out[_views_first(lost)] = 0.0
+        if self._turn is None:
+            return rows
+        d = self.layout.own_motion.shape[1]
+        turned = np.empty((*rows.shape[:3], d + self._turn.columns.shape[1] + 1))
+        turned[..., :d], turned[..., -1] = rows[..., :d], rows[..., -1]
+        for cut, turn in zip(self._strips.groups, self._turn.by, strict=True):
+            np.matmul(rows[:, cut, :, d:-1], turn, out=turned[:, cut, :, d:-1])
+        return turned
 
-    def _rest_written(self, closures: Array, boards: Array, memory: Memory) -> Array:
-        """Derivatives (k, r', na) of closures and boards by all shared unknowns, from those of the
-        closures (k, E, n) and the boards (k, 6 G, na).
+    def _of_rest(self, closures: Array, boards: Array) -> Array:
+        """Derivatives (B, K, r', na) of closures and boards by all shared unknowns, from those of
+        the closures (B, K, E, n) and the boards (B, K, 6 G, na).
         """
-        count, k, equations = self.unknowns.count, len(closures), self.layout.n_equations
-        out = memory.empty("rest", (k, equations + boards.shape[1], self._width))
-        out.fill(0.0)
+        count, (*batch, equations, _) = self.unknowns.count, closures.shape
+        out = np.zeros((*batch, equations + boards.shape[2], self._width))
         each = np.arange(equations)[:, None]
-        out[:, each, self._column[self._closure_index]] = closures
+        out[:, :, each, self._column[self._closure_index]] = closures
         if self._choice is None:
-            out[:, :equations, self.unknowns.machine] = out[:, :equations, count:-1] @ self.free
-        out[:, equations:, :count] = boards
+            by_parameters = out[:, :, :equations, count:-1]
+            out[:, :, :equations, self.unknowns.machine] = by_parameters @ self.free
+        out[:, :, equations:, :count] = boards
         return out[..., :count]
 
     @cached_property
@@ -290,66 +299,78 @@ class Problem:
         """Configurations K and rows of each, r."""
         return len(self.blocks.present), self.n_rows
 
-    @property
-    def _strip_rows(self) -> int:
-        """Rows of a configuration in a strip, n."""
-        return self.closure_rows.start // max(len(self._strips.parameters), 1)
+    @cached_property
+    def _strips(self) -> StripLayout:
+        """The views as strips."""
+        views, columns = self.blocks.views, self._strip_parameters
+        n_rows = 2 * self.blocks.side.shape[-1]
+        place = n_rows * (views.place.T % max(self.blocks.present.shape[1], 1))
+        rows = np.where(views.present.T[..., None], place[..., None] + np.arange(n_rows), -1)
+        return StripLayout(
+            n_shared=self.unknowns.count,
+            n_own=self.layout.own_motion.shape[1],
+            count=len(self.blocks.present),
+            configuration=views.configuration,
+            rows=rows.reshape(len(rows), rows.shape[1] * n_rows),
+            groups=views.groups,
+            columns=columns if self._turn is None else self._turn.columns,
+        )
 
     @cached_property
-    def _strips(self) -> _Strips:
-        """The edges' strips: of each leg the parameters that its edges depend on, its lines, and
-        what all edges depend on; last what is no unknown.
+    def _strip_parameters(self) -> Integers:
+        """Of each group of views the columns (groups, w) that its edges' derivatives are by: the
+        parameters of both ends, the station, the radii, its camera's, its lines' and its breathing.
         """
-        u, layout, legs = self.unknowns, self.layout, np.unique(self.blocks.leg)
+        u, layout, views = self.unknowns, self.layout, self.blocks.views
+        first = np.array([cut.start for cut in views.groups], dtype=int)
+        leg, station, camera = views.leg[first], views.station[first], views.camera[first]
         none = self._width - 1
-        parts = [self._column[x[legs]] for x in (layout.a_index, layout.b_index)]
-        radii = np.full((len(legs), max((len(layout.radius[j]) for j in legs), default=0)), none)
-        own = np.zeros((layout.n_legs, u.n_lines + 1), dtype=bool)
-        if u.n_lines:
-            own[self.blocks.leg, self.blocks.line] = True  # -1, which is none, is the last
-        most = int(own[:, :-1].sum(axis=1).max(initial=0))
-        lines = np.full((len(legs), most), none)
-        for k, leg in enumerate(legs):
-            radii[k, : len(layout.radius[leg])] = self._column[layout.radius[leg]]
-            found = np.flatnonzero(own[leg, :-1])
-            lines[k, : len(found)] = u.shading.start + found
-        common = np.append(u.columns("stations", "optics", "breathing"), none)
-        parts += [radii, lines, np.tile(common, (len(legs), 1))]
-        return _Strips.of(np.concatenate(parts, axis=1), u.count, self._width, self._turn)
+        radii = np.full((len(first), self._own_columns[0].shape[-1]), none)
+        for k, one in enumerate(leg):
+            radii[k, : len(layout.radius[one])] = self._column[layout.radius[one]]
+        lines = np.full((len(first), self._own_columns[1].shape[-1]), none)
+        for own, found in zip(lines, self._lines, strict=True):
+            own[: len(found)] = u.shading.start + found
+        parts = [self._column[layout.a_index[leg]], self._column[layout.b_index[leg]]]
+        parts += [_columns(u.stations, station, 6), radii, _columns(u.optics, camera, u.n_optics)]
+        parts.append(lines)
+        if u.n_breathing:
+            parts.append(_columns(u.breathing, station, 1))
+        return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _turn(self) -> Array | None:
-        """(width, na) from the columns that are written to those of the shared unknowns, where
-        parameters are tied or are axes.
+    def _lines(self) -> list[Integers]:
+        """The lines that each group of views sees."""
+        views = self.blocks.views
+        if not self.unknowns.n_lines:
+            return [np.zeros(0, dtype=int) for _ in views.groups]
+        line = np.where(views.present, views.taken(self.blocks.line), -1)
+        return [np.unique(line[:, cut][line[:, cut] >= 0]) for cut in views.groups]
+
+    @cached_property
+    def _own_columns(self) -> tuple[Array, Array]:
+        """Which of its leg's radii and of its group's lines each block depends on: ones in
+        (N, m, 1, radii) and (N, m, 1, lines).
         """
+        blocks, views = self.blocks, self.blocks.views
+        used = views.taken(blocks.tube).T[..., None, None] == np.arange(
+            max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
+        )
+        number = np.zeros((*views.place.shape, max((len(own) for own in self._lines), default=0)))
+        for cut, own in zip(views.groups, self._lines, strict=True):
+            if own.size:
+                line = views.taken(blocks.line)[:, cut]
+                number[:, cut, : len(own)] = line[..., None] == own
+        return used.astype(float), number.swapaxes(0, 1)[:, :, None]
+
+    @cached_property
+    def _turn(self) -> _Turn | None:
+        """How strips' columns become unknowns, where parameters are tied or are axes."""
         if self._choice is not None:
             return None
-        out = np.eye(self._width, self.unknowns.count)
-        out[self.unknowns.count : -1, self.unknowns.machine] = self.free
-        return out
-
-    @cached_property
-    def _edge_places(self) -> Integers:
-        """Where the edges' derivatives are written in their own strip of all configurations,
-        (m, 2g, K, G).
-        """
-        u, blocks, layout = self.unknowns, self.blocks, self.layout
-        shape, leg, strips = blocks.station.shape, blocks.leg[0], self._strips
-        columns = [self._column[x[leg]] for x in (layout.a_index, layout.b_index)]
-        columns = [np.broadcast_to(x, (shape[0], *x.shape)) for x in columns]
-        columns.append(self._column[blocks.radius][..., None])
-        columns.append(_columns(u.stations, blocks.station, 6))
-        columns.append(_columns(u.optics, blocks.camera, u.n_optics))
-        if u.n_lines:
-            columns.append(_columns(u.shading, np.maximum(blocks.line, 0), 1))
-        if u.n_breathing:
-            columns.append(_columns(u.breathing, blocks.station, 1))
-        strip = np.searchsorted(np.unique(leg), leg)
-        column = strips.place[strip[:, None], np.concatenate(columns, axis=-1)]
-        (k, g), n = shape, 2 * blocks.side.shape[-1]
-        rows, width = self._strip_rows, strips.parameters.shape[1]
-        row = rows * np.arange(k)[:, None] + (n * np.arange(g)) % max(rows, 1)
-        return (row + np.arange(n)[:, None, None]) * width + np.moveaxis(column, -1, 0)[:, None]
+        turn = np.eye(self._width, self.unknowns.count)
+        turn[self.unknowns.count : -1, self.unknowns.machine] = self.free
+        return _Turn.of(self._strip_parameters, turn)
 
     @cached_property
     def _closure_index(self) -> Integers:
@@ -359,22 +380,6 @@ class Problem:
         if self.layout.shares_motors:
             return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
         return self.layout.closure_index
-
-    def _of_edges(self, edges: EdgeRows) -> tuple[list[Array], Array]:
-        """The edges' derivatives (m, 2g, B, K, G) by what :attr:`_edge_places` says, in parts of m,
-        and by the configuration's own unknowns, (B, K, G 2g, d); zero where they are lost.
-        """
-        parts = [*edges.by_machine, edges.by_station, _blocks_last(edges.by_optics)]
-        if self.unknowns.n_lines:
-            parts.append(_blocks_last(edges.by_line))
-        if self.unknowns.n_breathing:
-            parts.append(_blocks_last(edges.by_breathing))
-        own, lost = edges.by_own(self.layout.freedoms), edges.lost
-        # a leg through the camera; padding may lie anywhere, so that its need not be finite either
-        if lost.any():
-            own, *parts = (np.where(lost, 0.0, part) for part in (own, *parts))
-        parts = [np.broadcast_to(part, (len(part), *own.shape[1:])) for part in parts]
-        return parts, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
         """The closures' derivatives (B, K, E, n) by what :attr:`_closure_index` says, and by the
@@ -390,6 +395,9 @@ class Problem:
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
         """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
         u, boards = self.unknowns, self.pose_blocks
+        if not boards.present.size:
+            none = np.zeros((*poses.value.shape[:2], 0, u.count))
+            return none, none[..., : self.layout.own_motion.shape[1]]
         parts = [
             (_columns(u.stations, boards.station, 6), poses.by_station),
             (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
@@ -433,7 +441,8 @@ class Problem:
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        return Kinds(edges.value(state), plain._poses(state).value)  # noqa: SLF001
+        rows = placed(self.blocks, edges.value(state))
+        return Kinds(rows, plain._poses(state).value)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
@@ -456,8 +465,11 @@ class Problem:
         return x @ self.prior.T
 
     def _edges(self, state: BatchState, c: Closure) -> EdgeRows:
-        radius = self.theta(state)[:, self.blocks.radius]
-        return edge_rows(self.blocks, self.data, c, radius, state.T_camera_base)
+        return edge_rows(self.blocks, self._view_data, c, self.theta(state), state.T_camera_base)
+
+    @cached_property
+    def _view_data(self) -> ViewData:
+        return ViewData.of(self.blocks, self.data, breathe=self.unknowns.n_breathing > 0)
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(
@@ -480,15 +492,7 @@ class Problem:
         """Rows (B, K, E, n) of the closure in standard deviations."""
         return by_noise(self.layout, self.joint_noise[:, None, None], c.by_reading, rows)
 
-    def _values(self, state: BatchState, c: Closure, edges: EdgeRows, poses: PoseRows) -> Array:
-        """All rows of the configurations, (B, K, r)."""
-        parts = (
-            edges.value(state),
-            self._by_noise(c, c.value[..., None]),
-            poses.value,
-        )
-        return np.concatenate([part.reshape(*part.shape[:2], -1) for part in parts], axis=-1)
-
+    @cached_property
     def _in_use(self) -> Booleans:
         """Rows that are not padding and not weighted away, (B or 1, K, r)."""
         edges, poses = (
@@ -514,41 +518,49 @@ class Problem:
         """
         u, layout = self.unknowns, self.layout
         z = shared[:, u.machine]
-        by_moves = self.to_free @ move_generators(layout, self.theta(state), self.drawing)
-        moves = self.frames @ np.linalg.pinv(by_moves @ self.frames) @ z[..., None]
-        y, slides = moves[:, :12], moves[:, 12:, 0]
-
-        def less_frames(step: Array, by_frames: Array) -> Array:
-            """Steps (B, n, 6) of poses without what the frame change y does to them."""
-            return step - (by_frames @ y[:, None])[..., 0]
-
-        camera = shared[:, u.stations].reshape(len(z), u.n_stations, 6)
-        mount = shared[:, u.mounts].reshape(*state.T_mount.shape[:2], 6)
+        moves = z @ self._moves_of.T
+        y, slides = moves[:, :12], moves[:, 12:]
+        by_moves = move_generators(layout, self.theta(state), self.drawing) @ moves[..., None]
         motion = own @ layout.own_motion.T
-        on_platform = self.pose_blocks.on_platform
+        steps = (
+            shared[:, u.stations].reshape(len(z), u.n_stations, 6),
+            motion[..., :6],
+            shared[:, u.mounts].reshape(len(z), u.n_mounts, 6),
+        )
+        by_frames = (
+            station_generators(state.T_camera_base),
+            pose_generators(state.T_base_platform),
+            mount_generators(state.T_mount, self.pose_blocks.on_platform),
+        )
+        poses = np.concatenate([state.T_camera_base, state.T_base_platform, state.T_mount], axis=1)
+        less_frames = np.concatenate(by_frames, axis=1) @ y[:, None, :, None]
+        poses = perturb(poses, np.concatenate(steps, axis=1) - less_frames[..., 0])
+        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts
         inner = BatchState(
-            state.z + (z - (by_moves @ moves)[..., 0]),
-            perturb(
-                state.T_camera_base, less_frames(camera, station_generators(state.T_camera_base))
-            ),
-            perturb(
-                state.T_base_platform,
-                less_frames(motion[..., :6], pose_generators(state.T_base_platform)),
-            ),
+            state.z + z - by_moves[..., 0] @ self.to_free.T,
+            poses[:, :first_pose],
+            poses[:, first_pose:first_mount],
             state.optics + shared[:, u.optics].reshape(state.optics.shape),
-            perturb(
-                state.T_mount, less_frames(mount, mount_generators(state.T_mount, on_platform))
-            ),
+            poses[:, first_mount:],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
             state.breathing + shared[:, u.breathing],
             state.sizes + shared[:, u.sizes],
         )
-        return self._closed(state, self._in_frames(inner, y[..., 0], slides), shared, own)
+        return self._closed(state, self._in_frames(inner, y, slides), shared, own)
+
+    @cached_property
+    def _moves_of(self) -> Array:
+        """Frame changes and others (12 + n, nz) that a step of z makes, as far as they can, by
+        least squares at the drawing: what they leave to be added up is small in any case.
+        """
+        by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
+        return self.frames @ np.linalg.pinv(by_moves @ self.frames)
 
     def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
         """The state after exact frame changes y (B, 12) and others (B, n)."""
-        layout, e, f = self.layout, perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
+        layout = self.layout
+        e, f = perturb(np.eye(4), y.reshape(-1, 2, 6)).swapaxes(0, 1)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.drawing)
         return replace(
@@ -601,6 +613,6 @@ def _in_rows(parts: Array) -> Array:
     return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
 
 
-def _blocks_last(values: Array) -> Array:
-    """Derivatives (B, K, G, n, w) with the blocks last, (w, n, B, K, G)."""
-    return np.moveaxis(values, (-1, -2), (0, 1))
+def _views_first(numbers: Array) -> Array:
+    """Numbers (..., 2g, B, m, N) of edges by view, (..., B, N, m, 2g)."""
+    return np.moveaxis(numbers, (-1, -4), (-3, -1))

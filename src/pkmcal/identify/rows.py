@@ -21,14 +21,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.batches import NEXT
-from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
-from pkmcal.geometry.rigid import cross, dot, pose_difference, skew
+from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
+from pkmcal.geometry.rigid import dot, inverse, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import Closure
@@ -39,6 +41,7 @@ PERFECT = 1e-6
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
 Item = TypeVar("Item", covariant=True)
+Scalar = TypeVar("Scalar", bound=np.generic)
 Numbers = TypeVar("Numbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
@@ -86,8 +89,7 @@ def _among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
 @dataclass(frozen=True)
 class EdgeBlocks:
     """Where the edges are: K configurations of G blocks, padded; the same for all runs. A leg has
-    as many places as every other, side by side, in all configurations: its rows have the same
-    parameters, see :class:`pkmcal.solver.Compact`.
+    as many places as every other, side by side, in all configurations.
 
     Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
     fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
@@ -114,6 +116,56 @@ class EdgeBlocks:
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
         return _among(self, configurations, 0)
+
+    @cached_property
+    def views(self) -> EdgeViews:
+        """The same by views, padding left out."""
+        configuration, number = np.nonzero(self.present)
+        leg, station = self.leg[0, number], self.station[configuration, number]
+        order = np.lexsort((number, configuration, station, leg))
+        keys = np.stack([leg, station, configuration])[:, order]
+        begins = np.append(True, np.any(keys[:, 1:] != keys[:, :-1], axis=0))[: len(order)]
+        first = np.flatnonzero(begins)
+        view = np.cumsum(begins) - 1
+        slot = np.arange(len(order)) - first[view]
+        leg, station, configuration = keys[:, first]
+        place = (configuration * self.present.shape[1] + number[order[first]])[None]
+        place = np.repeat(place, int(slot.max(initial=-1)) + 1, axis=0)
+        place[slot, view] = (keys[2] * self.present.shape[1]) + number[order]
+        present = np.zeros(place.shape, dtype=bool)
+        present[slot, view] = True
+        camera = self.camera.ravel()[place[0]] if place.size else station
+        return EdgeViews(configuration, leg, station, camera, place, present)
+
+
+@dataclass(frozen=True)
+class EdgeViews:
+    """What is seen of one leg in one photograph, N times: up to m blocks, whose edges are those of
+    one line. Views of one leg from one station stand side by side.
+
+    configuration, leg, station, camera : (N,). place : (m, N) where each block is among those of
+    all configurations, (K G). present : (m, N) False for padding, which has another block's place.
+    """
+
+    configuration: Integers
+    leg: Integers
+    station: Integers
+    camera: Integers
+    place: Integers
+    present: Booleans
+
+    def taken(self, numbers: NDArray[Scalar], axis: int = 0) -> NDArray[Scalar]:
+        """Numbers of the blocks (..., K, G, ...) by view, (..., m, N, ...); axis : that of K."""
+        shape = numbers.shape
+        flat = numbers.reshape(*shape[:axis], shape[axis] * shape[axis + 1], *shape[axis + 2 :])
+        return flat.take(self.place, axis=axis)
+
+    @cached_property
+    def groups(self) -> list[slice]:
+        """Views of one leg from one station."""
+        changes = (np.diff(self.leg) != 0) | (np.diff(self.station) != 0)
+        cuts = [0, *(np.flatnonzero(changes) + 1).tolist(), len(self.leg)]
+        return [slice(*cut) for cut in pairwise(cuts) if cut[0] < cut[1]]
 
 
 @dataclass(frozen=True)
@@ -170,186 +222,197 @@ class EdgeData:
         """The whitening with the weights, (B or 1, K, G, 2g, 2g)."""
         return np.sqrt(self.weight)[..., None, None] * self.whiten
 
-    @cached_property
-    def by_optics(self) -> Array:
-        """Rows by the unknowns of their camera, (B or 1, K, G, 2g, w)."""
-        return self.weighed @ self.optics
 
-    @cached_property
-    def by_breathing(self) -> Array:
-        """Rows by their station's focal breathing, (B or 1, K, G, 2g, 1)."""
-        return self.weighed @ self.breathing
+@dataclass(frozen=True)
+class ViewData:
+    """The edges' numbers by view, whitened and weighted, with the blocks (B or 1, m, N) last: NumPy
+    then runs along rows of many views, and a number costs a nanosecond an operation.
 
-    @cached_property
-    def of_normals(self) -> Array:
-        """Rows by changes of the normals, whitening and weights included, (g, 3, 2g, ...) with
-        the blocks (B or 1, K, G) last.
-        """
-        shape = self.weighed.shape
-        split = self.weighed.reshape(*shape[:-1], shape[-1] // 2, 2)
-        return np.einsum("...rej,...eij->eir...", split, self.basis, order="C")
+    of_normals : (g, 3, 2g, ...) rows by changes of the normals, camera frame. by_optics : (w, 2g,
+    ...) by the unknowns of their camera. by_breathing : (1, 2g, ...) by their station's focal
+    breathing, none where nothing breathes. by_line : (2g, ...) by their line's shading, which moves
+    them as the camera's shift moves all; edges that are their station's only one of a line have
+    theirs among their noise. counts : (...) blocks that are there and have a weight. sign : (g, 1,
+    m, N) of the edges' sides.
+    """
+
+    of_normals: Array
+    by_optics: Array
+    by_breathing: Array
+    by_line: Array
+    counts: Booleans
+    sign: Array
+
+    @classmethod
+    def of(cls, blocks: EdgeBlocks, data: EdgeData, *, breathe: bool) -> ViewData:
+        """The numbers of all edges that are there; breathe : whether focal lengths do."""
+        views = blocks.views
+        counts = (views.taken(data.weight, 1) > 0) & views.present
+        white = np.where(counts[..., None, None], views.taken(data.weighed, 1), 0.0)
+        split = white.reshape(*white.shape[:-1], white.shape[-1] // 2, 2)
+
+        def rows(by_unknowns: Array) -> Array:
+            return np.einsum("...rq,...qw->wr...", white, by_unknowns, order="C")
+
+        by_optics = rows(views.taken(data.optics, 1))
+        by_line, by_breathing = by_optics[0], by_optics[:0]
+        if blocks.line.size:
+            line, sigma = views.taken(blocks.line), data.shading
+            own = sigma[:, line] if sigma.shape[1] > 1 else sigma[..., None]
+            by_line = by_line * np.where(line < 0, 0.0, own)
+        if breathe:
+            by_breathing = rows(views.taken(data.breathing, 1))
+        return cls(
+            np.einsum("...rej,...eij->eir...", split, views.taken(data.basis, 1), order="C"),
+            by_optics,
+            by_breathing,
+            by_line,
+            counts,
+            SIDE_SIGNS[np.moveaxis(views.taken(blocks.side), -1, 0)[:, None]],
+        )
 
 
 @dataclass(frozen=True)
 class EdgeRows:
-    """The edges' rows at a state, and how they answer to what they depend on.
+    """The edges' rows at a state, and how they answer to the two ends of their line; the ends
+    answer to all else. Arrays have the views (B, N) last, or the blocks (B, m, N).
 
-    In the arrays here the blocks (B, K, G) stand last and vectors' components before them: NumPy
-    then runs along rows of many blocks, and a block costs a few nanoseconds an operation.
-
-    T_camera_base : (3, 4, ...) of each block's station. a, b : (3, ...) both ends of their limbs
-    in the camera frame. normals : predicted there, [B] eq. 3, (g, 3, ...) each.
+    rot_camera_base : (3, 3, ...) of the views' stations. ends : (2, 3, ...) base frame. lines : the
+    same from the camera's centre. frame : (3, 3, ...) their u, m and w. sine (...) and cosine
+    (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a leg passes through the
+    camera.
+    by_frame : (3, g, 2g, ...) rows by changes of the normals along u, m and w.
     """
 
     blocks: EdgeBlocks
-    data: EdgeData
+    data: ViewData
     closure: Closure
-    T_camera_base: Array
-    a: Array
-    b: Array
-    normals: EdgeNormals
+    rot_camera_base: Array
+    ends: Array
+    lines: SeenLines
+    frame: Array
+    sine: Array
+    cosine: Array
+    by_frame: Array
 
     def value(self, state: BatchState) -> Array:
-        """Rows (B, K, G, 2g), zero where they do not count, with the state's cameras, lines and
+        """Rows (2g, B, m, N), zero where they do not count, with the state's cameras, lines and
         focal lengths.
         """
-        optics, shading, breathing = state.optics, state.shading, state.breathing
-        rows = np.moveaxis(self._whitened(self.normals.n), 0, -1)
-        rows = rows + (self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
-        if shading.shape[-1]:
-            rows = rows + self.by_line[..., 0] * shading[:, self.blocks.line, None]
-        if breathing.shape[-1]:
-            rows = rows + self.by_breathing[..., 0] * breathing[:, self.blocks.station, None]
-        return np.where((self.data.weight == 0)[..., None], 0.0, rows)
+        data, views = self.data, self.blocks.views
+        _, along_m, along_w = self.by_frame
+        rows = np.sum(self.cosine[:, None] * along_m - self.sine * along_w, axis=0)
+        for by_unknown, unknown in zip(
+            data.by_optics, state.optics.transpose(2, 0, 1), strict=True
+        ):
+            rows += by_unknown * unknown[:, None, views.camera]
+        if state.shading.shape[-1]:
+            rows += data.by_line * state.shading[:, views.taken(self.blocks.line)]
+        if state.breathing.shape[-1]:
+            rows += data.by_breathing[0] * state.breathing[:, None, views.station]
+        return np.where(data.counts, rows, 0.0)
 
-    @property
-    def by_optics(self) -> Array:
-        """By their camera's unknowns, (B or 1, K, G, 2g, w)."""
-        return self.data.by_optics
-
-    @property
-    def by_line(self) -> Array:
-        """By their line's shading, which moves them as the camera's shift moves all, (..., 1);
-        edges that are their station's only one of a line have theirs among their noise.
+    @cached_property
+    def _pulls(self) -> tuple[Array, Array, Array]:
+        """Rows by n.a, by n.b and by the radius, (g, 2g, ...) each: all derivatives are multiples
+        of these, see :meth:`~pkmcal.geometry.cylinders.SeenLines.edges`.
         """
-        sigma = self.data.shading
-        own = sigma[:, self.blocks.line] if sigma.shape[1] > 1 else sigma[:, :, None]
-        own = np.where(self.blocks.line < 0, 0.0, own)
-        return self.by_optics[..., :1] * own[..., None, None]
-
-    @property
-    def by_breathing(self) -> Array:
-        """By their station's focal breathing, (B or 1, K, G, 2g, 1)."""
-        return self.data.by_breathing
-
-    @property
-    def lost(self) -> Booleans:
-        """Where derivatives are not finite, (...)."""
-        return ~np.isfinite(np.sum(self._pulls[0] + self._pulls[1], axis=(0, 1)))
-
-    @property
-    def by_machine(self) -> tuple[Array, Array, Array]:
-        """By the parameters of both ends and by the radius, (n, 2g, ...) each."""
-        c = self.closure
-        radius = np.sum(self._pulls[0] + self._pulls[1], axis=0)[None]
-        return self._by_a(self._along(c.a_by)), self._by_b(self._along(c.b_by)), radius
-
-    @property
-    def by_station(self) -> Array:
-        """By their station's (omega, tau), (6, 2g, ...): both ends turn about its origin and go
-        with it, which moves n.p by ``omega . (arm x n) + tau . n``.
-        """
-        n, origin = self.normals.n, self.T_camera_base[:, 3]
-        arm, of_b = (
-            np.einsum("er...,j...->jer...", pull, end - origin)
-            for pull, end in zip(self._pulls, (self.a, self.b), strict=True)
+        (along_u, along_m, along_w), line = self.by_frame, self.lines
+        turn = along_w + (self.sine / self.cosine)[:, None] * along_m
+        shift = along_u / line.length[:, None]
+        turn = turn / line.distance[:, None]
+        before, behind = (
+            x[:, None] for x in (line.before / line.length, line.behind / line.length)
         )
-        arm += of_b
-        out = np.empty((6, arm.shape[2], *n.shape[2:]))
-        for k, (i, j) in enumerate(NEXT):
-            np.einsum("er...,e...->r...", arm[i], n[:, j], out=out[k])
-            out[k] -= np.einsum("er...,e...->r...", arm[j], n[:, i])
-        np.einsum("er...,ec...->cr...", self._pulls[0] + self._pulls[1], n, out=out[3:])
+        return shift - behind * turn, before * turn - shift, -turn
+
+    def by_ends(self) -> Array:
+        """By both ends in the base frame, a before b, (B, N, m, 2g, 6)."""
+        _, m, w = self.frame
+        normals = self.cosine[:, None] * m[:, :, None] - self.sine * w[:, :, None]
+        n_rows, n_runs, n_blocks, n_views = self.by_frame.shape[2:]
+        out = np.empty((n_runs, n_views, n_blocks, n_rows, 6))
+        for k, pulls in enumerate(self._pulls[:2]):
+            by_end = out.transpose(4, 3, 0, 2, 1)[3 * k : 3 * k + 3]
+            np.multiply(pulls[0], normals[0, :, None], out=by_end)
+            for pull, normal in zip(pulls[1:], normals[1:], strict=True):
+                by_end += pull * normal[:, None]
         return out
 
-    def by_own(self, freedoms: slice) -> Array:
-        """By the configuration's own unknowns (d, 2g, ...): the platform's freedoms of its six, and
-        what is internal.
+    def by_radius(self) -> Array:
+        """By their tube's radius, (2g, ...)."""
+        return np.sum(self._pulls[2], axis=0)
+
+    def ends_by(self, freedoms: slice) -> Array:
+        """How both ends, a before b, answer in the base frame, (B, N, 6, d + n_a + n_b + 6): to the
+        configuration's own unknowns, to the parameters of either end, and to their station, whose
+        (omega, tau) acts as if it moved the ends p by ``R^T (omega x R p + tau)``.
         """
-        platform = self.closure.platform
-        arm = _of_legs(platform.arm, 1, self.blocks)
-        by = np.concatenate([_moments(arm, self._n_base), self._n_base], axis=1)[:, freedoms]
-        if platform.by_internal.shape[-1]:
-            by = np.concatenate([by, self._along(platform.by_internal)], axis=1)
-        return self._by_b(by)
-
-    @cached_property
-    def _n_base(self) -> Array:
-        """The normals in the base frame, (g, 3, ...)."""
-        return np.einsum("ij...,ei...->ej...", self.T_camera_base[:, :3], self.normals.n)
-
-    def _along(self, by: Array) -> Array:
-        """Derivatives of the limbs' ends (B, K, L, 3, n), along the blocks' normals (g, n, ...)."""
-        own = _of_legs(by, 2, self.blocks)
-        return np.einsum("ej...,jc...->ec...", self._n_base, own)
-
-    @cached_property
-    def _pulls(self) -> tuple[Array, Array]:
-        """Rows by n.a and by n.b, (g, 2g, ...) each: all derivatives are multiples of these."""
-        return self._whitened_each(self.normals.by_a), self._whitened_each(self.normals.by_b)
-
-    def _by_a(self, along: Array) -> Array:
-        """Rows (n, 2g, ...) from changes of n.a (g, n, ...)."""
-        return np.einsum("er...,ec...->cr...", self._pulls[0], along)
-
-    def _by_b(self, along: Array) -> Array:
-        """Rows (n, 2g, ...) from changes of n.b (g, n, ...)."""
-        return np.einsum("er...,ec...->cr...", self._pulls[1], along)
-
-    def _whitened(self, vectors: Array) -> Array:
-        """basis^T v, whitened and weighted: (g, 3, ...) -> (2g, ...)."""
-        return np.einsum("eir...,ei...->r...", self.data.of_normals, vectors)
-
-    def _whitened_each(self, vectors: Array) -> Array:
-        """The same of each edge's vector alone, (g, 2g, ...)."""
-        return np.einsum("eir...,ei...->er...", self.data.of_normals, vectors)
+        c, views = self.closure, self.blocks.views
+        own, by_internal = c.b_by_pose[..., freedoms], c.platform.by_internal
+        if by_internal.shape[-1]:
+            own = np.concatenate([own, by_internal], axis=-1)
+        parts = (own, c.a_by, c.b_by)
+        shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
+        widths = [part.shape[-1] for part in parts]
+        legs = np.zeros((*shape, 6, sum(widths) + 6))
+        first, second = widths[0], widths[0] + widths[1]
+        legs[..., 3:, :first] = own
+        legs[..., :3, first:second] = c.a_by
+        legs[..., 3:, second:-6] = c.b_by
+        n_runs, count, n_legs = shape
+        flat = legs.reshape(n_runs, count * n_legs, *legs.shape[-2:])
+        out = flat.take(views.configuration * n_legs + views.leg, axis=1)
+        axes = self.rot_camera_base  # (camera's axis, base's component, ...)
+        for k, end in enumerate(self.ends):
+            rows = slice(3 * k, 3 * k + 3)
+            out[..., rows, -3:] = axes.transpose(2, 3, 1, 0)
+            for c, (i, j) in enumerate(NEXT):
+                turned = axes[:, i] * end[j] - axes[:, j] * end[i]
+                out[..., 3 * k + c, -6:-3] = turned.transpose(1, 2, 0)
+        return out
 
 
-def _of_legs(array: Array, components: int, blocks: EdgeBlocks) -> Array:
-    """Vectors or matrices of all legs (B, K, L, c) for the blocks' legs, (c, B, K, G)."""
-    return np.take(_components_first(array, components), blocks.leg[0], axis=-1)
-
-
-def _of_stations(array: Array, components: int, blocks: EdgeBlocks) -> Array:
-    """The same of all stations (B, S, c)."""
-    return np.take(_components_first(array, components), blocks.station, axis=-1)
+def placed(blocks: EdgeBlocks, rows: Array) -> Array:
+    """Rows (2g, B, m, N) of views at the places of their blocks, (B, K, G, 2g); zero elsewhere."""
+    views, (count, each), n_runs = blocks.views, blocks.present.shape, rows.shape[1]
+    out = np.zeros((n_runs, count * each + 1, len(rows)))
+    out[:, np.where(views.present, views.place, -1)] = np.moveaxis(rows, 0, -1)
+    return out[:, :-1].reshape(n_runs, count, each, len(rows))
 
 
 def _components_first(array: Array, components: int) -> Array:
     return np.moveaxis(array, range(-components, 0), range(components))
 
 
-def _moments(arm: Array, n: Array) -> Array:
-    """Moments ``arm x n`` of arms (3, ...) and the blocks' normals (g, 3, ...)."""
-    return np.moveaxis(cross(np.moveaxis(arm, 0, -1), np.moveaxis(n, 1, -1)), -1, 1)
-
-
 def edge_rows(
-    blocks: EdgeBlocks, data: EdgeData, c: Closure, radius: Array, T_camera_base: Array
+    blocks: EdgeBlocks, data: ViewData, c: Closure, theta: Array, T_camera_base: Array
 ) -> EdgeRows:
-    """Rows of the edges from the machine's closure (B, K), the blocks' radii (B, K, G) and the
-    stations (B, S, 4, 4).
+    """Rows of the edges from the machine's closure (B, K), its parameters (B, P) and the stations
+    (B, S, 4, 4).
     """
-    ends = np.broadcast_arrays(c.base.a, c.platform.b)
-    station = _of_stations(T_camera_base[..., :3, :], 2, blocks)
-    a, b = (
-        np.einsum("ij...,j...->i...", station[:, :3], _of_legs(end, 1, blocks)) + station[:, 3]
-        for end in ends
+    views = blocks.views
+    n_legs = c.layout.n_legs
+    both = np.stack(np.broadcast_arrays(c.base.a, c.platform.b))
+    both = np.ascontiguousarray(_components_first(both, 1)).reshape(3, 2, len(both[0]), -1)
+    ends = both.take(views.configuration * n_legs + views.leg, axis=-1)
+    rot = _components_first(T_camera_base[..., :3, :3], 2).take(views.station, axis=-1)
+    centre = _components_first(inverse(T_camera_base)[..., :3, 3], 1).take(views.station, axis=-1)
+    lines = SeenLines.between(*np.moveaxis(ends - centre[:, None], 0, -1))
+    frame = np.stack([np.moveaxis(axis, -1, 0) for axis in lines[:3]])
+    in_camera = np.einsum("ij...,fj...->fi...", rot, frame)
+    radius = theta.take(views.taken(blocks.radius), axis=-1)
+    return EdgeRows(
+        blocks,
+        data,
+        c,
+        rot,
+        np.moveaxis(ends, 0, 1),
+        lines,
+        frame,
+        *edge_planes(lines.distance[:, None], radius, data.sign),
+        np.einsum("eir...,fi...->fer...", data.of_normals, in_camera[:, :, :, None]),
     )
-    side = np.moveaxis(blocks.side, -1, 0)[:, None]
-    found = edge_normal_jacobians(np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1), radius, side)
-    normals = EdgeNormals(*(np.ascontiguousarray(np.moveaxis(x, -1, 1)) for x in found))
-    return EdgeRows(blocks, data, c, station, a, b, normals)
 
 
 def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
@@ -378,9 +441,8 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     rod that is read always moves with its reading, whose noise is one of lengths: told by its
     scale, it would be the same but for a thousandth, and change with an unknown.
     """
-    rod = np.append(layout.rod_reads[layout.closing], np.zeros(len(layout.angles), dtype=bool))
-    sigma = np.abs(by_reading) * joint_noise
-    sigma = np.where(rod, joint_noise, np.maximum(sigma, PERFECT))
+    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT)
+    sigma = np.where(layout.row_is_rod, joint_noise, sigma)
     return np.where(layout.row_motor >= 0, sigma, PERFECT)
 
 

@@ -186,9 +186,9 @@ def joint_values(layout: LimbLayout, theta: Array, readings: Array) -> Array:
 
 def scales(layout: LimbLayout, theta: Array) -> Array:
     """The scale of each leg's reading, (..., L), or (L,) where all are exact."""
-    if not layout.unsure_scales.any():
+    if not layout.some_scales_unsure:
         return layout.exact_scale
-    known = theta[..., np.where(layout.unsure_scales, layout.scale, 0)]
+    known = theta[..., layout.scale_or_first]
     return np.where(layout.unsure_scales, known, layout.exact_scale)
 
 
@@ -199,7 +199,8 @@ def rod_rates(layout: LimbLayout, theta: Array) -> Array:
 
 def _leg_readings(layout: LimbLayout, readings: Array) -> Array:
     """Readings (..., m) spread over the legs (..., L), zero for legs without one."""
-    return np.where(layout.actuated >= 0, readings[..., np.maximum(layout.actuated, 0)], 0.0)
+    own = readings[..., layout.reading_or_first]
+    return own if layout.all_read else np.where(layout.actuated >= 0, own, 0.0)
 
 
 def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
@@ -435,8 +436,12 @@ def by_own(layout: LimbLayout, rows: Closure | Rows) -> Array:
 def _side_by_side(parts: tuple[Array, ...]) -> Array:
     """Derivatives (..., E, n) joined along their last axis; leading axes broadcast."""
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    whole = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts]
-    return np.concatenate(whole, axis=-1)
+    out = np.empty((*shape, sum(part.shape[-1] for part in parts)))
+    first = 0
+    for part in parts:
+        out[..., first : first + part.shape[-1]] = part
+        first += part.shape[-1]
+    return out
 
 
 def along(u: Array, by: Array) -> Array:

@@ -119,6 +119,11 @@ class LimbLayout:
         return np.concatenate([self.actuated[self.closing], angles])
 
     @cached_property
+    def row_is_rod(self) -> Booleans:
+        """(E,) rows of the closure whose rod a reading is of."""
+        return np.append(self.rod_reads[self.closing], np.zeros(len(self.angles), dtype=bool))
+
+    @cached_property
     def of_motor(self) -> Booleans:
         """(E, m) which reading enters each row."""
         return self.row_motor[:, None] == np.arange(self.n_readings)
@@ -146,6 +151,26 @@ class LimbLayout:
     def unsure_scales(self) -> Booleans:
         """(L,) readings whose scale is a parameter."""
         return self.scale < self.n_parameters
+
+    @cached_property
+    def some_scales_unsure(self) -> bool:
+        """Whether the scale of any reading is a parameter."""
+        return bool(self.unsure_scales.any())
+
+    @cached_property
+    def scale_or_first(self) -> Integers:
+        """(L,) where each scale stands among the parameters; the first where it is none."""
+        return np.where(self.unsure_scales, self.scale, 0)
+
+    @cached_property
+    def all_read(self) -> bool:
+        """Whether every leg has a reading."""
+        return bool((self.actuated >= 0).all())
+
+    @cached_property
+    def reading_or_first(self) -> Integers:
+        """(L,) each leg's reading; the first where it has none."""
+        return np.maximum(self.actuated, 0)
 
     @cached_property
     def scales_move_a(self) -> bool:

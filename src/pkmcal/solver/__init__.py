@@ -13,11 +13,11 @@ unknowns; ``strips`` of rows that depend on few shared unknowns, and the normal 
 
 from pkmcal.solver.elimination import (
     Linear,
-    Memory,
     Reduced,
     condensed,
     divisions,
     eliminate,
+    flat,
     own_factors,
     stacked,
 )
@@ -44,7 +44,15 @@ from pkmcal.solver.search import (
     soft_weights,
     take,
 )
-from pkmcal.solver.strips import Compact, Eliminated, compact, damped_step, eliminated
+from pkmcal.solver.strips import (
+    Compact,
+    Eliminated,
+    StripLayout,
+    Strips,
+    compact,
+    damped_step,
+    eliminated,
+)
 
 __all__ = [
     "FULL",
@@ -55,10 +63,11 @@ __all__ = [
     "Eliminated",
     "LeastSquares",
     "Linear",
-    "Memory",
     "Reduced",
     "Solution",
     "Stop",
+    "StripLayout",
+    "Strips",
     "Values",
     "column_space",
     "compact",
@@ -69,6 +78,7 @@ __all__ = [
     "eliminate",
     "eliminated",
     "final_weights",
+    "flat",
     "inverse_root",
     "minimise",
     "normal_inverse",

@@ -8,7 +8,6 @@ terms.
 
 from __future__ import annotations
 
-from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -34,23 +33,6 @@ class Linear(NamedTuple):
     usable: Booleans
     shared_value: Array
     shared_by: Array
-
-
-class Memory:
-    """Arrays that are written over again and again.
-
-    A fresh array of megabytes costs the system as much time as it takes to fill it.
-    """
-
-    def __init__(self) -> None:
-        self._flat: dict[str, Array] = {}
-
-    def empty(self, name: str, shape: tuple[int, ...]) -> Array:
-        """An array of this shape with anything in it; what had the name before is lost."""
-        size = prod(shape)
-        if name not in self._flat or self._flat[name].size < size:
-            self._flat[name] = np.empty(size)
-        return self._flat[name][:size].reshape(shape)
 
 
 class Reduced(NamedTuple):
@@ -93,7 +75,7 @@ def eliminate(linear: Linear, damping: Array) -> Reduced:
     if not np.any(damping > 0):
         q = q[..., :n_rows, :]
     top, value = q[..., :n_rows, :], linear.value[..., None]
-    rows = left_of(linear.by_shared, q, top.mT @ linear.by_shared, Memory())
+    rows = left_of(linear.by_shared, q, top.mT @ linear.by_shared)
     # the damping's rows carry no residual of their own, only -bottom top^T value
     left = value - top @ (top.mT @ value)
     gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
@@ -101,14 +83,14 @@ def eliminate(linear: Linear, damping: Array) -> Reduced:
     return Reduced(rows, left[..., 0], top, r, gradient)
 
 
-def left_of(by_shared: Array, q: Array, along: Array, memory: Memory) -> Array:
+def left_of(by_shared: Array, q: Array, along: Array) -> Array:
     """The reduced rows ``by_shared - Q along`` (..., r', na), and those of the damping, which are
     ``-Q along``, where q has them.
 
     along : Q^T by_shared of all rows, (..., d, na).
     """
     *batch, n_rows, na = by_shared.shape
-    out = memory.empty("reduced rows", (*batch, q.shape[-2], na))
+    out = np.empty((*batch, q.shape[-2], na))
     data = np.matmul(q[..., :n_rows, :], along, out=out[..., :n_rows, :])
     np.subtract(by_shared, data, out=data)
     if q.shape[-2] > n_rows:
@@ -116,7 +98,7 @@ def left_of(by_shared: Array, q: Array, along: Array, memory: Memory) -> Array:
     return out
 
 
-def _flat(rows: Array) -> Array:
+def flat(rows: Array) -> Array:
     """Rows (B, K, r, n) of all configurations, (B, K r, n); n may be none."""
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
@@ -127,7 +109,7 @@ def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
     """
     n_runs = len(reduced.rows)
     shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
-    rows = np.concatenate([_flat(reduced.rows), shared], axis=1)
+    rows = np.concatenate([flat(reduced.rows), shared], axis=1)
     value = [reduced.value.reshape(n_runs, -1), linear.shared_value]
     return rows, np.concatenate(value, axis=1)
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, Memory, divisions
+from pkmcal.solver.elimination import Linear, divisions
 from pkmcal.solver.strips import (
     Compact,
     compact,
@@ -179,11 +179,12 @@ class Solution:
 
 def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
+    values: list[Values] | None = None
     if isinstance(problem, Divisible):
-        values, rows = None, problem.extent
+        rows = problem.extent
     else:
-        values = problem.residuals(start)
-        rows = values.value.shape[1:]
+        values = [problem.residuals(start)]
+        rows = values[0].value.shape[1:]
     n_runs = _count(start)
     cuts = divisions(n_runs, prod(rows))
     if len(cuts) < 2:
@@ -203,52 +204,56 @@ def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solutio
 
 
 class _Divided(NamedTuple):
-    """A problem with its parts of some configurations each, small enough for the processor's cache,
-    and the memory that they write to in turn.
-    """
+    """A problem with its parts of some configurations, small enough for the processor's cache."""
 
     problem: LeastSquares
     parts: list[tuple[slice, LeastSquares]]
-    memory: Memory
 
     @classmethod
     def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
         """A problem of so many runs and configurations of so many rows, divided where it can be."""
         cuts = divisions(count, n_runs * rows)
         if not isinstance(problem, Divisible) or len(cuts) < 2:
-            return cls(problem, [(slice(0, count), problem)], Memory())
-        return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
+            return cls(problem, [(slice(0, count), problem)])
+        return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
 
     def select(self, runs: Integers) -> _Divided:
         """The same of some runs."""
         parts = [(cut, part.select(runs)) for cut, part in self.parts]
         return self._replace(problem=self.problem.select(runs), parts=parts)
 
-    def rows(self, state: Any, values: Values | None) -> Iterator[Compact]:
+    def rows(self, state: Any, values: list[Values] | None) -> Iterator[Compact]:
         """Residuals and Jacobian of one part after the other; values : the residuals there, where
         they are known.
         """
-        if len(self.parts) == 1 and values is not None and values.rows is not None:
-            yield values.rows()
-            return
-        for cut, part in self.parts:
-            if isinstance(part, Divisible):
+        for k, (cut, part) in enumerate(self.parts):
+            known = values[k].rows if values else None
+            if known:
+                yield known()
+            elif isinstance(part, Divisible):
                 yield part.compact(part.state_among(state, cut))
             else:
                 yield compact(part.linearize(state))
 
-    def residuals(self, state: Any) -> Iterator[Values]:
-        """Residuals of one part after the other; those of shared unknowns only in the first."""
-        for k, (cut, part) in enumerate(self.parts):
-            if len(self.parts) > 1 and isinstance(part, Divisible):
-                state_of_part = part.state_among(state, cut)
-            else:
-                state_of_part = state
-            values = part.residuals(state_of_part)
-            yield values._replace(shared_value=values.shared_value[:, :0]) if k else values
+    def residuals(self, state: Any) -> list[Values]:
+        """Residuals of each part; those of shared unknowns only in the first."""
+        found = [self.parts[0][1].residuals(self._state_among(state, 0))]
+        for k in range(1, len(self.parts)):
+            values = self.parts[k][1].residuals(self._state_among(state, k))
+            found.append(values._replace(shared_value=values.shared_value[:, :0]))
+        return found
+
+    def _state_among(self, state: Any, k: int) -> Any:
+        """What a part needs of a state."""
+        cut, part = self.parts[k]
+        if len(self.parts) > 1 and isinstance(part, Divisible):
+            return part.state_among(state, cut)
+        return state
 
 
-def _minimised(problem: _Divided, start: Any, values: Values | None, max_steps: int) -> Solution:
+def _minimised(
+    problem: _Divided, start: Any, values: list[Values] | None, max_steps: int
+) -> Solution:
     """The same of few runs; values : the residuals at the start, where they are known."""
     n_runs = _count(start)
     cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
@@ -261,7 +266,7 @@ def _minimised(problem: _Divided, start: Any, values: Values | None, max_steps: 
         new, gain = _try(part, here, at, take(search, active))
         steps[active] += 1
         here, at = _kept(here, new, gain)
-        state = put(state, active, here)
+        state = here if active.size == n_runs else put(state, active, here)
         cost[active], search = gain.cost, put(search, active, gain.search)
         normal = gain.normal if normal is None else put(normal, active, gain.normal)
         for run, reason in zip(active, gain.stop, strict=True):
@@ -276,7 +281,7 @@ def _minimised(problem: _Divided, start: Any, values: Values | None, max_steps: 
     return Solution(state, cost, steps, final, cast(Array, normal))
 
 
-def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, Values | None]:
+def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
     """The state with the steps that were accepted, and the residuals there where they are known."""
     if gain.accepted.all():
         return new, gain.values
@@ -325,10 +330,10 @@ class _Search(NamedTuple):
 
 
 class _Gain(NamedTuple):
-    """What came of a step. values : the first part's residuals after it."""
+    """What came of a step. values : each part's residuals after it."""
 
     accepted: Booleans
-    values: Values
+    values: list[Values]
     cost: Array
     search: _Search
     normal: Array
@@ -336,22 +341,22 @@ class _Gain(NamedTuple):
 
 
 def _try(
-    problem: _Divided, state: Any, values: Values | None, search: _Search
+    problem: _Divided, state: Any, values: list[Values] | None, search: _Search
 ) -> tuple[Any, _Gain]:
     """One damped step of every run; returns the states after it and what came of it.
 
     values : the residuals at the state, where they are known.
     """
     damping = search.damping
-    normal = normal_equations(problem.rows(state, values), damping, problem.memory)
+    normal = normal_equations(problem.rows(state, values), damping)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
     usable = [part.usable for part in normal.parts]
-    after = problem.residuals(trial)
-    values = next(after)
-    cost, cost_trial = normal.cost, cost_of(values.value, values.shared_value, usable[0])
-    for part, use in zip(after, usable[1:], strict=True):
-        cost_trial = cost_trial + cost_of(part.value, part.shared_value, use)
+    values, cost = problem.residuals(trial), normal.cost
+    cost_trial = total(
+        cost_of(part.value, part.shared_value, use)
+        for part, use in zip(values, usable, strict=True)
+    )
     descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
     size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)

@@ -1,148 +1,234 @@
-"""Rows that are many and depend on few shared unknowns, a few configurations at a time.
+"""Rows that are many and depend on few shared unknowns, and the normal equations of all.
 
-Such rows are in *strips* (:class:`Compact`), of which only products are formed
-(:attr:`Eliminated.strips_normal`): a sixth of the arithmetic, and as many digits as of the reduced
-rows themselves, as no sharp row is among them. With the rows after them they make the normal
-equations of a step.
+Such rows are in *strips* (:class:`Strips`), of which only products are formed
+(:attr:`Eliminated.strips_normal`): a tenth of the arithmetic, and as many digits as of the reduced
+rows themselves, as no sharp row is among them. With the rows besides they make the normal equations
+of a step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import reduce
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, Memory, left_of, own_factors, squares
+from pkmcal.solver.elimination import Linear, flat, squares
 from pkmcal.solver.ranks import unit_diagonal
 
-PIECE = 2**17
-"""Numbers of the Jacobian that are written at once, a megabyte: what is read again before it is
-forgotten then stays in the second cache, and a call of NumPy costs little beside its arithmetic."""
+
+@dataclass(frozen=True)
+class StripLayout:
+    """Where the rows of N strips belong; the same for all runs.
+
+    A strip is n rows of one configuration that depend on w of the shared unknowns, as all edges of
+    one leg in one photograph do. Strips with the same columns stand side by side.
+
+    n_shared, n_own : na, d. configuration : (N,), of ``count``. rows : (N, n) which of the
+    configuration's each is, -1 for padding. groups : strips with the same columns. columns :
+    (groups, w), na where there are fewer.
+    """
+
+    n_shared: int
+    n_own: int
+    count: int
+    configuration: Integers
+    rows: Integers
+    groups: list[slice]
+    columns: Integers
+
+    @classmethod
+    def none(cls, n_shared: int, n_own: int, count: int) -> StripLayout:
+        """No strips."""
+        empty = np.zeros((0, 0), dtype=int)
+        return cls(n_shared, n_own, count, empty.ravel(), empty, [], empty)
+
+    @cached_property
+    def own_target(self) -> Integers:
+        """Where the products of a strip's rows by own unknowns with all its columns are summed, out
+        of (K, d, d + na + 2): own unknowns, shared ones, none, and the residual.
+        """
+        d, na = self.n_own, self.n_shared
+        column = np.empty((len(self.configuration), d + self.columns.shape[1] + 1), dtype=int)
+        for cut, columns in zip(self.groups, self.columns, strict=True):
+            column[cut, d:-1] = d + columns
+        column[:, :d], column[:, -1] = np.arange(d), d + na + 1
+        row = d * self.configuration[:, None] + np.arange(d)
+        return (row[..., None] * (d + na + 2) + column[:, None]).ravel()
+
+    @cached_property
+    def shared_target(self) -> Integers:
+        """The same of the groups' products by shared unknowns, out of (na + 2, na + 2)."""
+        residual = np.full((len(self.columns), 1), self.n_shared + 1)
+        column = np.concatenate([self.columns, residual], axis=1)
+        return (column[:, :, None] * (self.n_shared + 2) + column[:, None]).ravel()
+
+
+class Strips(NamedTuple):
+    """Strips' numbers (B, N, n, d + w + 1): by the own unknowns, by the shared ones of their
+    columns, and the residual.
+    """
+
+    layout: StripLayout
+    numbers: Array
 
 
 class Compact(NamedTuple):
-    """As :class:`Linear`, but for the Jacobian by the shared unknowns, which is written a few
-    configurations at a time.
+    """As :class:`Linear`, but for the rows of strips; those that are in none come last among the
+    rows of their configuration.
 
-    Most rows depend on few of the shared unknowns, and many on the same few, as all edges of one
-    leg do: a *strip* is n rows of every configuration with w columns of their own. Strips come
-    first among a configuration's rows, one after the other; the rows after them have all columns.
-
-    n_shared : na. strips : (L, w) columns of each strip, na where it has fewer than w. write : the
-    strips (L, k, n, w) and the rows after them (k, r', na) of one run and some configurations, in
-    memory where the next are written as well.
+    n_shared : na. by_shared : (B, K, r', na) and by_own : (B, K, r', d) of the rows in no strip.
     """
 
     value: Array
-    by_own: Array
     usable: Booleans
     shared_value: Array
     shared_by: Array
-    n_shared: int
-    strips: Integers
-    write: Callable[[int, slice, Memory], tuple[Array, Array]]
+    strips: Strips
+    by_shared: Array
+    by_own: Array
 
     def linear(self) -> Linear:
         """The same with the Jacobian in memory as a whole."""
-        by_shared = np.zeros((*self.value.shape, self.n_shared + 1))
-        for run in range(len(by_shared)):
-            strips, rest = self.write(run, slice(None), Memory())
-            n = strips.shape[2]
-            for k, (columns, strip) in enumerate(zip(self.strips, strips, strict=True)):
-                by_shared[run, :, n * k : n * (k + 1), columns] = np.moveaxis(strip, -1, 0)
-            by_shared[run, :, n * len(strips) :, :-1] = rest
-        return Linear(self.value, by_shared[..., :-1], *self[1:5])
+        layout, numbers = self.strips
+        (*batch, n_rows), d, na = self.value.shape, layout.n_own, layout.n_shared
+        by_own, by_shared = (
+            np.zeros((*batch, n_rows + 1, d)),
+            np.zeros((*batch, n_rows + 1, na + 1)),
+        )
+        at = layout.configuration[:, None]
+        by_own[:, at, layout.rows] = numbers[..., :d]
+        for cut, columns in zip(layout.groups, layout.columns, strict=True):
+            place = at[cut, ..., None], layout.rows[cut, :, None], columns
+            by_shared[:, *place] = numbers[:, cut, :, d:-1]
+        by_own, by_shared = by_own[:, :, :-1], by_shared[:, :, :-1, :-1]
+        rest = slice(n_rows - self.by_own.shape[2], None)
+        by_own[:, :, rest], by_shared[:, :, rest] = self.by_own, self.by_shared
+        return Linear(self.value, by_shared, by_own, self.usable, self.shared_value, self.shared_by)
 
 
 def compact(linear: Linear) -> Compact:
     """The same of a Jacobian that stands in memory."""
-    none = np.zeros((0, 0), dtype=int)
-
-    def write(run: int, configurations: slice, memory: Memory) -> tuple[Array, Array]:
-        del memory
-        rows = linear.by_shared[run, configurations]
-        return np.zeros((0, len(rows), 0, 0)), rows
-
-    rest = linear.usable, linear.shared_value, linear.shared_by, linear.by_shared.shape[-1]
-    return Compact(linear.value, linear.by_own, *rest, none, write)
+    (*_, n_own), (n_runs, count, _, n_shared) = linear.by_own.shape, linear.by_shared.shape
+    layout = StripLayout.none(n_shared, n_own, count)
+    strips = Strips(layout, np.zeros((n_runs, 0, 0, n_own + 1)))
+    rows = linear.value, linear.usable, linear.shared_value, linear.shared_by
+    return Compact(*rows, strips, linear.by_shared, linear.by_own)
 
 
 class Eliminated(NamedTuple):
-    """Some configurations of one run with their own unknowns eliminated, ``by_own = Q R``.
+    """Configurations with their own unknowns eliminated, ``by_own = Q R``.
 
-    cut : which they are. along : Q^T J, (k, d, na), J the Jacobian by the shared unknowns.
-    rest : (k, r', na) reduced rows after the strips, and the damping's where there is any.
+    inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), with J the Jacobian by the shared
+    unknowns. fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns'
+    squares.
+
+    Of rows in no strip q (B, K, r', d), the reduced rows (B, K, r', na) and what of their residuals
+    is left, (B, K, r').
 
     Of the strips' rows J_s what their products need, which is far less than the rows themselves:
-    normal J_s^T J_s (na, na), along_strips Q_s^T J_s (k, d, na), own Q_s^T Q_s (k, d, d).
-    gradient : (na,) of half the cost.
+    normal J_s^T J_s (B, na, na), slope J_s^T value (B, na), along_strips Q_s^T J_s (B, K, d, na),
+    own Q_s^T Q_s (B, K, d, d), to which the damping's rows count, which have no J.
     """
 
-    cut: slice
+    inverse: Array
     along: Array
-    rest: Array
+    fitted: Array
+    damped: Array
+    q: Array
+    rows: Array
+    left: Array
     normal: Array
+    slope: Array
     along_strips: Array
     own: Array
-    gradient: Array
 
     @property
     def strips_normal(self) -> Array:
-        """Normal matrix (na, na) of the strips' reduced rows ``J_s - Q_s W`` with W = Q^T J:
+        """Normal matrices (B, na, na) of the strips' reduced rows ``J_s - Q_s W`` with W = Q^T J:
         ``J_s^T J_s - V^T W - W^T V`` with ``V = Q_s^T J_s - Q_s^T Q_s W / 2``.
 
         Readings a thousand times sharper than edges have no part in these differences: W is in
         units of the own unknowns' directions, of which edges see as much as of the shared ones.
         """
-        na = len(self.normal)
         half = self.along_strips - 0.5 * (self.own @ self.along)
-        both = half.reshape(-1, na).T @ self.along.reshape(-1, na)
-        return self.normal - both - both.T
+        both = flat(half).mT @ flat(self.along)
+        return self.normal - both - both.mT
+
+    @property
+    def rows_normal(self) -> Array:
+        """The same of the rows in no strip."""
+        rows = flat(self.rows)
+        return rows.mT @ rows
 
 
-def eliminated(
-    rows: Compact, run: int, q: Array, left: Array, memory: Memory
-) -> Iterator[Eliminated]:
-    """Pieces of one run whose Jacobian, written, reduced and forgotten, stays in the processor's
-    cache.
+def eliminated(rows: Compact, damping: Array) -> Eliminated:
+    """Own unknowns eliminated with Marquardt damping (B,), zero for none.
 
-    q : (K, r'', d) as of :func:`own_factors`; more than the rows' where damped. left : (K, r) what
-    of the residuals the own unknowns cannot take up.
+    The damping's rows sqrt(damping) diag(column norms) are appended, so a configuration that its
+    data do not fix stays solvable.
     """
-    (count, n_rows), d, na = rows.value.shape[1:], q.shape[-1], rows.n_shared
-    n_strips, width = rows.strips.shape
-    pieces = -(-count * n_rows * (width if n_strips else na) // PIECE)
-    for cut in (slice(count * k // pieces, count * (k + 1) // pieces) for k in range(pieces)):
-        strips, rest = rows.write(run, cut, memory)
-        k, n = strips.shape[1:3]
-        own, after = q[cut, : n_strips * n], q[cut, n_strips * n : n_rows]
-        along_strips = memory.empty("along strips", (k, d, na + 1))
-        along_strips.fill(0.0)
-        normal, gradient = np.zeros((na + 1, na + 1)), np.zeros(na + 1)
-        flat = strips.reshape(n_strips, k * n, width)
-        split = own.reshape(k, n_strips, n, d).transpose(1, 0, 3, 2)
-        by_left = left[cut, : n_strips * n].reshape(k, n_strips, n).swapaxes(0, 1)
-        by_left = by_left.reshape(n_strips, k * n, 1)
-        products = flat.mT @ flat, (flat.mT @ by_left)[..., 0], split @ strips
-        for columns, square, slope, part in zip(rows.strips, *products, strict=True):
-            normal[columns[:, None], columns] += square
-            gradient[columns] += slope
-            along_strips[..., columns] += part
-        along_strips = along_strips[..., :na]
-        along = along_strips + after.mT @ rest
-        gradient[:na] += left[cut, n_strips * n :].ravel() @ rest.reshape(-1, na)
-        yield Eliminated(
-            cut,
-            along,
-            left_of(rest, q[cut, n_strips * n :], along, memory),
-            normal[:na, :na],
-            along_strips,
-            own.mT @ own,
-            gradient[:na],
-        )
+    (layout, numbers), by_own = rows.strips, rows.by_own
+    n_runs, d, na = len(numbers), layout.n_own, layout.n_shared
+    products = numbers[..., :d].mT @ numbers
+    sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
+    square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
+    norms = np.einsum("...ii->...i", square) + squares(by_own)
+    damped = damping[:, None, None] * np.where(norms > 0, norms, 1.0)
+    extra = np.sqrt(damped)[..., None] * np.eye(d)
+    r = np.linalg.qr(np.concatenate([_root(square), by_own, extra], axis=-2), mode="r")
+    inverse = np.linalg.inv(r)
+
+    q = by_own @ inverse
+    value = rows.value[..., rows.value.shape[-1] - q.shape[-2] :, None]
+    along_strips = inverse.mT @ with_shared
+    along = along_strips + q.mT @ rows.by_shared
+    fitted = inverse.mT @ with_value + q.mT @ value
+    normal, slope = _group_sums(layout, numbers[..., d:])
+    return Eliminated(
+        inverse,
+        along,
+        fitted[..., 0],
+        damped,
+        q,
+        rows.by_shared - q @ along,
+        (value - q @ fitted)[..., 0],
+        normal,
+        slope,
+        along_strips,
+        inverse.mT @ (square + extra**2) @ inverse,
+    )
+
+
+def _group_sums(layout: StripLayout, numbers: Array) -> tuple[Array, Array]:
+    """J_s^T J_s (B, na, na) and J_s^T value (B, na) of strips (B, N, n, w + 1)."""
+    n_runs, na, width = len(numbers), layout.n_shared, numbers.shape[-1]
+    products = np.empty((n_runs, len(layout.groups), width, width))
+    for k, cut in enumerate(layout.groups):
+        rows = flat(numbers[:, cut])
+        np.matmul(rows.mT, rows, out=products[:, k])
+    sums = _summed(products, layout.shared_target, (n_runs, na + 2, na + 2))
+    return sums[:, :na, :na], sums[:, :na, -1]
+
+
+def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
+    """Numbers (B, ...) of each run summed where ``target`` says."""
+    out = np.zeros(shape)
+    for total, own in zip(out.reshape(len(out), -1), parts.reshape(len(out), -1), strict=True):
+        np.add.at(total, target, own)
+    return out
+
+
+def _root(square: Array) -> Array:
+    """Matrices (..., d, d) with ``root^T root = square``, which may be singular."""
+    try:
+        return np.linalg.cholesky(square).mT
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(square)
+        return np.sqrt(np.maximum(values, 0.0))[..., None] * vectors.mT
 
 
 class NormalPart(NamedTuple):
@@ -150,8 +236,7 @@ class NormalPart(NamedTuple):
     step needs of them once the rows are forgotten.
 
     matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
-    (B, K, r). along, fitted : Q^T by_shared (B, K, d, na) and Q^T value (B, K, d), with
-    ``by_own = Q R``. r : (B, K, d, d). damped : (B, K, d) the damping of the own unknowns' squares.
+    (B, K, r). along, fitted, inverse, damped : see :class:`Eliminated`.
     """
 
     matrix: Array
@@ -160,37 +245,31 @@ class NormalPart(NamedTuple):
     usable: Booleans
     along: Array
     fitted: Array
-    r: Array
+    inverse: Array
     damped: Array
 
     def own(self, shared: Array) -> Array:
         """The own unknowns' step (B, K, d) after the shared one (B, na)."""
-        right = self.fitted + (self.along @ shared[:, None, :, None])[..., 0]
-        return -np.linalg.solve(self.r, right[..., None])[..., 0]
+        right = self.fitted[..., None] + self.along @ shared[:, None, :, None]
+        return -(self.inverse @ right)[..., 0]
 
 
-def _part(rows: Compact, damping: Array, memory: Memory) -> NormalPart:
+def _part(rows: Compact, damping: Array) -> NormalPart:
     """A part's normal equations."""
-    (n_runs, count, n_rows, d), na = rows.by_own.shape, rows.n_shared
-    q, r = own_factors(rows.by_own, damping)
-    if not np.any(damping > 0):
-        q = q[..., :n_rows, :]
-    top = q[..., :n_rows, :]
-    fitted = (top.mT @ rows.value[..., None])[..., 0]
-    # the damping's rows carry no residual of their own, only -bottom top^T value
-    left = rows.value - (top @ fitted[..., None])[..., 0]
-    along = np.empty((n_runs, count, d, na))
-    matrix = np.tile(rows.shared_by.T @ rows.shared_by, (n_runs, 1, 1))
-    gradient = rows.shared_value @ rows.shared_by
-    for run in range(n_runs):
-        for piece in eliminated(rows, run, q[run], left[run], memory):
-            along[run, piece.cut] = piece.along
-            rest = piece.rest.reshape(-1, na)
-            matrix[run] += piece.strips_normal + rest.T @ rest
-            gradient[run] += piece.gradient
-    cost = cost_of(rows.value, rows.shared_value, rows.usable)
-    own = damping[:, None, None] * squares(rows.by_own)
-    return NormalPart(matrix, gradient, cost, rows.usable, along, fitted, r, own)
+    found = eliminated(rows, damping)
+    taken_up = flat(found.along_strips).mT @ flat(found.fitted[..., None])
+    left = flat(rows.by_shared).mT @ flat(found.left[..., None])
+    gradient = found.slope + (left - taken_up)[..., 0]
+    return NormalPart(
+        found.strips_normal + found.rows_normal + rows.shared_by.T @ rows.shared_by,
+        gradient + rows.shared_value @ rows.shared_by,
+        cost_of(rows.value, rows.shared_value, rows.usable),
+        rows.usable,
+        found.along,
+        found.fitted,
+        found.inverse,
+        found.damped,
+    )
 
 
 class NormalEquations(NamedTuple):
@@ -230,14 +309,14 @@ def total(parts: Iterable[Array]) -> Array:
     return reduce(np.add, parts)
 
 
-def normal_equations(parts: Iterable[Compact], damping: Array, memory: Memory) -> NormalEquations:
+def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquations:
     """The normal equations of all parts, each reduced before the next is asked for."""
     done: list[NormalPart] = []
     for rows in parts:
         if done:  # the rows on shared unknowns only stand in the first part
             none = rows.shared_value[:, :0], rows.shared_by[:0]
             rows = rows._replace(shared_value=none[0], shared_by=none[1])
-        done.append(_part(rows, damping, memory))
+        done.append(_part(rows, damping))
     sums = zip(*((part.matrix, part.gradient, part.cost) for part in done), strict=True)
     matrix, gradient, cost = (total(each) for each in sums)
     return NormalEquations(matrix, gradient, cost, done)
@@ -245,7 +324,7 @@ def normal_equations(parts: Iterable[Compact], damping: Array, memory: Memory) -
 
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
-    shared, own = normal_equations([compact(linear)], damping, Memory()).step(damping)
+    shared, own = normal_equations([compact(linear)], damping).step(damping)
     return shared, own[0]
 
 

@@ -442,8 +442,7 @@ def moved_direction(d: Array, transform: Array) -> Array:
 
 def point_by_frame(p: Array) -> Array:
     """Change (..., 3, 6) of a body's point by its frame's six numbers."""
-    eye = np.broadcast_to(np.eye(3), (*p.shape, 3))
-    return np.concatenate([-skew(p), eye], axis=-1)
+    return by_pose(p)
 
 
 def direction_by_frame(d: Array) -> Array:
