@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.gather import measurements_of
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
@@ -16,11 +18,13 @@ from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.session.load import load_session
 from pkmcal.solver import damped_step
 from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
 from pkmcal.studies.tasks import Batch
 from test_identify_scene import FOCAL, make_scene
+from test_pose_sessions import make
 
 
 def derivatives(problem, state, shared, own, h=1e-4):
@@ -120,6 +124,21 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
     z = (data.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
     T = np.broadcast_to(data.view.T_camera_base, (2, 3, 4, 4))
     check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1, 1))), rng)
+
+
+@pytest.mark.parametrize("name", ["h4", "delta"])
+def test_jacobian_of_cranks_with_the_noise_that_a_search_holds(name, tmp_path):
+    """Away from where the closures are zero, where the noise's own slope would tell."""
+    make(tmp_path / "session", name, n=6)
+    session = load_session(tmp_path / "session")
+    measurements = measurements_of(session, Boards())
+    start = start_state(session.machine, measurements, np.eye(4)[None])
+    assembled = assemble(session.machine, measurements, ThreeCentres())
+    state = batch_of(session.machine, assembled, start)
+    rng = np.random.default_rng(4)
+    turned = perturb(state.T_base_platform, 0.01 * rng.normal(size=(1, 6, 6)))
+    held = assembled.problem.as_noisy_as_at(state)
+    check(held, replace(state, T_base_platform=turned), rng)
 
 
 def test_true_values_leave_no_residual():

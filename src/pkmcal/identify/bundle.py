@@ -254,7 +254,7 @@ def _solved(
     """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
     parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    found = minimise(used, state)
+    found = minimise(used.as_noisy_as_at(state), state)
     found = replace(found, steps=steps + found.steps)
     info = information(used, found.state, found.normal)
     return _Fit(found, weight, scale, info, edges, trust)

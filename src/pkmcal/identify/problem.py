@@ -93,7 +93,8 @@ class Problem:
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,).
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
-    pose_blocks, pose_data : of boards.
+    pose_blocks, pose_data : of boards. slopes : (B, K, E) closures by their readings, which tell
+    their noise, where they are held; None where they are the state's own.
     """
 
     layout: LimbLayout
@@ -108,6 +109,7 @@ class Problem:
     frames: Array
     pose_blocks: PoseBlocks
     pose_data: PoseData
+    slopes: Array | None = None
 
     @cached_property
     def kinds(self) -> Kinds[Kind]:
@@ -132,6 +134,7 @@ class Problem:
             data=of_runs(self.data, runs),
             pose_data=of_runs(self.pose_data, runs),
             joint_noise=of_runs(self.joint_noise, runs),
+            slopes=None if self.slopes is None else of_runs(self.slopes, runs),
         )
 
     def among(self, configurations: slice) -> Problem:
@@ -142,6 +145,7 @@ class Problem:
             data=self.data.among(configurations),
             pose_blocks=self.pose_blocks.among(configurations),
             pose_data=self.pose_data.among(configurations),
+            slopes=None if self.slopes is None else self.slopes[:, configurations],
         )
 
     def state_among(self, state: BatchState, configurations: slice) -> BatchState:
@@ -159,6 +163,18 @@ class Problem:
             data=replace(self.data, weight=weight.edges),
             pose_data=replace(self.pose_data, weight=weight.poses),
         )
+
+    def as_noisy_as_at(self, state: BatchState) -> Problem:
+        """The same problem with closures whose noise is that of a state from which a search begins.
+
+        A crank moves its closure by its reading as far as the state says. Were its noise the
+        state's own throughout, the cost would have a slope that no row tells, the noise's own,
+        and near the end, with thousands of configurations, no step would keep what it promises.
+        """
+        layout = self.layout
+        if not layout.shares_motors and np.all(layout.row_is_rod | (layout.row_motor < 0)):
+            return self  # readings of lengths: the noise is the same everywhere
+        return replace(self, slopes=self.closure(state).by_reading)
 
     def shaded(self, sigma: Array) -> Problem:
         """The same problem with other standard deviations (B, n) px of the lines' shading."""
@@ -490,7 +506,8 @@ class Problem:
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
         """Rows (B, K, E, n) of the closure in standard deviations."""
-        return by_noise(self.layout, self.joint_noise[:, None, None], c.by_reading, rows)
+        slopes = c.by_reading if self.slopes is None else self.slopes
+        return by_noise(self.layout, self.joint_noise[:, None, None], slopes, rows)
 
     @cached_property
     def _in_use(self) -> Booleans:

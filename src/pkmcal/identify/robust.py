@@ -114,7 +114,8 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
         weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
-        found = minimise(problem.weighted(weight), state, max_steps=most)
+        searched = problem.weighted(weight).as_noisy_as_at(state)
+        found = minimise(searched, state, max_steps=most)
         state, steps = found.state, steps + int(found.steps.max())
         d = distances(problem, state)
         if settled:
