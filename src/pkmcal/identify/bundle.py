@@ -7,8 +7,7 @@ readings and the drawing, each divided by its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -146,7 +145,8 @@ def solve_batch(
     )
 
 
-class _Fit(NamedTuple):
+@dataclass(frozen=True)
+class _Fit:
     """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
     before it counted, and what its problem says there. The edges' scale is the annealing's, and one
     as soon as their noise was looked for. edges : that noise; trust : (B, K, G) by how much more or
@@ -159,6 +159,11 @@ class _Fit(NamedTuple):
     info: Information
     edges: EdgeScatter
     trust: Array
+
+    @cached_property
+    def components(self) -> Components:
+        """How large the noise of each kind of rows shows itself."""
+        return components(self.info, self.weight)
 
 
 def _settle(
@@ -182,12 +187,12 @@ def _settle(
         scale, factor = fit.scale, np.ones(len(by_data))
         edges, trust = fit.edges, fit.trust
         if scale_noise:
-            found = components(fit.info, weight)
-            scale = Kinds(np.ones_like(scale.edges), _pose_scale(scale.poses, found))
+            scale = Kinds(np.ones_like(scale.edges), _pose_scale(fit))
             if scale.poses.min() > hopeless:
-                return fit._replace(scale=scale)
-            edges = _edges(fit, found, by_tube, late=number >= FREE_ROUNDS)
-            factor = np.where(by_data, found.factor(READINGS), 1.0)
+                return replace(fit, scale=scale)
+            edges = _edges(fit, by_tube, late=number >= FREE_ROUNDS)
+            if by_data.any():
+                factor = np.where(by_data, fit.components.factor(READINGS), 1.0)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
@@ -225,7 +230,7 @@ def _readings_speak(fit: _Fit) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
-    found = components(fit.info, fit.weight)
+    found = fit.components
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
     return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
 
@@ -260,7 +265,7 @@ def _solved(
     return _Fit(found, weight, scale, info, edges, trust)
 
 
-def _edges(fit: _Fit, found: Components, by_tube: bool, *, late: bool) -> EdgeScatter:
+def _edges(fit: _Fit, by_tube: bool, *, late: bool) -> EdgeScatter:
     """The edges' noise: of each tube where light moves edges; else their errors are normal, as
     stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
     what the likelihood would say too, but for the edges that it counts as stated; and tails would
@@ -268,17 +273,21 @@ def _edges(fit: _Fit, found: Components, by_tube: bool, *, late: bool) -> EdgeSc
     """
     if by_tube:
         return edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
-    scale = fit.scale.edges[:, None] * fit.edges.scale
+    scale, found = fit.scale.edges[:, None] * fit.edges.scale, fit.components
     chi2, freedom = found.chi2[:, EDGES, None], found.freedom[:, EDGES, None]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     scale = np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
     return replace(fit.edges, scale=scale)
 
 
-def _pose_scale(scale: Array, found: Components) -> Array:
+def _pose_scale(fit: _Fit) -> Array:
     """The factor on the poses' stated noise that makes their chi2 equal its degrees of freedom,
     (B,), from the one in use; kept as it is where too few remain to judge it.
     """
+    scale = fit.scale.poses
+    if not fit.info.problem.kinds.poses.present.any():
+        return scale
+    found = fit.components
     chi2, freedom = found.chi2[:, POSES], found.freedom[:, POSES]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     return np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
