@@ -26,7 +26,7 @@ from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
-from pkmcal.identify.noise import FEWEST, Components, components, counts
+from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -48,6 +48,9 @@ ROUNDS = 30
 PACE = 1.6
 """A round of weights, deviations and solution brings the deviations of shading and of the edges a
 part of the way only; from the third on they go by so much further."""
+FURTHEST, MOST = 3.0, 0.99 * float(np.log(STEP))
+"""The same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
+how far it goes: at most by how much further, and the logarithm of a step that was not cut short."""
 FREE_ROUNDS = 6
 """Rounds in which the tails of the edges' noise are chosen; they are steps, and two that are alike
 would take turns for ever."""
@@ -182,6 +185,7 @@ def _settle(
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
+    asked = made = np.full(len(by_data), np.inf)  # of the readings' noise, in the last round
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, factor = fit.scale, np.ones(len(by_data))
@@ -192,7 +196,9 @@ def _settle(
                 return replace(fit, scale=scale)
             edges = _edges(fit, by_tube, late=number >= FREE_ROUNDS)
             if by_data.any():
-                factor = np.where(by_data, fit.components.factor(READINGS), 1.0)
+                before, asked = asked, np.log(fit.components.factor(READINGS))
+                made = _secant(asked, before, made)
+                factor = np.where(by_data, np.exp(made), 1.0)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
@@ -224,6 +230,16 @@ def _settle(
         problem = replace(problem, joint_noise=readings)
         fit = _solved(problem, state, weight, scale, fit.solution.steps, edges, trust)
     return fit
+
+
+def _secant(asked: Array, before: Array, made: Array) -> Array:
+    """The step (B,) of a noise's logarithm after which the data will ask for none, where they ask
+    for ``asked`` now and asked for ``before`` when the last step, ``made``, was; all (B,).
+    """
+    # what is asked for at most is not all that is missing
+    shrinks = (asked * before > 0) & (np.abs(asked) < np.abs(before)) & (np.abs(before) < MOST)
+    pace = np.where(shrinks, made / np.where(shrinks, before - asked, 1.0), 1.0)
+    return asked * np.clip(pace, 1.0, FURTHEST)
 
 
 def _readings_speak(fit: _Fit) -> Booleans:
