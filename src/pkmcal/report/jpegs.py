@@ -58,7 +58,9 @@ def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> l
     for width in sorted(widths, reverse=True):
         if image.shape[1] > width:
             height = max(1, round(image.shape[0] * width / image.shape[1]))
-            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            # between neighbours, at an eighth of the price, as long as these leave none out
+            how = cv2.INTER_LINEAR if image.shape[1] <= 2 * width else cv2.INTER_AREA
+            image = cv2.resize(image, (width, height), interpolation=how)
         packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         out[width] = base64.b64encode(packed.tobytes()).decode("ascii")
     return [out[width] for width in widths]
