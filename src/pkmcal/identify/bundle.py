@@ -188,17 +188,13 @@ def _settle(
     asked = made = np.full(len(by_data), np.inf)  # of the readings' noise, in the last round
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, factor = fit.scale, np.ones(len(by_data))
-        edges, trust = fit.edges, fit.trust
+        scale, edges, trust = fit.scale, fit.edges, fit.trust
         if scale_noise:
             scale = Kinds(np.ones_like(scale.edges), _pose_scale(fit))
             if scale.poses.min() > hopeless:
                 return replace(fit, scale=scale)
             edges = _edges(fit, by_tube, late=number >= FREE_ROUNDS)
-            if by_data.any():
-                before, asked = asked, np.log(fit.components.factor(READINGS))
-                made = _secant(asked, before, made)
-                factor = np.where(by_data, np.exp(made), 1.0)
+            asked, made = _readings_step(fit, by_data, asked, made)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
@@ -217,7 +213,7 @@ def _settle(
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():
-            readings = problem.joint_noise_times(factor, state)
+            readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
         found_readings = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
         found_edges = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
         found_all = found_shading and found_readings and found_edges
@@ -232,14 +228,18 @@ def _settle(
     return fit
 
 
-def _secant(asked: Array, before: Array, made: Array) -> Array:
-    """The step (B,) of a noise's logarithm after which the data will ask for none, where they ask
-    for ``asked`` now and asked for ``before`` when the last step, ``made``, was; all (B,).
+def _readings_step(fit: _Fit, by_data: Booleans, before: Array, made: Array) -> tuple[Array, Array]:
+    """The step of the readings' noise that the data ask for, and the one to make, after which they
+    will ask for none: by the secant through this and what they asked for before the last step that
+    was made. Logarithms, (B,) all; nothing is asked where no run's readings are judged.
     """
+    if not by_data.any():
+        return before, made
+    asked = np.log(fit.components.factor(READINGS))
     # what is asked for at most is not all that is missing
     shrinks = (asked * before > 0) & (np.abs(asked) < np.abs(before)) & (np.abs(before) < MOST)
     pace = np.where(shrinks, made / np.where(shrinks, before - asked, 1.0), 1.0)
-    return asked * np.clip(pace, 1.0, FURTHEST)
+    return asked, asked * np.clip(pace, 1.0, FURTHEST)
 
 
 def _readings_speak(fit: _Fit) -> Booleans:
