@@ -185,7 +185,7 @@ def _settle(
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
-    asked = made = np.full(len(by_data), np.inf)  # of the readings' noise, in the last round
+    asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, trust = fit.scale, fit.edges, fit.trust
