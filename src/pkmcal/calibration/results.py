@@ -11,6 +11,7 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -203,7 +204,8 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
     ]
 
 
-def versions() -> dict[str, str]:
+@cache
+def versions() -> Mapping[str, str]:
     """Versions of pkmcal, Python and the packages that numbers depend on."""
     found = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
     for name in PACKAGES:

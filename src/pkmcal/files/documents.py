@@ -448,6 +448,8 @@ def plain(value: Any) -> Any:
         known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
         return value.tolist() if known and value.dtype.kind in "fiub" else plain(value.tolist())
     if isinstance(value, (list, tuple)):
+        if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
+            return list(value)  # a row of a matrix: most numbers stand in one
         return [plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 

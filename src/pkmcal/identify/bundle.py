@@ -7,8 +7,7 @@ readings and the drawing, each divided by its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
-from pkmcal.identify.noise import FEWEST, Components, components, counts
+from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -49,6 +48,9 @@ ROUNDS = 30
 PACE = 1.6
 """A round of weights, deviations and solution brings the deviations of shading and of the edges a
 part of the way only; from the third on they go by so much further."""
+FURTHEST, MOST = 3.0, 0.99 * float(np.log(STEP))
+"""The same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
+how far it goes: at most by how much further, and the logarithm of a step that was not cut short."""
 FREE_ROUNDS = 6
 """Rounds in which the tails of the edges' noise are chosen; they are steps, and two that are alike
 would take turns for ever."""
@@ -146,7 +148,8 @@ def solve_batch(
     )
 
 
-class _Fit(NamedTuple):
+@dataclass(frozen=True)
+class _Fit:
     """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
     before it counted, and what its problem says there. The edges' scale is the annealing's, and one
     as soon as their noise was looked for. edges : that noise; trust : (B, K, G) by how much more or
@@ -159,6 +162,11 @@ class _Fit(NamedTuple):
     info: Information
     edges: EdgeScatter
     trust: Array
+
+    @cached_property
+    def components(self) -> Components:
+        """How large the noise of each kind of rows shows itself."""
+        return components(self.info, self.weight)
 
 
 def _settle(
@@ -177,17 +185,16 @@ def _settle(
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
+    asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, factor = fit.scale, np.ones(len(by_data))
-        edges, trust = fit.edges, fit.trust
+        scale, edges, trust = fit.scale, fit.edges, fit.trust
         if scale_noise:
-            found = components(fit.info, weight)
-            scale = Kinds(np.ones_like(scale.edges), _pose_scale(scale.poses, found))
+            scale = Kinds(np.ones_like(scale.edges), _pose_scale(fit))
             if scale.poses.min() > hopeless:
-                return fit._replace(scale=scale)
-            edges = _edges(fit, found, by_tube, late=number >= FREE_ROUNDS)
-            factor = np.where(by_data, found.factor(READINGS), 1.0)
+                return replace(fit, scale=scale)
+            edges = _edges(fit, by_tube, late=number >= FREE_ROUNDS)
+            asked, made = _readings_step(fit, by_data, asked, made)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
@@ -206,7 +213,7 @@ def _settle(
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():
-            readings = problem.joint_noise_times(factor, state)
+            readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
         found_readings = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
         found_edges = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
         found_all = found_shading and found_readings and found_edges
@@ -221,11 +228,25 @@ def _settle(
     return fit
 
 
+def _readings_step(fit: _Fit, by_data: Booleans, before: Array, made: Array) -> tuple[Array, Array]:
+    """The step of the readings' noise that the data ask for, and the one to make, after which they
+    will ask for none: by the secant through this and what they asked for before the last step that
+    was made. Logarithms, (B,) all; nothing is asked where no run's readings are judged.
+    """
+    if not by_data.any():
+        return before, made
+    asked = np.log(fit.components.factor(READINGS))
+    # what is asked for at most is not all that is missing
+    shrinks = (asked * before > 0) & (np.abs(asked) < np.abs(before)) & (np.abs(before) < MOST)
+    pace = np.where(shrinks, made / np.where(shrinks, before - asked, 1.0), 1.0)
+    return asked, asked * np.clip(pace, 1.0, FURTHEST)
+
+
 def _readings_speak(fit: _Fit) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
-    found = components(fit.info, fit.weight)
+    found = fit.components
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
     return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
 
@@ -260,7 +281,7 @@ def _solved(
     return _Fit(found, weight, scale, info, edges, trust)
 
 
-def _edges(fit: _Fit, found: Components, by_tube: bool, *, late: bool) -> EdgeScatter:
+def _edges(fit: _Fit, by_tube: bool, *, late: bool) -> EdgeScatter:
     """The edges' noise: of each tube where light moves edges; else their errors are normal, as
     stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
     what the likelihood would say too, but for the edges that it counts as stated; and tails would
@@ -268,17 +289,21 @@ def _edges(fit: _Fit, found: Components, by_tube: bool, *, late: bool) -> EdgeSc
     """
     if by_tube:
         return edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
-    scale = fit.scale.edges[:, None] * fit.edges.scale
+    scale, found = fit.scale.edges[:, None] * fit.edges.scale, fit.components
     chi2, freedom = found.chi2[:, EDGES, None], found.freedom[:, EDGES, None]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     scale = np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
     return replace(fit.edges, scale=scale)
 
 
-def _pose_scale(scale: Array, found: Components) -> Array:
+def _pose_scale(fit: _Fit) -> Array:
     """The factor on the poses' stated noise that makes their chi2 equal its degrees of freedom,
     (B,), from the one in use; kept as it is where too few remain to judge it.
     """
+    scale = fit.scale.poses
+    if not fit.info.problem.kinds.poses.present.any():
+        return scale
+    found = fit.components
     chi2, freedom = found.chi2[:, POSES], found.freedom[:, POSES]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     return np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)

@@ -40,6 +40,7 @@ from pkmcal.solver import (
     eliminate,
     inverse_root,
     normal_inverse,
+    normal_root,
     stacked,
     take,
 )
@@ -105,6 +106,16 @@ class Information:
     def by_kind(self) -> KindSums:
         """What the rows of each kind say, summed over the configurations."""
         return kind_sums(self.problem, self.state)
+
+    @cached_property
+    def root(self) -> Array:
+        """F (B, na, na) with F F^T the covariance of the shared unknowns, where nothing is said of
+        a direction that is not known.
+        """
+        normal, prior = self.normal, self.problem.prior
+        if normal is None:
+            normal = self.by_kind.every + prior.T @ prior
+        return normal_root(normal, UNKNOWN, loose=False)
 
     @cached_property
     def covariance(self) -> Array:

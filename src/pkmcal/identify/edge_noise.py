@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.covariance import UNKNOWN, Information
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.scatter import (
     LEAST,
     PAIR,
@@ -31,7 +31,7 @@ from pkmcal.identify.scatter import (
     worth,
 )
 from pkmcal.measurements import OWN_SHADING
-from pkmcal.solver import divisions, normal_root
+from pkmcal.solver import divisions
 
 TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
@@ -75,7 +75,7 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
     shift outward does, and across; and the square of that shift by a pixel.
     """
     problem, rows = info.problem, info.problem.kinds.edges.rows
-    half = normal_root(info.by_kind.every + problem.prior.T @ problem.prior, UNKNOWN, loose=False)
+    half = info.root
     n_runs, n_rows = len(half), problem.n_rows
     squares = []
     for cut in divisions(info.state.T_base_platform.shape[1], n_rows * n_runs):

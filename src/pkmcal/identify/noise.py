@@ -22,10 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.identify.covariance import UNKNOWN, Information
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kinds
-from pkmcal.solver import normal_root
 
 DOUBT = 0.01 / 3
 """Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
@@ -108,8 +107,7 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     H is Q Q^T of the own unknowns and S S^T of the shared ones, orthogonal to each other; what
     nothing fixes has no part in it. With G_k = [Q S]_k^T [Q S]_k, tr(H_kl H_lk) = tr(G_k G_l).
     """
-    problem, prior, sums = info.problem, info.problem.prior, info.by_kind
-    half = normal_root(sums.every + prior.T @ prior, UNKNOWN, loose=False)
+    problem, sums, half = info.problem, info.by_kind, info.root
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
     count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
     shared = half.mT[:, None] @ sums.normal @ half[:, None]

@@ -118,10 +118,9 @@ def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
     kind = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     # one row an edge: cv2.remap takes at most 32767 rows and columns
     shape = (*pixel.shape[:2], -1)
-    x, y = (
-        np.nan_to_num(np.asarray(pixel[..., k], np.float32), nan=-9.0).reshape(shape)
-        for k in (0, 1)
-    )
+    x, y = (np.array(pixel[..., k], np.float32, order="C").reshape(shape) for k in (0, 1))
+    for place in (x, y):
+        place[~np.isfinite(place)] = -9.0
     out = np.empty(x.shape, dtype=np.float32)
     columns: Any
     rows: Any

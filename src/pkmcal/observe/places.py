@@ -191,7 +191,7 @@ def _chart_tables(
         number = direction_of(np.stack([-chord[:, 1], chord[:, 0]], axis=-1))
         middle = np.rint(cell.mean(axis=1)).astype(int) + HALF
         inside = ((middle >= 0) & (middle < n)).all(axis=1)
-        out.append(distances(middle[inside], number[inside], (n, n)))
+        out.append(distances(middle[inside], number[inside], (DIRECTIONS, n, n)))
     return np.rint(np.minimum(np.stack(out), REACH)).astype(np.uint8)
 
 

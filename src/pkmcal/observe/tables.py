@@ -159,21 +159,27 @@ def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
 
 
 def distances(
-    pixel: Integers, number: Integers, shape: tuple[int, int], count: int = DIRECTIONS
+    pixel: Integers, number: Integers, shape: tuple[int, ...], out: Array | None = None
 ) -> Array:
     """Distance tables (DIRECTIONS, h, w) of edge points at whole pixels (n, 2), x first.
 
-    number : (n,) their directions. shape : (h, w).
+    number : (n,) their directions. shape : of the tables. out : where they are written, in single
+    precision and each row in one piece, if not into a new array.
     """
     import cv2
 
-    tables = np.empty((count, *shape), dtype=np.float32)
-    place = pixel[:, 1] * shape[1] + pixel[:, 0]
+    tables = np.empty(shape, dtype=np.float32) if out is None else out
+    count, height, width = shape
+    place = pixel[:, 1] * width + pixel[:, 0]
     for k in range(count):
         near = (number - (k - 1)) % count < 3
-        mask = np.ones(shape, dtype=np.uint8)
+        if not near.any():
+            tables[k] = 1e3
+            continue
+        mask = np.ones((height, width), dtype=np.uint8)
         mask.reshape(-1)[place[near]] = 0
-        tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
+        table: Any = tables[k]
+        cv2.distanceTransform(mask, cv2.DIST_L2, 3, dst=table)
     return tables
 
 
@@ -200,9 +206,9 @@ def distance_tables(
     tables = np.zeros((rows, height, columns, directions, across), dtype=np.float32)
     count = np.ones((directions, round(FURTHEST / BIN)))  # what no place has is not impossible
     for k, e in enumerate(edges):
+        table = tables[k % rows, :, k // rows].transpose(1, 0, 2)
         number = direction_of(e.normal, directions)
-        table = distances(e.pixel.astype(int), number, (height, across), directions)
-        tables[k % rows, :, k // rows] = table.transpose(1, 0, 2)
+        distances(e.pixel.astype(int), number, table.shape, table)
         count += _counted(table)
     chance = (count / count.sum(axis=1, keepdims=True) / BIN).astype(np.float32)
     return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, chance)

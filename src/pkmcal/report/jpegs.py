@@ -66,7 +66,9 @@ def narrowed(image: Any, width: int) -> Any:
     if image.shape[1] <= width:
         return image
     height = max(1, round(image.shape[0] * width / image.shape[1]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    # between neighbours, at an eighth of the price, as long as these leave none out
+    how = cv2.INTER_LINEAR if image.shape[1] <= 2 * width else cv2.INTER_AREA
+    return cv2.resize(image, (width, height), interpolation=how)
 
 
 def coded(image: Any, quality: int) -> bytes:
