@@ -40,6 +40,9 @@ from pkmcal.wording import listed
 SURE = 0.05
 """Probability that any photograph of a session is believed to be where it is not; each has an equal
 share of it."""
+LIKELY = 4
+"""Places of a photograph that are asked about again, whatever the picture says to a machine that is
+known better: one in a wrong place spoils it."""
 FEWEST_EDGES = 4
 """Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
 take seven."""
@@ -91,7 +94,7 @@ def search_by_hand(
     # with the machine that the first of them tell; later ones change it by little
     looked: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        alone = partial(_search, session, at, room, joined, {}, {}, {})
+        alone = partial(_search, session, at, room, joined, {}, {}, {}, {})
         for k, (_, one) in zip(by_hand, pool.map(alone, by_hand), strict=True):
             found[k] = one
             if told is not None:
@@ -116,7 +119,7 @@ def search_by_hand(
                 T = joined.T_camera_base[k]
                 placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
             landmarks = room.landmarks(placed)
-            again = partial(_search, session, at, room, joined, placed, landmarks, looked)
+            again = partial(_search, session, at, room, joined, placed, landmarks, looked, found)
             for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
                 looked[k], found[k] = seen, one
     for k in by_hand:
@@ -133,10 +136,12 @@ def _search(
     placed: Mapping[int, Neighbour],
     landmarks: Mapping[int, Landmarks],
     looked: Mapping[int, Alone],
+    found: Mapping[int, Alone],
     k: int,
 ) -> tuple[Alone, Alone]:
     """The places that photograph k could show: by the search in it alone, unless it was looked at,
-    and weighed by its legs and by what it shares of the room with those that are placed.
+    and those that were likely before, weighed by its legs and by what it shares of the room with
+    those that are placed.
     """
     p = photographs[k]
     alone = looked.get(k)
@@ -147,12 +152,14 @@ def _search(
         )  # fmt: skip
         alone = find_alone(view, p.images[0])
     others = room.place(k, landmarks)
+    if k in found:
+        others = np.concatenate([others, found[k].T_camera_base[:LIKELY]])
     if placed:
         axes = _legs(session, p, joined, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    found = look_closer(session, p, joined, alone, others)
-    axes = _legs(session, p, joined, found.T_camera_base)
-    return alone, room.weighed(found, k, p.camera, axes, placed)
+    closer = look_closer(session, p, joined, alone, others)
+    axes = _legs(session, p, joined, closer.T_camera_base)
+    return alone, room.weighed(closer, k, p.camera, axes, placed)
 
 
 def _legs(

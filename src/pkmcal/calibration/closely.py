@@ -42,6 +42,10 @@ FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
 LATER: tuple[float | None, ...] = (legs.REACH, None)
 """Pixels within which legs are looked for, one look after the other; None: edges are measured. The
 drawing is off by pixels, a machine that photographs have told is not."""
+NEAR = legs.SEARCH_SIGMA
+"""Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
+leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
+that lie near something; it does not offer legs that lie on it."""
 GIVEN_UP = 9.0
 """What an edge costs at least that the estimate gives up: three standard deviations."""
 
@@ -117,7 +121,7 @@ def look_closer(
 
     def weigh(known: KnownScene, T: Array) -> None:
         seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        settled, evidence = settle(seen, T[None], one, 16, 6)
+        settled, evidence = settle(seen, T[None], one, 16, 6, NEAR)
         weighed.append((float(evidence[0]), known.paid(but=p.station) - before.paid(but=p.station)))
         places.append(settled[0])
 
