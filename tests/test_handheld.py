@@ -498,6 +498,12 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     given_up = replace(estimate, edge_weights=weights)
     wrong = misplaced(session, measurements, given_up, T)
     assert wrong == [1]
+    # nor do three legs, none of which another one contradicts
+    edges = measurements.edges
+    fewer = edges.select((edges.station != 2) | (edges.leg < 3))
+    mine = (edges.station != 2) | (edges.leg < 3)
+    of_three = replace(estimate, edge_weights=estimate.edge_weights[mine])
+    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == [2]
     # a board that agrees tells its place
     shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
     with_board = replace(given_up, pose_weights=np.ones(1))

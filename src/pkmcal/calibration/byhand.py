@@ -43,9 +43,10 @@ share of it."""
 LIKELY = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
-FEWEST_EDGES = 4
-"""Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
-take seven."""
+FEWEST_LEGS, FEWEST_EDGES = 4, 4
+"""Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
+focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
+contradicts another that was taken for something else."""
 
 
 def place(
@@ -219,8 +220,8 @@ def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
 def misplaced(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> list[int]:
-    """Photographs by hand of which the joint estimate has given up most edges, has too few to tell
-    their place, or finds the camera looking another way than where it was placed, T_camera_base. A
+    """Photographs by hand of which the joint estimate has given up most edges, has too few edges or
+    legs to tell their place, or finds the camera looking another way than where it was placed, T_camera_base. A
     board that agrees with the others tells the place of its photograph whatever the edges do.
     """
     turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
@@ -230,7 +231,11 @@ def misplaced(
     count = np.bincount(station, minlength=len(session.stations))
     poses = measurements.poses.station
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
-    lost = ((2 * kept < count) | (kept < FEWEST_EDGES)) & ~by_board
+    shown = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
+    used = estimate.edge_weights >= 0.5
+    shown[station[used], measurements.edges.leg[used]] = True
+    few = shown.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
+    lost = ((2 * kept < count) | (kept < FEWEST_EDGES) | few) & ~by_board
     return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 
@@ -284,9 +289,10 @@ def _without(seen: SeenSession, lost: dict[int, str]) -> SeenSession:
             next_step="Take photographs in which all legs are large and before a plain background",
         )
     T_camera_base = known.T_camera_base[[*kept, *trackers]]
+    edges = {number[k]: found for k, found in known.edges.items() if k in number}
     return SeenSession(
         left,
         [replace(p, station=number[p.station]) for p in seen.photographs if p.station in number],
         seen.boards.of(np.array(kept, dtype=int)),
-        KnownScene(known.machine, T_camera_base, known.T_base_platform),
+        known._replace(T_camera_base=T_camera_base, edges=edges, cost={}),
     )

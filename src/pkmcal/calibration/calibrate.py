@@ -174,7 +174,10 @@ def calibrate(
         at = seen.known.T_camera_base
         if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
             state = turns.estimate.state
-            known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
+            known = KnownScene(
+                turns.estimate.machine, state.T_camera_base, state.T_base_platform,
+                seen.known.edges,
+            )  # fmt: skip
             seen = without_misplaced(seen._replace(known=known), wrong)
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
         return _judge(seen, found, method, seed, clock)
