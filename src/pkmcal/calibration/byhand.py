@@ -221,8 +221,9 @@ def misplaced(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> list[int]:
     """Photographs by hand of which the joint estimate has given up most edges, has too few edges or
-    legs to tell their place, or finds the camera looking another way than where it was placed, T_camera_base. A
-    board that agrees with the others tells the place of its photograph whatever the edges do.
+    legs to tell their place, or finds the camera looking another way than where it was placed,
+    T_camera_base. A board that agrees with the others tells the place of its photograph whatever
+    the edges do.
     """
     turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
     astray = np.sqrt(dot(turn, turn)) > ALIKE / 2

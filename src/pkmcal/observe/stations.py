@@ -409,9 +409,7 @@ class _Look(NamedTuple):
         part = (self.found * (1 / reach)) ** 2
         return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
-    def mixture(
-        self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH
-    ) -> _Mixture:
+    def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
         """The likeliest mixture, from another on (expectation and maximisation)."""
         total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
