@@ -510,9 +510,16 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     assert misplaced(session, shown, with_board, T) == []
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
-    known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
-    rest = without_misplaced(SeenSession(session, [], Boards(), known), wrong)
+    photographs = read_photographs(session)
+    known = KnownScene.as_drawn(session.machine, T, session.joints)
+    seen = SeenSession(session, photographs, Boards(), known)
+    rest = without_misplaced(seen, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    # the others are where the estimate has them, by the edges that it was made from
+    np.testing.assert_array_equal(rest.known.T_camera_base, T[[0, 2]])
+    assert {k: len(found) for k, found in rest.known.edges.items()} == {
+        k: (edges.station == old).sum() for k, old in enumerate([0, 2])
+    }
     assert "too few of its edges agree" in rest.session.warnings[-1]
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -20,13 +21,13 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.closely import AT_LAST, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, Alone, find_alone, turn_between
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
@@ -67,6 +68,11 @@ def place(
     known = KnownScene.as_drawn(session.machine, stations, session.joints)
     if len(fixed) < len(photographs):
         found, known = search_by_hand(session, photographs, boards, known, told)
+        if known.edges:
+            at = {p.station: p for p in photographs}
+            sure = {k: known.T_camera_base[k] for k in known.edges}
+            with suppress(PkmcalError):  # with all that is observed it is told better why
+                known = join(session, at, known, sure, boards, AT_LAST)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         return _without(SeenSession(session, photographs, boards, known), lost)
@@ -240,10 +246,18 @@ def misplaced(
     return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 
-def without_misplaced(seen: SeenSession, wrong: list[int]) -> SeenSession:
-    """What is seen without these photographs, each told."""
+def without_misplaced(
+    seen: SeenSession, wrong: list[int], edges: EdgeSet, estimate: Estimate
+) -> SeenSession:
+    """What is seen without these photographs, each told, and what is known by an estimate of all.
+
+    edges : from which it was made.
+    """
+    state = estimate.state
+    mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
+    known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
     why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(seen, why)
+    return _without(seen._replace(known=known), why)
 
 
 def why_lost(found: Alone) -> str:
