@@ -70,7 +70,10 @@ def place(
         found, known = search_by_hand(session, photographs, boards, known, told)
         if known.edges:
             at = {p.station: p for p in photographs}
+            # what too few legs hold the joint estimate moves anywhere
+            loose = {k for k, e in known.edges.items() if len(np.unique(e.leg)) < FEWEST_LEGS}
             sure = {k: known.T_camera_base[k] for k in known.edges}
+            sure |= {k: found[k].T_camera_base[0] for k in loose & found.keys()}
             with suppress(PkmcalError):  # with all that is observed it is told better why
                 known = join(session, at, known, sure, boards, AT_LAST)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
