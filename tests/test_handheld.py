@@ -498,15 +498,28 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     given_up = replace(estimate, edge_weights=weights)
     wrong = misplaced(session, measurements, given_up, T)
     assert wrong == [1]
+    # nor do three legs, none of which another one contradicts
+    edges = measurements.edges
+    fewer = edges.select((edges.station != 2) | (edges.leg < 3))
+    mine = (edges.station != 2) | (edges.leg < 3)
+    of_three = replace(estimate, edge_weights=estimate.edge_weights[mine])
+    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == [2]
     # a board that agrees tells its place
     shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
     with_board = replace(given_up, pose_weights=np.ones(1))
     assert misplaced(session, shown, with_board, T) == []
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
-    known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
-    rest = without_misplaced(SeenSession(session, [], Boards(), known), wrong)
+    photographs = read_photographs(session)
+    known = KnownScene.as_drawn(session.machine, T, session.joints)
+    seen = SeenSession(session, photographs, Boards(), known)
+    rest = without_misplaced(seen, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    # the others are where the estimate has them, by the edges that it was made from
+    np.testing.assert_array_equal(rest.known.T_camera_base, T[[0, 2]])
+    assert {k: len(found) for k, found in rest.known.edges.items()} == {
+        k: (edges.station == old).sum() for k, old in enumerate([0, 2])
+    }
     assert "too few of its edges agree" in rest.session.warnings[-1]
 
 

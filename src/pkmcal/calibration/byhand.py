@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -20,13 +21,13 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.closely import AT_LAST, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, Alone, find_alone, turn_between
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
@@ -40,9 +41,13 @@ from pkmcal.wording import listed
 SURE = 0.05
 """Probability that any photograph of a session is believed to be where it is not; each has an equal
 share of it."""
-FEWEST_EDGES = 4
-"""Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
-take seven."""
+LIKELY = 4
+"""Places of a photograph that are asked about again, whatever the picture says to a machine that is
+known better: one in a wrong place spoils it."""
+FEWEST_LEGS, FEWEST_EDGES = 4, 4
+"""Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
+focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
+contradicts another that was taken for something else."""
 
 
 def place(
@@ -63,6 +68,14 @@ def place(
     known = KnownScene.as_drawn(session.machine, stations, session.joints)
     if len(fixed) < len(photographs):
         found, known = search_by_hand(session, photographs, boards, known, told)
+        if known.edges:
+            at = {p.station: p for p in photographs}
+            # what too few legs hold the joint estimate moves anywhere
+            loose = {k for k, e in known.edges.items() if len(np.unique(e.leg)) < FEWEST_LEGS}
+            sure = {k: known.T_camera_base[k] for k in known.edges}
+            sure |= {k: found[k].T_camera_base[0] for k in loose & found.keys()}
+            with suppress(PkmcalError):  # with all that is observed it is told better why
+                known = join(session, at, known, sure, boards, AT_LAST)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         return _without(SeenSession(session, photographs, boards, known), lost)
@@ -91,7 +104,7 @@ def search_by_hand(
     # with the machine that the first of them tell; later ones change it by little
     looked: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        alone = partial(_search, session, at, room, joined, {}, {}, {})
+        alone = partial(_search, session, at, room, joined, {}, {}, {}, {})
         for k, (_, one) in zip(by_hand, pool.map(alone, by_hand), strict=True):
             found[k] = one
             if told is not None:
@@ -116,7 +129,7 @@ def search_by_hand(
                 T = joined.T_camera_base[k]
                 placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
             landmarks = room.landmarks(placed)
-            again = partial(_search, session, at, room, joined, placed, landmarks, looked)
+            again = partial(_search, session, at, room, joined, placed, landmarks, looked, found)
             for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
                 looked[k], found[k] = seen, one
     for k in by_hand:
@@ -133,10 +146,12 @@ def _search(
     placed: Mapping[int, Neighbour],
     landmarks: Mapping[int, Landmarks],
     looked: Mapping[int, Alone],
+    found: Mapping[int, Alone],
     k: int,
 ) -> tuple[Alone, Alone]:
     """The places that photograph k could show: by the search in it alone, unless it was looked at,
-    and weighed by its legs and by what it shares of the room with those that are placed.
+    and those that were likely before, weighed by its legs and by what it shares of the room with
+    those that are placed.
     """
     p = photographs[k]
     alone = looked.get(k)
@@ -147,12 +162,14 @@ def _search(
         )  # fmt: skip
         alone = find_alone(view, p.images[0])
     others = room.place(k, landmarks)
+    if k in found:
+        others = np.concatenate([others, found[k].T_camera_base[:LIKELY]])
     if placed:
         axes = _legs(session, p, joined, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    found = look_closer(session, p, joined, alone, others)
-    axes = _legs(session, p, joined, found.T_camera_base)
-    return alone, room.weighed(found, k, p.camera, axes, placed)
+    closer = look_closer(session, p, joined, alone, others)
+    axes = _legs(session, p, joined, closer.T_camera_base)
+    return alone, room.weighed(closer, k, p.camera, axes, placed)
 
 
 def _legs(
@@ -212,9 +229,10 @@ def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
 def misplaced(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> list[int]:
-    """Photographs by hand of which the joint estimate has given up most edges, has too few to tell
-    their place, or finds the camera looking another way than where it was placed, T_camera_base. A
-    board that agrees with the others tells the place of its photograph whatever the edges do.
+    """Photographs by hand of which the joint estimate has given up most edges, has too few edges or
+    legs to tell their place, or finds the camera looking another way than where it was placed,
+    T_camera_base. A board that agrees with the others tells the place of its photograph whatever
+    the edges do.
     """
     turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
     astray = np.sqrt(dot(turn, turn)) > ALIKE / 2
@@ -223,14 +241,26 @@ def misplaced(
     count = np.bincount(station, minlength=len(session.stations))
     poses = measurements.poses.station
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
-    lost = ((2 * kept < count) | (kept < FEWEST_EDGES)) & ~by_board
+    shown = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
+    used = estimate.edge_weights >= 0.5
+    shown[station[used], measurements.edges.leg[used]] = True
+    few = shown.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
+    lost = ((2 * kept < count) | (kept < FEWEST_EDGES) | few) & ~by_board
     return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 
-def without_misplaced(seen: SeenSession, wrong: list[int]) -> SeenSession:
-    """What is seen without these photographs, each told."""
+def without_misplaced(
+    seen: SeenSession, wrong: list[int], edges: EdgeSet, estimate: Estimate
+) -> SeenSession:
+    """What is seen without these photographs, each told, and what is known by an estimate of all.
+
+    edges : from which it was made.
+    """
+    state = estimate.state
+    mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
+    known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
     why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(seen, why)
+    return _without(seen._replace(known=known), why)
 
 
 def why_lost(found: Alone) -> str:
@@ -277,9 +307,10 @@ def _without(seen: SeenSession, lost: dict[int, str]) -> SeenSession:
             next_step="Take photographs in which all legs are large and before a plain background",
         )
     T_camera_base = known.T_camera_base[[*kept, *trackers]]
+    edges = {number[k]: found for k, found in known.edges.items() if k in number}
     return SeenSession(
         left,
         [replace(p, station=number[p.station]) for p in seen.photographs if p.station in number],
         seen.boards.of(np.array(kept, dtype=int)),
-        KnownScene(known.machine, T_camera_base, known.T_base_platform),
+        known._replace(T_camera_base=T_camera_base, edges=edges, cost={}),
     )

@@ -29,7 +29,7 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
-from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
@@ -178,9 +178,7 @@ def calibrate(
         turns = found.turns
         at = seen.known.T_camera_base
         if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
-            state = turns.estimate.state
-            known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
-            seen = without_misplaced(seen._replace(known=known), wrong)
+            seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
         estimate = found.turns.estimate
         if estimate.statistics.noise_scale > TOO_NOISY:

@@ -40,8 +40,14 @@ CLOSER, BEHIND = 8, 12.0
 may be behind the best: what is further behind has odds of one in a hundred thousand."""
 FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
 LATER: tuple[float | None, ...] = (legs.REACH, None)
+AT_LAST: tuple[float | None, ...] = (legs.AGAIN, None)
 """Pixels within which legs are looked for, one look after the other; None: edges are measured. The
-drawing is off by pixels, a machine that photographs have told is not."""
+drawing is off by pixels, a machine that photographs have told is not. When all have told it, the
+first of them are where it says."""
+NEAR = legs.SEARCH_SIGMA
+"""Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
+leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
+that lie near something; it does not offer legs that lie on it."""
 GIVEN_UP = 9.0
 """What an edge costs at least that the estimate gives up: three standard deviations."""
 
@@ -52,10 +58,12 @@ def join(
     known: KnownScene,
     places: Mapping[int, Array],
     boards: Boards,
+    looks: tuple[float | None, ...] | None = None,
 ) -> KnownScene:
     """What is known together with photographs at places T_camera_base (4, 4).
 
-    photographs : by station. boards : what they show of a board. Raises a `PkmcalError` where there
+    photographs : by station. boards : what they show of a board. looks : as FIRST, which they are
+    where nothing but the drawing is known, and LATER elsewhere. Raises a `PkmcalError` where there
     is nothing to be estimated.
     """
     at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
@@ -65,7 +73,7 @@ def join(
     shown = boards.of(np.array(stations, dtype=int))
     edges = dict(known.edges)
     state: State | None = None
-    for reach in LATER if edges else FIRST:
+    for reach in looks or (LATER if edges else FIRST):
         for k in places:
             p = photographs[k]
             seen = known.machine, at[k], known.T_base_platform[p.configuration]
@@ -117,7 +125,7 @@ def look_closer(
 
     def weigh(known: KnownScene, T: Array) -> None:
         seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        settled, evidence = settle(seen, T[None], one, 16, 6)
+        settled, evidence = settle(seen, T[None], one, 16, 6, NEAR)
         weighed.append((float(evidence[0]), known.paid(but=p.station) - before.paid(but=p.station)))
         places.append(settled[0])
 

@@ -68,12 +68,22 @@ def take_turns(
     session, photographs, boards, known = seen
     total = sum(len(p.images) for p in photographs)
     machine = session.machine
-    text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
-    estimate = searched(known, legs.REACH, _counted(told, text, total, 0.35))
-    start = estimate.state
-    known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
-    text = "Finding the legs again"
-    estimate = searched(known, legs.AGAIN, _counted(told, text, total, 0.4), start)
+    if all(p.station in known.edges for p in photographs):
+        # photographs by hand were measured when they were placed
+        placed = [
+            replace(known.edges[p.station], station=np.full(len(known.edges[p.station]), p.station))
+            for p in photographs
+        ]
+        measurements = measurements_of(session, boards, concatenate(placed))
+        start = start_state(known.machine, measurements, known.T_camera_base)
+        estimate = bundle(machine, measurements, start)
+    else:
+        text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
+        estimate = searched(known, legs.REACH, _counted(told, text, total, 0.35))
+        start = estimate.state
+        known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
+        text = "Finding the legs again"
+        estimate = searched(known, legs.AGAIN, _counted(told, text, total, 0.4), start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)

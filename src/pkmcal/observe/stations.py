@@ -409,14 +409,14 @@ class _Look(NamedTuple):
         part = (self.found * (1 / reach)) ** 2
         return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
-    def mixture(self, mixture: _Mixture, rounds: int = 3) -> _Mixture:
+    def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
         """The likeliest mixture, from another on (expectation and maximisation)."""
         total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
             own = self.length * self.own(mixture)
             mine = _summed(own)
             square = _summed(own * self.found**2) / np.maximum(mine, 1e-9)
-            sigma = np.clip(np.sqrt(square), BIN, LAST_REACH)
+            sigma = np.clip(np.sqrt(square), BIN, widest)
             mixture = _Mixture(np.clip(1 - mine / total, 0.01, 0.99), sigma)
         return mixture
 
@@ -469,9 +469,15 @@ def descend(
 
 
 def settle(
-    view: StationView, candidates: Array, photographs: Integers, samples: int, steps: int
+    view: StationView,
+    candidates: Array,
+    photographs: Integers,
+    samples: int,
+    steps: int,
+    widest: float = LAST_REACH,
 ) -> tuple[Array, Array]:
-    """The same to the most evidence: how far edges scatter is learnt on the way.
+    """The same to the most evidence: how far edges scatter, up to ``widest`` reduced pixels, is
+    learnt on the way.
 
     Returns the places (H, 4, 4) and their evidence (H,).
     """
@@ -480,7 +486,7 @@ def settle(
     mixture = _first_mixture(len(candidates))
     last = np.inf
     for _ in range(steps):
-        mixture = look.mixture(mixture)
+        mixture = look.mixture(mixture, widest=widest)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
         seen = _look(view, trial, photographs, samples)
         gain = _summed(seen.evidence(mixture)) - _summed(look.evidence(mixture))
@@ -490,7 +496,8 @@ def settle(
         damping = np.where(better, 0.3, 10.0) * damping
         if max(last, last := float(gain.max())) < SETTLED:
             break  # one step may have been too long
-    return candidates, _summed(look.evidence(look.mixture(_first_mixture(len(candidates)), 10)))
+    mixture = look.mixture(_first_mixture(len(candidates)), 10, widest)
+    return candidates, _summed(look.evidence(mixture))
 
 
 def _first_mixture(count: int) -> _Mixture:
