@@ -23,7 +23,7 @@ from pkmcal.solver import damped_step
 from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
 from pkmcal.studies.tasks import Batch
-from test_identify_scene import FOCAL, make_scene
+from test_identify_scene import FOCAL, guess, make_scene
 from test_pose_sessions import make
 
 
@@ -124,6 +124,20 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
     z = (data.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
     T = np.broadcast_to(data.view.T_camera_base, (2, 3, 4, 4))
     check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1, 1))), rng)
+
+
+def test_jacobian_of_stations_whose_focal_lengths_breathe():
+    """Each by an unknown of its own, which its edges alone answer to."""
+    rng = np.random.default_rng(5)
+    scene = make_scene(rng, configurations=3)
+    seen = scene.measurements(rng)
+    edges = replace(seen.edges, by_focal=rng.normal(size=(len(seen.edges), 2)))
+    seen = replace(seen, edges=edges, breathing_at=np.zeros(seen.n_stations))
+    assembled = assemble(scene.machine, seen, ThreeCentres())
+    stations = guess(rng, scene.T_camera_base)
+    state = batch_of(scene.machine, assembled, start_state(scene.machine, seen, stations))
+    assert assembled.problem.unknowns.n_breathing == seen.n_stations == 3
+    check(assembled.problem, state, rng)
 
 
 @pytest.mark.parametrize("name", ["h4", "delta"])

@@ -261,7 +261,8 @@ class Problem:
         data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
         tube, line = self._own_columns
         (n_rows, n_runs, m, n), c = value.shape, ends_by.shape[-1]
-        ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], u.n_breathing, 1]
+        breathes = int(u.n_breathing > 0)  # a view's own station alone
+        ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], breathes, 1]
         of_ends, _, of_optics, of_line, of_breathing, residual = (
             slice(stop - width, stop)
             for width, stop in zip(ends, np.cumsum(ends).tolist(), strict=True)
