@@ -413,8 +413,8 @@ class Problem:
         """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
         u, boards = self.unknowns, self.pose_blocks
         if not boards.present.size:
-            none = np.zeros((*poses.value.shape[:2], 0, u.count))
-            return none, none[..., : self.layout.own_motion.shape[1]]
+            none = (*poses.value.shape[:2], 0)
+            return np.zeros((*none, u.count)), np.zeros((*none, self.layout.own_motion.shape[1]))
         parts = [
             (_columns(u.stations, boards.station, 6), poses.by_station),
             (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
