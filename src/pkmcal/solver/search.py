@@ -45,6 +45,9 @@ REFUSED = 1e-3
 little is their rounding, where a direction is a millionth as well known as the others."""
 ROUNDING = 1e-13
 """Of the cost, relative."""
+KEPT = 16
+"""Parts of a problem of which is kept what their residuals took, so that the next step goes on from
+it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
 
 FULL, NONE = 4.0, 6.5
 """Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
@@ -240,7 +243,8 @@ class _Divided(NamedTuple):
         found = [self.parts[0][1].residuals(self._state_among(state, 0))]
         for k in range(1, len(self.parts)):
             values = self.parts[k][1].residuals(self._state_among(state, k))
-            found.append(values._replace(shared_value=values.shared_value[:, :0]))
+            values = values._replace(shared_value=values.shared_value[:, :0])
+            found.append(values if k < KEPT else values._replace(rows=None))
         return found
 
     def _state_among(self, state: Any, k: int) -> Any:
