@@ -234,8 +234,9 @@ class LimbLayout:
 
     def radius_of(self, legs: Integers, tubes: Integers) -> Integers:
         """Positions (n,) of the radii of legs' tubes, by the numbers of both, (n,) each."""
-        pairs = zip(legs, tubes, strict=True)
-        return np.array([self.radius[leg][tube] for leg, tube in pairs], dtype=int)
+        count = np.array([len(own) for own in self.radius])
+        every = np.array([place for own in self.radius for place in own], dtype=int)
+        return every[(np.cumsum(count) - count)[legs] + tubes]
 
     @cached_property
     def free(self) -> Booleans:
