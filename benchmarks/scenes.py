@@ -256,12 +256,12 @@ def read_truth(folder: Path, drawing: Any) -> TrueMachine | str:
         from pkmcal.simulation.truth import load_truth
 
         told = load_truth(folder, drawing)
-        numbers = _numbers(told.machine)
+        numbers = numbers_of(told.machine)
         if isinstance(numbers, str):
             return numbers
         seen = told.T_base_platform[told.photographs[:, 1]]
         values = told.machine.values[numbers]
-        return TrueMachine(*_split(values), told.T_camera_base, seen)
+        return TrueMachine(*parts_of(values), told.T_camera_base, seen)
     missing = [key for key in ("A_base", "B_platform", "joint_offsets") if key not in data]
     if missing:
         return f"the truth has no {', '.join(missing)}"
@@ -276,7 +276,7 @@ def read_truth(folder: Path, drawing: Any) -> TrueMachine | str:
     )
 
 
-def _numbers(machine: Any) -> np.ndarray | str:
+def numbers_of(machine: Any) -> np.ndarray | str:
     """Where A, B and the offsets of all legs stand among a machine's parameters."""
     names, legs = list(machine.parameters.names), range(1, machine.n_legs + 1)
     centres = [
@@ -288,8 +288,8 @@ def _numbers(machine: Any) -> np.ndarray | str:
     return np.array([names.index(name) for name in wanted])
 
 
-def _split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a, b (L, 3) and offset (L,) of what `_numbers` found."""
+def parts_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """a, b (L, 3) and offset (L,) of what `numbers_of` found."""
     n = len(values) // 7
     return values[: 3 * n].reshape(n, 3), values[3 * n : 6 * n].reshape(n, 3), values[6 * n :]
 
@@ -299,11 +299,11 @@ def score(calibration: Any, folder: Path) -> Errors | str:
     truth = read_truth(folder, calibration.session.machine)
     if isinstance(truth, str):
         return truth
-    numbers, estimate = _numbers(calibration.machine), calibration.estimate
+    numbers, estimate = numbers_of(calibration.machine), calibration.estimate
     if isinstance(numbers, str):
         return numbers
     covariance = estimate.covariance[np.ix_(numbers, numbers)]
-    parts = _split(calibration.machine.values[numbers])
+    parts = parts_of(calibration.machine.values[numbers])
     return errors_of(*parts, covariance, truth, estimate.state.T_camera_base)
 
 

@@ -30,8 +30,8 @@ def scenes():
 @pytest.fixture(scope="module")
 def case(scenes, calibrated, demo):
     """An estimate's parts, its covariance and its truth."""
-    numbers = scenes._numbers(calibrated.machine)
-    parts = scenes._split(calibrated.machine.values[numbers])
+    numbers = scenes.numbers_of(calibrated.machine)
+    parts = scenes.parts_of(calibrated.machine.values[numbers])
     truth = scenes.read_truth(demo.session, calibrated.session.machine)
     return parts, calibrated.estimate.covariance[np.ix_(numbers, numbers)], truth
 

@@ -1,0 +1,119 @@
+"""What a session's edges allow: the tool's error had the same edge errors other signs.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/allowed.py FOLDER [FOLDER ...] [--draws 16]
+
+FOLDER is a session with its truth.json, as of `benchmarks/scenes.py`. It is calibrated without its
+truth; then every edge that was measured is compared with where the true machine has it. One
+session's tool error is one draw: by chance it is small where its edges are bad. So the errors of
+each line (one side of one tube at one station) get a sign at random, together, so that what an edge
+shares with its neighbours stays, and the joint estimate is made again from these edges; so too with
+the errors halved. The root mean square over draws is what a method of calibration can expect of
+edges as good as these, and what it could of edges twice as good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scenes import TRUTH, TrueMachine, errors_of, numbers_of, parts_of, read_truth, rms
+
+
+def true_normals(edges: Any, truth: TrueMachine, radius: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Normals (n, 3) of the edges as the true machine has them.
+
+    radius : (n,) of their tubes, m. row : (n,) of T_base_platform.
+    """
+    from pkmcal.geometry.cylinders import edge_normals
+
+    T, pose = truth.T_camera_base[edges.station], truth.T_base_platform[row]
+    ends = truth.a[edges.leg], (pose @ np.pad(truth.b, ((0, 0), (0, 1)), constant_values=1.0)[
+        edges.leg][..., None])[:, :3, 0]  # fmt: skip
+    a, b = ((T[:, :3, :3] @ end[..., None])[..., 0] + T[:, :3, 3] for end in ends)
+    u = (b - a) / np.linalg.norm(b - a, axis=-1, keepdims=True)
+    return edge_normals(a, u, radius)[np.arange(len(edges)), edges.side]
+
+
+def true_radii(folder: Path, drawing: Any, edges: Any) -> np.ndarray:
+    """Radii (n,) m of the edges' tubes."""
+    data = json.loads((folder / TRUTH).read_text())
+    if "tube_radius" in data:
+        return np.where(edges.tube == 0, data["tube_radius"], data["rod_radius"])
+    from pkmcal.simulation.truth import load_truth
+
+    return load_truth(folder, drawing).machine.radii_of(edges.leg, edges.tube)
+
+
+def edges_at(edges: Any, normal: np.ndarray, turn: np.ndarray) -> Any:
+    """The edges where normals (n, 3) say, turned by ``turn`` (n, 2) in their bases."""
+    normal = normal + (edges.basis @ turn[..., None])[..., 0]
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    basis = edges.basis - normal[..., None] * (normal[:, None] @ edges.basis)
+    basis = basis / np.linalg.norm(basis, axis=1, keepdims=True)
+    return replace(edges, normal=normal, basis=basis)
+
+
+def tool_error(calibration: Any, estimate: Any, truth: TrueMachine) -> float:
+    """The tool's error, m, of an estimate from the calibration's session."""
+    numbers = numbers_of(calibration.machine)
+    covariance = estimate.covariance[np.ix_(numbers, numbers)]
+    return errors_of(*parts_of(estimate.machine.values[numbers]), covariance, truth).tool
+
+
+def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
+    """Tool errors, mm: as calibrated, and over draws with whole errors and with half of them."""
+    from pkmcal.calibration import calibrate
+    from pkmcal.identify.assembly import lines
+    from pkmcal.identify.bundle import bundle
+
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary) / folder.name
+        shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(TRUTH))
+        found = calibrate.calibrate(copy, seed=seed)
+    session, measurements, estimate = found.session, found.measurements, found.estimate
+    truth = read_truth(folder, session.machine)
+    if isinstance(truth, str):
+        raise SystemExit(f"{folder.name}: {truth}")
+    edges = measurements.edges
+    # the truth lists photographs station by station, as the session does
+    photographs = [(k, p.configuration) for k, s in enumerate(session.stations)
+                   for p in s.photographs]  # fmt: skip
+    number = {key: row for row, key in enumerate(photographs)}
+    row = np.array([number[key] for key in zip(edges.station, edges.configuration, strict=True)])
+    normal = true_normals(edges, truth, true_radii(folder, session.machine, edges), row)
+    turn = (edges.basis.mT @ (edges.normal - normal)[..., None])[..., 0]
+    line = lines(measurements)[1]
+    rng = np.random.default_rng(seed)
+    out = [tool_error(found, estimate, truth)]
+    for share in (1.0, 0.5):
+        errors = []
+        for _ in range(draws):
+            sign = rng.choice([-1.0, 1.0], size=line.max() + 1)[line]
+            moved = edges_at(edges, normal, share * sign[:, None] * turn)
+            again = bundle(session.machine, replace(measurements, edges=moved), estimate.state)
+            errors.append(tool_error(found, again, truth))
+        out.append(rms(np.array(errors)))
+    return tuple(1e3 * error for error in out)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    parser.add_argument("--draws", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    print(f"{'tool, mm':24} calibrated  other signs  half the errors")
+    for folder in options.folders:
+        found = allowed(folder.resolve(), options.draws, options.seed)
+        print(f"{folder.name:24} {found[0]:10.3f} {found[1]:12.3f} {found[2]:16.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
