@@ -28,6 +28,7 @@ from pkmcal.check.pictures import (
 from pkmcal.check.words import outcome_of
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
+from pkmcal.observe.predict import tubes_of
 from pkmcal.outcome import Level
 from pkmcal.planning.first import EdgesOf
 
@@ -152,6 +153,17 @@ def test_stations_on_one_side_are_told(found):
     angle = int(re.search(r"lines that are (\d+)° apart", said)[1])
     assert 20 < angle <= 25
     assert words._from_one_side(found.look) == []
+
+
+def test_slim_tubes_are_told(found):
+    """By the width that the drawing has in the photographs; wide ones need no word."""
+    assert words._slim(found.look) == []
+    first, *others = found.look.stations
+    half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)
+    every = np.broadcast_to(half_width, first.quality.half_width.shape)
+    slim = replace(first, quality=replace(first.quality, half_width=every))
+    (said,) = words._slim(replace(found.look, stations=(slim, *others)))
+    assert said.startswith(f"{first.name}: legs are slim in the photographs, tube 2 4.5 px wide.")
 
 
 def test_hidden_legs_are_told_where_no_station_sees_them(found):

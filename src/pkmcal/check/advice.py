@@ -14,7 +14,7 @@ from pkmcal.check.forecast import Forecast, LegForecast
 from pkmcal.check.look import Look, StationLook
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.profiles import SATURATED
+from pkmcal.observe.profiles import INSIDE, SATURATED
 from pkmcal.observe.quality import BLACK
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.planning.first import EdgesOf
@@ -43,7 +43,7 @@ ONE_LEGEND = (
 
 def advice(look: Look, forecast: Forecast | None) -> tuple[str, ...]:
     """Sentences, the most useful first."""
-    out = [*_second_place(forecast), *_from_one_side(look), *_hidden(look)]
+    out = [*_second_place(forecast), *_from_one_side(look), *_hidden(look), *_slim(look)]
     if forecast is not None:
         for station, edges in zip(look.stations, forecast.edges, strict=True):
             out += _lost(look, station, edges)
@@ -107,6 +107,30 @@ def _hidden(look: Look) -> list[str]:
             " until the legs stand one beside the other, or back, or add a place that sees"
             f" {'it' if bad.size == 1 else 'them'}."
         )
+    return out
+
+
+def _slim(look: Look) -> list[str]:
+    """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
+    tubes, least = tubes_of(look.session.machine), 2 * INSIDE
+    out: list[str] = []
+    for station in look.stations:
+        if station.quality is None:
+            continue
+        width = 2 * station.quality.half_width
+        usual = [
+            (tube, float(np.nanmedian(mine)))
+            for tube in np.unique(tubes.tube)
+            if np.isfinite(mine := width[:, tubes.tube == tube]).any()
+        ]
+        slim = [f"tube {tube + 1} {brief(px)} px" for tube, px in usual if px < least]
+        if slim:
+            out.append(
+                f"{station.name}: legs are slim in the photographs, {listed(slim)} wide. Below"
+                f" {least:.0f} px what is measured of one edge reaches the other: something bright"
+                " between moves both alike, and the result is off by more than stated. Take the"
+                " camera nearer, or more pixels, or a longer lens."
+            )
     return out
 
 

@@ -39,7 +39,8 @@ class Quality:
     legs. blur : standard deviation of the sharper edges, px; NaN where no edge tells.
     hidden : (K, L) share of a leg's edges behind other legs or outside the photograph, NaN of legs
     without tubes. level, behind : (K, E) grey levels beside each edge, on the leg and on what lies
-    behind it, in the order of ``tubes_of``; NaN where nothing of it is seen.
+    behind it, in the order of ``tubes_of``; NaN where nothing of it is seen. half_width : (K, E)
+    px of the tube there.
     """
 
     legs: Booleans
@@ -49,6 +50,7 @@ class Quality:
     hidden: Array = field(default_factory=lambda: np.zeros((0, 0)))
     level: Array = field(default_factory=lambda: np.zeros((0, 0)))
     behind: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    half_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def contrast(self) -> Array:
@@ -100,6 +102,7 @@ def _quality(
         hidden=hidden,
         level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
         behind=_middle(across[..., near & (offsets > 0)].mean(axis=-1), clear),
+        half_width=_middle(half_width[..., 0], clear),
     )
 
 
