@@ -51,12 +51,14 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_calibration", "test_fuzz", "test_cli",
-    "test_camera_calibration", "test_study_workers", "test_bad_input", "test_diagnose",
-    "test_bundle", "test_pose_sessions", "test_calibrate_board", "test_boards", "test_repeats",
-    "test_view", "test_observe_search", "test_departures", "test_validate", "test_servo",
-    "test_paper_b", "test_check", "test_examples", "test_watch_command", "test_paper_c",
-    "test_handheld", "test_plan", "test_paper_a",
+    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_diagnose",
+    "test_study_workers", "test_calibration", "test_repeats", "test_camera_calibration",
+    "test_calibrate_board", "test_pose_sessions", "test_boards", "test_report_page",
+    "test_departures", "test_watch_command", "test_paper_b", "test_paper_c", "test_check",
+    "test_validate", "test_examples", "test_observe_search", "test_handheld", "test_plan",
+    "test_paper_a", "test_servo", "test_bad_input", "test_bundle", "test_view",
+    "test_export_trees", "test_cli_camera", "test_servo_command", "test_reproduce_b",
+    "test_edge_noise", "test_reproduce",
 )  # fmt: skip
 
 
