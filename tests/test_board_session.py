@@ -270,11 +270,11 @@ def test_another_board_than_described(folder):
 
 
 def test_a_board_that_is_nowhere(found):
-    session, *_ = found
+    session, photographs, _ = found
     # one of it: where no board is, one of every other kind is looked for as well
     one = replace(session.stations[0], photographs=session.stations[0].photographs[:1])
     session = replace(session, stations=(one, *session.stations[1:]))
-    images = {0: [np.full((120, 160), 90, np.uint8)]}
+    images = {0: [np.full_like(photographs[0].images[0], 90)]}
     with pytest.raises(
         InputError, match="in none of the photographs of station station1"
     ) as caught:
