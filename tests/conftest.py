@@ -11,8 +11,9 @@ import shutil
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
 
@@ -23,6 +24,8 @@ from rendered import once
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.check.checked import SessionCheck
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,14 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_calibration", "test_fuzz", "test_cli",
-    "test_camera_calibration", "test_study_workers", "test_bad_input", "test_diagnose",
-    "test_bundle", "test_pose_sessions", "test_calibrate_board", "test_boards", "test_repeats",
-    "test_view", "test_observe_search", "test_departures", "test_validate", "test_servo",
-    "test_paper_b", "test_check", "test_examples", "test_watch_command", "test_paper_c",
-    "test_handheld", "test_plan", "test_paper_a",
+    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_diagnose",
+    "test_study_workers", "test_calibration", "test_repeats", "test_camera_calibration",
+    "test_calibrate_board", "test_pose_sessions", "test_boards", "test_report_page",
+    "test_departures", "test_watch_command", "test_paper_b", "test_paper_c", "test_check",
+    "test_validate", "test_examples", "test_observe_search", "test_handheld", "test_plan",
+    "test_paper_a", "test_servo", "test_bad_input", "test_bundle", "test_view",
+    "test_export_trees", "test_cli_camera", "test_servo_command", "test_reproduce_b",
+    "test_edge_noise", "test_reproduce",
 )  # fmt: skip
 
 
@@ -120,24 +125,30 @@ def demo(common) -> Demo:
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """The demonstration's session, calibrated, and the progress that was told."""
+class Told(Generic[Found]):
+    """What was found in the demonstration's session, and the progress that was told meanwhile."""
 
-    found: Calibration
+    found: Found
     told: list[tuple[str, float]]
 
 
+def told_once(folder: Path, find: Callable[..., Found]) -> Told[Found]:
+    """What ``find`` gives and tells, by the worker that asks first."""
+
+    def make() -> Told[Found]:
+        told: list[tuple[str, float]] = []
+        found = find(progress=lambda text, share: told.append((text, share)))
+        return Told(found, told)
+
+    return made_once(folder, make)
+
+
 @pytest.fixture(scope="session")
-def calibrating(demo, common) -> Calibrated:
+def calibrating(demo, common) -> Told[Calibration]:
     """The demonstration's session, calibrated from Python."""
     from pkmcal.calibration.calibrate import calibrate
 
-    def make() -> Calibrated:
-        told: list[tuple[str, float]] = []
-        found = calibrate(demo.session, progress=lambda text, share: told.append((text, share)))
-        return Calibrated(found, told)
-
-    return made_once(common / "calibrated", make)
+    return told_once(common / "calibrated", partial(calibrate, demo.session))
 
 
 @pytest.fixture(scope="session")
@@ -146,25 +157,12 @@ def calibrated(calibrating) -> Calibration:
     return calibrating.found
 
 
-@dataclass(frozen=True)
-class Checked:
-    """What the check found in the demonstration's session, and the progress that it told."""
-
-    found: SessionCheck
-    told: list[tuple[float, str]]
-
-
 @pytest.fixture(scope="session")
-def checked(demo, common) -> Checked:
+def checked(demo, common) -> Told[SessionCheck]:
     """The demonstration's session, checked from Python."""
     from pkmcal.check.check import check_session
 
-    def make() -> Checked:
-        told: list[tuple[float, str]] = []
-        found = check_session(demo.session, progress=lambda text, share: told.append((share, text)))
-        return Checked(found, told)
-
-    return made_once(common / "checked", make)
+    return told_once(common / "checked", partial(check_session, demo.session))
 
 
 @pytest.fixture

@@ -45,7 +45,9 @@ def off(result, truth):
     return float(np.mean(error / variance))
 
 
-@pytest.mark.parametrize("factor", [0.8, pytest.param(1.0, marks=pytest.mark.slow), 3.0])
+@pytest.mark.parametrize(
+    "factor", [0.8, *(pytest.param(factor, marks=pytest.mark.slow) for factor in (1.0, 3.0))]
+)
 def test_scale_and_shading_are_found(factor):
     """Of noise that is stated a quarter too large or three times too small, beside shading."""
     rng = np.random.default_rng(4)

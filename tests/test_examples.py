@@ -109,7 +109,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pkmcal.api.simulate.demo_camera", lambda: camera_of_size((320, 240)))
+    monkeypatch.setattr("pkmcal.api.simulate.demo_camera", lambda: camera_of_size((240, 180)))
     namespace: dict[str, object] = {}
     for cell in BOOK["cells"]:
         if cell["cell_type"] == "code":

@@ -202,18 +202,54 @@ def browse(page: str, folder: Path, width: int) -> tuple[str, str]:
     return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_page_runs_in_a_browser(page, tmp_path, width):
-    """Nothing fails, nothing sticks out, the plot stands, the table sorts, a picture opens."""
-    act = """<script>addEventListener("load", () => {
-      document.querySelector('th[data-sort="2"] button').click();
-      document.querySelector(".enlarge").click();
-    });</script></body>"""
-    document, console = browse(page.replace("</body>", act), tmp_path, width)
+OPENED = """
+  document.querySelector('th[data-sort="2"] button').click();
+  document.querySelector(".enlarge").click();"""
+LED = """
+  const tell = document.documentElement.dataset;
+  const plot = document.getElementById("plot-photographed");
+  const width = () => plot.querySelector(".main-svg").getAttribute("width");
+  const wait = setInterval(() => {
+    if (plot.dataset.drawn !== "yes") return;
+    clearInterval(wait);
+    document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
+    tell.bar = location.hash;
+    plot.emit("plotly_click", { points: [{ customdata: "#photograph-1-2" }] });
+    tell.point = location.hash;
+    tell.screen = width();
+    dispatchEvent(new Event("beforeprint"));
+    tell.paper = width();
+    tell.low = plot.querySelector(".main-svg").getAttribute("height")
+      / parseFloat(plot.style.getPropertyValue("--tall"));
+    tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
+    dispatchEvent(new Event("afterprint"));
+    setInterval(() => {
+      tell.again = width();
+      tell.printed = [...document.querySelectorAll(".in-space img.printed")]
+        .map((image) => image.naturalWidth).join();
+    }, 100);
+  }, 50);"""
+
+
+def fine(document: str, console: str) -> dict[str, str | None]:
+    """What the page tells of itself; nothing failed and nothing sticks out."""
     root = Found(document).tags[0][1]
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    return root
+
+
+def loaded(page: str, *acts: str) -> str:
+    """The page with what is done as soon as it is there."""
+    did = "\n".join(f'addEventListener("load", () => {{{act}\n}});' for act in acts)
+    return page.replace("</body>", f"<script>{did}</script></body>")
+
+
+def test_page_runs_in_a_browser(page, tmp_path):
+    """On a telephone: the plot stands, the table sorts, a picture opens."""
+    document, console = browse(loaded(page, OPENED), tmp_path, 390)
+    fine(document, console)
     tags = Found(document).tags
     assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
     assert any(tag == "canvas" for tag, _ in tags)
@@ -231,36 +267,11 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
 
 
 def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
-    """A bar's link and a plot's point go to their photograph; on paper, plots are as wide as it."""
-    act = """<script>addEventListener("load", () => {
-      const tell = document.documentElement.dataset;
-      const plot = document.getElementById("plot-photographed");
-      const width = () => plot.querySelector(".main-svg").getAttribute("width");
-      const wait = setInterval(() => {
-        if (plot.dataset.drawn !== "yes") return;
-        clearInterval(wait);
-        document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
-        tell.bar = location.hash;
-        plot.emit("plotly_click", { points: [{ customdata: "#photograph-1-2" }] });
-        tell.point = location.hash;
-        tell.screen = width();
-        dispatchEvent(new Event("beforeprint"));
-        tell.paper = width();
-        tell.low = plot.querySelector(".main-svg").getAttribute("height")
-          / parseFloat(plot.style.getPropertyValue("--tall"));
-        tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
-        dispatchEvent(new Event("afterprint"));
-        setInterval(() => {
-          tell.again = width();
-          tell.printed = [...document.querySelectorAll(".in-space img.printed")]
-            .map((image) => image.naturalWidth).join();
-        }, 100);
-      }, 50);
-    });</script></body>"""
-    document, console = browse(page.replace("</body>", act), tmp_path, 1280)
-    root = Found(document).tags[0][1]
-    assert root["data-errors"] == ""
-    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    """On a screen: a bar's link and a plot's point go to their photograph; on paper, plots are as
+    wide as it.
+    """
+    document, console = browse(loaded(page, OPENED, LED), tmp_path, 1280)
+    root = fine(document, console)
     assert str(root["data-bar"]).startswith("#photograph-")
     assert root["data-point"] == "#photograph-1-2"
     assert root["data-paper"] == "672"

@@ -136,11 +136,11 @@ def test_workers_that_die_are_replaced(monkeypatch):
 
     setting = JointByAxes(replace(JointByAxes().axes, poses=4, batch=2))
     # long enough for the one in its place to begin, too
-    many = engine.run(Counting(takes=0.04), 1500, 1, told)
-    assert len(done) == 300
+    many = engine.run(Counting(takes=0.04), 750, 1, told)
+    assert len(done) == 150
     assert len(begun) == 2  # beside this process one, and the one in its place
     monkeypatch.setattr(workers, "cores", lambda: 1)
-    one = engine.run(Counting(), 1500, 1)
+    one = engine.run(Counting(), 750, 1)
     np.testing.assert_array_equal(*(r.values("x", *ESTIMATE) for r in (many, one)))
     assert engine.run(setting, 4, 0).values("position", *ESTIMATE).shape == (4,)
 
