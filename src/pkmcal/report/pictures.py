@@ -21,7 +21,15 @@ from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.drawn import CURVE, Drawn, Spot, edge_name, measured_curves, polyline
+from pkmcal.report.drawn import (
+    CURVE,
+    Drawn,
+    Spot,
+    edge_name,
+    measured_curves,
+    polyline,
+    residual_words,
+)
 from pkmcal.report.jpegs import small_and_large
 from pkmcal.report.links import Links, Place
 from pkmcal.report.residuals import KEPT
@@ -264,10 +272,9 @@ class _Found:
             across, tilt = estimate.edge_residuals[n].tolist()
             leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
             tip = (
-                f"{edge_name(leg, tube, side).capitalize()}: "
-                f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
-                f"{number(across, 1, signed=True)} σ across, "
-                f"{number(tilt, 1, signed=True)} σ tilt; weight {number(weight, 2)}"
+                f"{edge_name(leg, tube, side).capitalize()}:"
+                f" {number(float(shifts[n]), 2, signed=True)} px outward;"
+                f" {residual_words(across, tilt, weight)}"
             )
             drawn = polyline(leg, curve, weight < KEPT, tip)
             if drawn:
