@@ -104,7 +104,7 @@ def test_closure_is_model_12s():
         [np.cos(ALPHA) * np.cos(turn), np.sin(ALPHA) * np.cos(turn), -np.sin(turn)], axis=-1
     )
     rods = pa(poses, IDENTIFIED, ALPHA) - IDENTIFIED["a"] * e
-    found = closure(machine.layout, machine.values, q, poses).value
+    found = closure(machine.layout, machine.values, q, poses).rows.value
     expected = np.linalg.norm(rods, axis=-1) - IDENTIFIED["f"]
     np.testing.assert_allclose(found, expected, atol=3e-14)
 
@@ -188,9 +188,8 @@ def test_newton_of_the_rods_is_well_conditioned():
     machine = load_mechanism("h4-rods")
     poses = papers_poses()
     readings, phi = kinematics.inverse_result(machine.layout, machine.values, poses)
-    by_motion = by_own(
-        machine.layout, closure(machine.layout, machine.values, readings, poses, phi)
-    )
+    c = closure(machine.layout, machine.values, readings, poses, phi)
+    by_motion = by_own(machine.layout, c.rows)
     assert by_motion.shape[-2:] == (8, 8)
     centres = machine.platform_centers()
     radius = np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))
@@ -209,15 +208,15 @@ def test_closure_derivatives_of_the_rods():
     pick = layout.row_motor[:, None] == np.arange(4)
     cases = [
         (dense(c, len(theta)), lambda d: closure(layout, theta + d, q, poses, phi), len(theta)),
-        (c.by_pose, lambda d: closure(layout, theta, q, perturb(poses, d), phi), 6),
-        (c.by_internal, lambda d: closure(layout, theta, q, poses, phi + d), 2),
+        (c.rows.by_pose, lambda d: closure(layout, theta, q, perturb(poses, d), phi), 6),
+        (c.rows.by_internal, lambda d: closure(layout, theta, q, poses, phi + d), 2),
         (c.by_reading[:, None] * pick, lambda d: closure(layout, theta, q + d, poses, phi), 4),
     ]
     for found, function, count in cases:
         oracle = np.stack(
             [
                 sum(
-                    w * (function(i * by).value - function(-i * by).value)
+                    w * (function(i * by).rows.value - function(-i * by).rows.value)
                     for i, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
                 )
                 / 1e-3
@@ -243,7 +242,7 @@ def ranks(machine, poses):
     layout, readings = machine.layout, machine.inverse(poses)
     c = closure(layout, machine.values, readings, poses)
     by_theta = dense(c, len(machine.values)) @ machine.parameters.free_matrix()
-    by_pose = c.by_pose @ layout.motion
+    by_pose = c.rows.by_pose @ layout.motion
     # camera and board move the measured pose; joint residuals see four of its six numbers
     frames = pose_generators(poses)
     joint = np.concatenate([by_theta, by_pose @ layout.motion.T @ frames], axis=-1)

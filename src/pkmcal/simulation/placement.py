@@ -111,11 +111,11 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     layout, values, home = machine.layout, machine.values, machine.home()
     at_home = closure(layout, values, machine.inverse(home[None])[0], home)
     c = closure(layout, values, joints, T_base_platform)
-    jac, home_jac = (x.by_pose @ layout.motion for x in (c, at_home))
-    good = np.abs(c.value).max(axis=-1) < 1e-9
+    jac, home_jac = (x.rows.by_pose @ layout.motion for x in (c, at_home))
+    good = np.abs(c.rows.value).max(axis=-1) < 1e-9
     # a machine that is weak at home is weak everywhere; it is not refused for that
-    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.by_pose)))
-    good &= singularity(layout, values, c.by_pose) > least
+    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.rows.by_pose)))
+    good &= singularity(layout, values, c.rows.by_pose) > least
     if jac.shape[-1] == jac.shape[-2]:
         with np.errstate(invalid="ignore"):  # where there is no Jacobian, nothing is usable
             good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
