@@ -70,10 +70,9 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
     Returns unit n (..., 3), NaN where the centre of projection lies inside the cylinder.
     """
     distance = np.sqrt(dot(m, m))
-    with np.errstate(invalid="ignore"):
-        sin = np.where(distance > np.abs(radius), radius / distance, np.nan)[..., None]
+    sine, cosine = (x[..., None] for x in edge_planes(distance, radius, sign))
     m_unit = m / distance[..., None]
-    return sign[..., None] * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)
+    return cosine * m_unit - sine * cross(u, m_unit)
 
 
 def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:

@@ -400,7 +400,7 @@ def _outside(
     distance: float,
     azimuth: float,
     rng: np.random.Generator,
-    elevation: float | None = None,
+    elevation: float | None,
 ) -> StationPlace:
     """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
     centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, _radius(points)
