@@ -10,7 +10,8 @@ from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.closure import by_own, closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends, rod_lengths
+from pkmcal.report.photographed import limbs_of
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,
@@ -195,6 +196,17 @@ def test_newton_of_the_rods_is_well_conditioned():
     radius = np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))
     condition = np.linalg.cond(by_motion / np.array([radius] * 3 + [1] * 3 + [radius] * 2))
     assert 8 < condition.min() < condition.max() < 15
+
+
+def test_limbs_are_drawn_where_the_hinges_turn_them():
+    """Every rod as long as it is; with bars that do not turn it would be off by centimetres."""
+    machine, poses = load_mechanism("h4-rods"), papers_poses()
+    joints = machine.inverse(poses)
+    limbs = limbs_of(machine, joints, poses)
+    rods = rod_lengths(machine.layout, machine.values, joints)
+    np.testing.assert_allclose(np.linalg.norm(limbs.b - limbs.a, axis=-1), rods, atol=1e-12)
+    unturned = limb_ends(machine.layout, machine.values, joints, poses).b
+    assert np.abs(unturned - limbs.b).max() > 0.01
 
 
 def test_closure_derivatives_of_the_rods():

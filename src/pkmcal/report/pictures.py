@@ -14,7 +14,6 @@ from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import Pictures
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
@@ -317,9 +316,9 @@ class _Found:
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
         base, platform = (side.T_calibrated_drawing for side in centres)
-        after = limb_ends(estimate.machine.layout, estimate.machine.values, joints, pose)
+        after = estimate.machine.ends_at(joints, pose)
         old_pose = inverse(base) @ pose @ platform
-        before = limb_ends(session.machine.layout, session.machine.values, joints, old_pose)
+        before = session.machine.ends_at(joints, old_pose)
         seen = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
         drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
         inside = camera.in_image(seen)

@@ -17,7 +17,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse, look_at, perturb, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import closure, limb_ends
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import on_manifold, singularity
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
@@ -173,7 +173,7 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
     another. Legs that meet in a joint, as in drawings that know no more of a platform than a point,
     come near each other nowhere else.
     """
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     # components slowest: every point of a leg meets every point of another, long rows of numbers
@@ -447,7 +447,7 @@ def share_in_image(
     machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> Array:
     """Part of each leg that lies in the image, (K, L), for poses (K, 4, 4) and readings (K, m)."""
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.96, 12)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     pixels = camera.project(apply(T_camera_base, points))
