@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, limb_ends
+from pkmcal.mechanisms.closure import joint_values
 from pkmcal.wording import SCALES, decimals, joined, named, number, split_name, with_unit
 
 AXES = "xyz"
@@ -97,8 +97,7 @@ class Situation:
     def along(self) -> tuple[Array, Array]:
         """Mean direction (L, 3) of each leg, in the base frame and in the platform frame."""
         poses = self.T_base_platform
-        readings = np.zeros((len(poses), self.machine.n_joints))
-        ends = limb_ends(self.machine.layout, self.machine.values, readings, poses)
+        ends = self.machine.ends_at(np.nan_to_num(self.readings), poses)
         u = ends.b - ends.a
         u = u / np.linalg.norm(u, axis=-1, keepdims=True)
         base, platform = (v.mean(axis=0) for v in (u, u @ poses[:, :3, :3]))
