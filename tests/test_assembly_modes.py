@@ -78,8 +78,8 @@ def test_every_mode_closes_the_machine_once(name):
     machine = load_mechanism(name)
     readings = machine.inverse(machine.home())
     found = machine.assembly_modes_result(readings, np.random.default_rng(0))
-    rows = closure(machine.layout, machine.values, readings, found.poses, found.internal)
-    assert np.abs(rows.value).max() < CONVERGED
+    c = closure(machine.layout, machine.values, readings, found.poses, found.internal)
+    assert np.abs(c.rows.value).max() < CONVERGED
     # home is the first, with its own sign
     np.testing.assert_allclose(found.poses[0], machine.home(), atol=1e-6)
     if machine.layout.overdetermined:  # no determinant tells its assemblies apart

@@ -52,7 +52,7 @@ def test_rows_in_the_other_order_of_memory_are_the_same(machine):
     other = rows_between(layout, theta, base, platform, last)
     assert is_batch_last(other.by_pose)
     for name in ("value", "by_pose", "by_internal"):
-        np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=1e-15)
+        np.testing.assert_allclose(getattr(other, name), getattr(plain.rows, name), atol=1e-15)
 
 
 @pytest.mark.parametrize(("rows", "unknowns"), [(3, 3), (6, 6), (8, 8), (8, 5), (1, 1)])

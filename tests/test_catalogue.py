@@ -114,13 +114,13 @@ def assert_as_the_oracle(machine, readings, T):
     rot, t = T[:3, :3], T[:3, 3]
     c = closure(layout, theta, readings, T)
     close = {"rtol": 1e-13, "atol": 1e-14}
-    np.testing.assert_allclose(c.value, oracle(machine, theta, readings, rot, t), **close)
+    np.testing.assert_allclose(c.rows.value, oracle(machine, theta, readings, rot, t), **close)
 
     def by_pose(d):
         turn = np.array([[0, -d[2], d[1]], [d[2], 0, -d[0]], [-d[1], d[0], 0]])
         return oracle(machine, theta, readings, rot + turn @ rot, t + d[3:])
 
-    np.testing.assert_allclose(c.by_pose, complex_steps(by_pose, 6), **close)
+    np.testing.assert_allclose(c.rows.by_pose, complex_steps(by_pose, 6), **close)
     by_theta = complex_steps(lambda d: oracle(machine, theta + d, readings, rot, t), len(theta))
     np.testing.assert_allclose(dense(c, len(theta)), by_theta, **close)
     by_reading = complex_steps(
@@ -156,7 +156,7 @@ def test_jacobians_at_random(machine):
 def test_jacobians_near_singular_poses(machine):
     poses = wide_poses(machine, 20_000, 2)
     c = closure(machine.layout, machine.values, machine.inverse(poses), poses)
-    size = kinematics.singularity(machine.layout, machine.values, c.by_pose)
+    size = kinematics.singularity(machine.layout, machine.values, c.rows.by_pose)
     assert size.min() < 0.01
     for k in np.argsort(size)[:5]:
         assert_as_the_oracle(machine, machine.inverse(poses[k]), poses[k])
@@ -171,7 +171,7 @@ def test_built_machines_move_as_drawn(machine):
         built = true_machine(machine, 1.0, np.random.default_rng(seed))
         assert loads_back(built)
         poses, joints = draw_configurations(built, 40, 0.5, np.random.default_rng(seed))
-        error = closure(built.layout, built.values, joints, poses).value
+        error = closure(built.layout, built.values, joints, poses).rows.value
         assert np.abs(error).max() < 1e-11
         found = built.forward(joints)
         np.testing.assert_allclose(found, poses, atol=1e-10)

@@ -104,7 +104,7 @@ def test_frames_change_no_reading(name):
     readings = machine.inverse(poses)
     known = np.isfinite(readings).all(axis=1)
     c = closure(machine.layout, moved.theta, readings[known], moved.T_base_platform[known])
-    np.testing.assert_allclose(c.value, 0, atol=1e-13)
+    np.testing.assert_allclose(c.rows.value, 0, atol=1e-13)
     back_e, back_f = alignment(machine, moved, default_gauge(machine))
     again = changed_frames(machine.layout, moved, back_e, back_f)
     again = machine.parameters.unit_axes(again.theta)

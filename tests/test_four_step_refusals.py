@@ -68,8 +68,8 @@ def test_stations_that_share_no_or_two_legs(hexapod):
     """Three cameras with three legs each: all of them fixed by their legs, none by the others."""
     three = np.array([[0, 1, 2], [3, 4, 5], [3, 4, 5]])
     error = refused(hexapod, hexapod.select(seen_by(hexapod, three)), "share too few legs")
-    assert "legs 1, 2 and 3 can move against those of legs 4, 5 and 6" in str(error)
-    assert "station 2 sees legs 4, 5 and 6" in str(error)
+    assert "legs 1 to 3 can move against those of legs 4 to 6" in str(error)
+    assert "station 2 sees legs 4 to 6" in str(error)
     assert "calibration board" in str(error)
     refused(hexapod, hexapod.select(seen_by(hexapod, THREE_BY_THREE)), "share too few legs")
     two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
@@ -117,7 +117,7 @@ def test_legs_that_are_never_seen_together(hexapod):
     refused(
         hexapod,
         part,
-        "platform joints of legs 1, 2 and 3 can move against those of legs 4, 5 and 6",
+        "platform joints of legs 1 to 3 can move against those of legs 4 to 6",
     )
     with_bridge = hexapod.select(
         ((edges.leg // 3) == edges.configuration % 2) | (edges.configuration > 15)
@@ -169,7 +169,7 @@ def test_lengths_that_the_distances_do_not_tell():
     k = np.arange(12)
     u = np.broadcast_to(u[None, :, None], (1, 12, 6, 3)).copy()
     axes = Axes(0 * k, k, np.ones((12, 6), dtype=bool), u, 0 * u, np.zeros((1, 12, 6)))
-    with pytest.raises(ResultError, match="do not tell the lengths of legs 1, 2, 3, 4, 5 and 6"):
+    with pytest.raises(ResultError, match="do not tell the lengths of legs 1 to 6"):
         checks.lengths_are_fixed(
             scene.drawing,
             axes,
@@ -210,7 +210,7 @@ def test_counts_of_the_papers_own_example():
     seen[:, 3:] = False
     found = by_equation("gough-stewart", seen)
     assert not found["[A] 3.3"].met
-    assert "legs 4, 5 and 6" in found["[A] 3.3"].text
+    assert "legs 4 to 6" in found["[A] 3.3"].text
     assert (found["[A] 11, 12"].available, found["[A] 11, 12"].met) == (4, False)
 
 

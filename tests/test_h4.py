@@ -10,7 +10,8 @@ from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.closure import by_own, closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends, rod_lengths
+from pkmcal.report.photographed import limbs_of
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,
@@ -104,7 +105,7 @@ def test_closure_is_model_12s():
         [np.cos(ALPHA) * np.cos(turn), np.sin(ALPHA) * np.cos(turn), -np.sin(turn)], axis=-1
     )
     rods = pa(poses, IDENTIFIED, ALPHA) - IDENTIFIED["a"] * e
-    found = closure(machine.layout, machine.values, q, poses).value
+    found = closure(machine.layout, machine.values, q, poses).rows.value
     expected = np.linalg.norm(rods, axis=-1) - IDENTIFIED["f"]
     np.testing.assert_allclose(found, expected, atol=3e-14)
 
@@ -188,14 +189,24 @@ def test_newton_of_the_rods_is_well_conditioned():
     machine = load_mechanism("h4-rods")
     poses = papers_poses()
     readings, phi = kinematics.inverse_result(machine.layout, machine.values, poses)
-    by_motion = by_own(
-        machine.layout, closure(machine.layout, machine.values, readings, poses, phi)
-    )
+    c = closure(machine.layout, machine.values, readings, poses, phi)
+    by_motion = by_own(machine.layout, c.rows)
     assert by_motion.shape[-2:] == (8, 8)
     centres = machine.platform_centers()
     radius = np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))
     condition = np.linalg.cond(by_motion / np.array([radius] * 3 + [1] * 3 + [radius] * 2))
     assert 8 < condition.min() < condition.max() < 15
+
+
+def test_limbs_are_drawn_where_the_hinges_turn_them():
+    """Every rod as long as it is; with bars that do not turn it would be off by centimetres."""
+    machine, poses = load_mechanism("h4-rods"), papers_poses()
+    joints = machine.inverse(poses)
+    limbs = limbs_of(machine, joints, poses)
+    rods = rod_lengths(machine.layout, machine.values, joints)
+    np.testing.assert_allclose(np.linalg.norm(limbs.b - limbs.a, axis=-1), rods, atol=1e-12)
+    unturned = limb_ends(machine.layout, machine.values, joints, poses).b
+    assert np.abs(unturned - limbs.b).max() > 0.01
 
 
 def test_closure_derivatives_of_the_rods():
@@ -209,15 +220,15 @@ def test_closure_derivatives_of_the_rods():
     pick = layout.row_motor[:, None] == np.arange(4)
     cases = [
         (dense(c, len(theta)), lambda d: closure(layout, theta + d, q, poses, phi), len(theta)),
-        (c.by_pose, lambda d: closure(layout, theta, q, perturb(poses, d), phi), 6),
-        (c.by_internal, lambda d: closure(layout, theta, q, poses, phi + d), 2),
+        (c.rows.by_pose, lambda d: closure(layout, theta, q, perturb(poses, d), phi), 6),
+        (c.rows.by_internal, lambda d: closure(layout, theta, q, poses, phi + d), 2),
         (c.by_reading[:, None] * pick, lambda d: closure(layout, theta, q + d, poses, phi), 4),
     ]
     for found, function, count in cases:
         oracle = np.stack(
             [
                 sum(
-                    w * (function(i * by).value - function(-i * by).value)
+                    w * (function(i * by).rows.value - function(-i * by).rows.value)
                     for i, w in ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
                 )
                 / 1e-3
@@ -243,7 +254,7 @@ def ranks(machine, poses):
     layout, readings = machine.layout, machine.inverse(poses)
     c = closure(layout, machine.values, readings, poses)
     by_theta = dense(c, len(machine.values)) @ machine.parameters.free_matrix()
-    by_pose = c.by_pose @ layout.motion
+    by_pose = c.rows.by_pose @ layout.motion
     # camera and board move the measured pose; joint residuals see four of its six numbers
     frames = pose_generators(poses)
     joint = np.concatenate([by_theta, by_pose @ layout.motion.T @ frames], axis=-1)

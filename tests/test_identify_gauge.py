@@ -46,7 +46,7 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     c = gauge.constraints(machine)
     np.testing.assert_allclose(c @ told.theta, c @ machine.parameters.drawing, atol=1e-14)
     legs = closure(machine.layout, told.theta, scene.joints[0], told.T_base_platform)
-    np.testing.assert_allclose(legs.value, 0, atol=1e-13)
+    np.testing.assert_allclose(legs.rows.value, 0, atol=1e-13)
     base, _ = centre_index(machine.layout)
     seen = [move(s.T_camera_base[:, None], s.theta[base]) for s in (state, told)]
     np.testing.assert_allclose(seen[0], seen[1], atol=1e-13)

@@ -19,12 +19,12 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.load import load_session
-from pkmcal.solver import damped_step
 from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
 from pkmcal.studies.tasks import Batch
 from test_identify_scene import FOCAL, guess, make_scene
 from test_pose_sessions import make
+from test_solver import damped_step
 
 
 def derivatives(problem, state, shared, own, h=1e-4):

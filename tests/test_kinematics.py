@@ -183,19 +183,19 @@ def assert_exact_derivatives(machine, readings, T, step=1e-3):
     lengths over the step by rounding, and less by truncation."""
     layout, theta = machine.layout, machine.values
     c = closure(layout, theta, readings, T)
-    tight = {"rtol": 0, "atol": 2e-15 * max(1.0, c.distance.max()) / step}
+    tight = {"rtol": 0, "atol": 2e-15 * max(1.0, c.rows.distance.max()) / step}
     np.testing.assert_allclose(
-        c.by_pose,
-        differences(lambda d: closure(layout, theta, readings, perturb(T, d)).value, 6, step),
+        c.rows.by_pose,
+        differences(lambda d: closure(layout, theta, readings, perturb(T, d)).rows.value, 6, step),
         **tight,
     )
     np.testing.assert_allclose(
         dense(c, len(theta)),
-        differences(lambda d: closure(layout, theta + d, readings, T).value, len(theta), step),
+        differences(lambda d: closure(layout, theta + d, readings, T).rows.value, len(theta), step),
         **tight,
     )
     oracle = differences(
-        lambda d: closure(layout, theta, readings + d, T).value, machine.n_joints, step
+        lambda d: closure(layout, theta, readings + d, T).rows.value, machine.n_joints, step
     )
     found = np.zeros(oracle.shape)
     found[layout.driven_rows, layout.row_motor[layout.driven_rows]] = c.by_reading[

@@ -301,10 +301,10 @@ def test_jacobians_against_complex_steps(machine):
         return oracle(machine, theta + d_theta, readings + d_readings, rot, T[:3, 3] + d_pose[3:])
 
     close = {"rtol": 1e-12, "atol": 1e-13}
-    np.testing.assert_allclose(c.value, rows(), **close)
+    np.testing.assert_allclose(c.rows.value, rows(), **close)
     by_theta = steps(lambda d: rows(d_theta=d), len(theta))
     np.testing.assert_allclose(dense(c, len(theta)), by_theta, **close)
-    np.testing.assert_allclose(c.by_pose, steps(lambda d: rows(d_pose=d), 6), **close)
+    np.testing.assert_allclose(c.rows.by_pose, steps(lambda d: rows(d_pose=d), 6), **close)
     by_readings = steps(lambda d: rows(d_readings=d), 6)
     np.testing.assert_allclose(np.diag(c.by_reading), by_readings, **close)
 

@@ -19,9 +19,11 @@ from pkmcal.calibration.repeats import (
     axis_coordinates,
     by_ends,
     fit_motions,
+    require_repeats,
     study_repeats,
 )
 from pkmcal.commands.comparison import compare
+from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.measurements import concatenate
@@ -473,6 +475,18 @@ def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypa
     assert "the session has no repeated photographs" in told.err
     assert "images/station1/{configuration}_{repeat}.png" in told.err
     assert "images/station1/0001_1.png" in told.err
+
+
+def test_repeats_are_asked_of_cameras_that_stand(demo):
+    """Those by hand have a place for each photograph, and none of their own in session.yaml."""
+    session = load_session(demo.session)
+    first, *rest = session.stations
+    by_hand = replace(first, name="by hand/1", handheld=True)
+    with pytest.raises(InputError, match=f"stations.{rest[0].name}.images"):
+        require_repeats(replace(session, stations=(by_hand, *rest)))
+    for stations in ((by_hand,), ()):
+        with pytest.raises(InputError, match="no camera that stands in one place"):
+            require_repeats(replace(session, stations=stations))
 
 
 def test_check_repeat_of_a_broken_session_says_what_is_broken(session):

@@ -180,7 +180,7 @@ def test_camera_position_sigma(case):
 
 def test_outward_shift_is_found_in_pixels(case):
     edges, estimate = case.observation.edges, case.estimate
-    numbers = residuals.camera_numbers(case.session)
+    numbers = case.session.camera_of_station
     got = residuals.outward_shift(edges, estimate, case.session.joints, numbers)
     np.testing.assert_allclose(got, OUTWARD, atol=2e-3)  # second order in the shift
 

@@ -143,10 +143,10 @@ def test_derivatives_by_scales_and_readings(name):
     found = dense(c, len(theta))
     for k in machine.parameters.of_kind("scale"):
         step = h * np.eye(len(theta))[k]
-        up, down = (closure(layout, theta + s * step, q, T, phi).value for s in (1, -1))
+        up, down = (closure(layout, theta + s * step, q, T, phi).rows.value for s in (1, -1))
         np.testing.assert_allclose(found[..., k], (up - down) / (2 * h), atol=1e-8)
     for m, step in enumerate(h * np.eye(machine.n_joints)):
-        up, down = (closure(layout, theta, q + s * step, T, phi).value for s in (1, -1))
+        up, down = (closure(layout, theta, q + s * step, T, phi).rows.value for s in (1, -1))
         by = c.by_reading * layout.of_motor[:, m]
         np.testing.assert_allclose(by, (up - down) / (2 * h), atol=1e-8)
 

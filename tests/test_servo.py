@@ -459,7 +459,7 @@ def test_three_legs_are_warned_of(eye):
     found = study(scene_of(eye, (0, 1, 2)), Plan(replace(SHORT, law="directions"), runs=8))
     words = judgement(found)
     assert not words.usable
-    assert "legs 1, 2 and 3 should not be used" in words.headline
+    assert "legs 1 to 3 should not be used" in words.headline
     warned = " ".join(words.warnings)
     assert "hardly show some motion" in warned
     assert "not the only pose at which the control can rest" in warned

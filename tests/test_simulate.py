@@ -264,7 +264,7 @@ def test_edges_have_the_stated_noise(setting):
     exact, joints = simulate_edges(
         machine, T_camera_base, CAMERA, poses, EdgeNoise(1e-9, 1e-9), rng, joint_noise=0.0
     )
-    assert np.abs(closure(machine.layout, machine.values, joints, poses).value).max() < 1e-12
+    assert np.abs(closure(machine.layout, machine.values, joints, poses).rows.value).max() < 1e-12
     for e in range(0, len(exact), 97):
         _check_exact(machine, T_camera_base, poses, exact, e)
     once, _ = simulate_edges(machine, T_camera_base, CAMERA, many, EdgeNoise(1e-9, 1e-9), rng)
@@ -423,7 +423,7 @@ def test_truth_is_consistent_and_reads_back(simulated, machine):
     again = load_truth(folder, machine)
     for kept in (truth, again):
         c = closure(kept.machine.layout, kept.machine.values, kept.joints, kept.T_base_platform)
-        assert np.abs(c.value).max() < 1e-12
+        assert np.abs(c.rows.value).max() < 1e-12
     np.testing.assert_array_equal(again.machine.values, truth.machine.values)
     np.testing.assert_array_equal(again.T_camera_base, truth.T_camera_base)
     np.testing.assert_array_equal(again.photographs, truth.photographs)

@@ -16,7 +16,7 @@ from pkmcal.solver import (
     StripLayout,
     Strips,
     column_space,
-    damped_step,
+    compact,
     eliminate,
     eliminated,
     final_weights,
@@ -54,6 +54,12 @@ def dense(linear: Linear, run: int) -> tuple[np.ndarray, np.ndarray]:
         jac[j * r : (j + 1) * r, na + j * d : na + (j + 1) * d] = linear.by_own[run, j]
     jac[k * r :, :na] = linear.shared_by
     return jac, np.concatenate([linear.value[run].ravel(), linear.shared_value[run]])
+
+
+def damped_step(linear: Linear, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A search's step: shared (B, na) and own (B, K, d)."""
+    shared, own = normal_equations([compact(linear)], damping).step(damping)
+    return shared, own[0]
 
 
 def test_undamped_step_equals_dense_least_squares():

@@ -17,6 +17,7 @@ from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.start import start_state
+from pkmcal.judge import new_data
 from pkmcal.judge.causes import magnification, magnified
 from pkmcal.judge.changes import change
 from pkmcal.judge.held import Trust, evidence, hold
@@ -225,6 +226,23 @@ def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
     page = (tmp_path / "1" / "watch.html").read_text()
     assert f"Left in place: {stayed.name}" in page
     assert "Left in place" not in (tmp_path / "0" / "watch.html").read_text()
+
+
+def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, stayed, monkeypatch):
+    """As those by hand are; the camera that was left in place is then another one's number."""
+    session = load_session(stayed.folder)
+    lost = replace(session.stations[0], name="by hand/1")
+    whole = replace(session, stations=(lost, *session.stations))
+
+    def without_the_first(saved, session, *rest):
+        return new_data.look(saved, session.of_stations([1], ("by hand/1 is left out",)), *rest)
+
+    monkeypatch.setattr("pkmcal.judge.watch.look", without_the_first)
+    found = watch(load(demo.calibration), whole, same_place=[stayed.name])
+    assert found.same_place == (stayed.name,)
+    assert not found.moved
+    assert not found.judged.changed
+    assert "by hand/1 is left out" in found.session.warnings
 
 
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):

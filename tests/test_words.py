@@ -229,6 +229,18 @@ def seen_from(*views, legs=6):
     return out
 
 
+@pytest.mark.parametrize("name", ["gough-stewart", "linear-delta", "delta"])
+def test_a_leg_grows_along_the_way_that_it_has_at_its_readings(name):
+    """With carriages and cranks where they were, and not at reading zero."""
+    machine = load_mechanism(name)
+    way = kinematics.closure_at(machine.layout, machine.values, machine.home()).rows.u[0]
+    change = {f"legs[1].base.center.{c}": -v for c, v in zip("xyz", way, strict=True)}
+    change |= {n: 1.0 for n in machine.parameters.names if n.startswith("legs[1].length")}
+    around = Situation(machine, np.ones((1, machine.n_legs), bool), machine.home()[None])
+    (sentence,) = describe(around, unit(machine, change)[None])
+    assert "it can grow while its base joint moves back along it" in sentence.text
+
+
 def test_a_hinge_is_found_through_the_joints_it_goes_through():
     machine, poses = hexapod()
     # in one plane a turn of some joints is a lift of others, and that is as true

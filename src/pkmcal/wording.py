@@ -62,17 +62,13 @@ def split_name(name: str) -> tuple[int | None, str]:
     return (int(match[1]), match[2]) if match else (None, name)
 
 
-def legs_named(numbers: Iterable[int], all_legs: int = 0) -> str:
-    """``all legs`` where their number is given, ``leg 3``, ``legs 1, 2 and 5``; from 1."""
-    found = sorted(set(numbers))
+def named(legs: Iterable[int], all_legs: int = 0) -> str:
+    """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0; ``all legs``
+    where their number is given.
+    """
+    found = sorted({int(leg) + 1 for leg in legs})
     if len(found) == all_legs and all_legs > 1:
         return "all legs"
-    return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
-
-
-def named(legs: Iterable[int]) -> str:
-    """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0."""
-    found = sorted({leg + 1 for leg in legs})
     if len(found) > 2 and found[-1] - found[0] == len(found) - 1:
         return f"legs {found[0]} to {found[-1]}"
     return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])

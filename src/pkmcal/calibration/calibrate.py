@@ -56,7 +56,7 @@ from pkmcal.identify.unidentified import (
     only_heights,
     seen_legs,
 )
-from pkmcal.identify.verdict import TOO_NOISY, RicherModel, judge
+from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -172,18 +172,15 @@ def calibrate(
         seen = _observe(session, seed, clock)
         try:
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
+            turns = found.turns
+            at = seen.known.T_camera_base
+            if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
+                seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
+                found = _identify(seen, refine_camera, method, seed, holdout, clock)
         except ResultError:
-            check_radii(seen, 0, refinement_of(seen.session, refine_camera), seed)
+            check_radii(seen, None, refine_camera, seed)
             raise
-        turns = found.turns
-        at = seen.known.T_camera_base
-        if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
-            seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-            found = _identify(seen, refine_camera, method, seed, holdout, clock)
-        estimate = found.turns.estimate
-        if estimate.statistics.noise_scale > TOO_NOISY:
-            kept = float(estimate.edge_weights.sum())
-            check_radii(seen, kept, refinement_of(seen.session, refine_camera), seed)
+        check_radii(seen, found.turns.estimate, refine_camera, seed)
         return _judge(seen, found, method, seed, clock)
 
 

@@ -15,10 +15,11 @@ import numpy as np
 
 from pkmcal.calibration.byhand import place
 from pkmcal.calibration.doubts import CURED
-from pkmcal.calibration.gather import CameraRefinement
+from pkmcal.calibration.gather import refinement_of
 from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.turns import take_turns
 from pkmcal.errors import PkmcalError
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.verdict import TOO_NOISY
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
@@ -26,23 +27,29 @@ from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.diagnose import diameters
 
 
-def check_radii(seen: SeenSession, kept: float, cameras: CameraRefinement, seed: int) -> None:
-    """Raise `InputError` where more edges agree with a machine of half the radii.
+def check_radii(
+    seen: SeenSession, estimate: Estimate | None, refine_camera: bool, seed: int
+) -> None:
+    """Raise `InputError` where nothing comes of the photographs that may be used, and more of their
+    edges agree with a machine of half the radii.
 
-    Asked where with the drawing's radii nothing comes of them that may be used. kept : edges that
-    fitted then. cameras : as they were before the estimate. seed : of the search for the stations.
+    estimate : with the drawing's radii, None where there is none. refine_camera : whether it
+    estimated the cameras. seed : of the search for the stations.
     """
-    if not seen.photographs:
+    bad = estimate is None or estimate.statistics.noise_scale > TOO_NOISY
+    if not bad or not seen.photographs:
         return
     thinner = replace(seen.session, machine=_of_half_the_radii(seen.session.machine))
     try:
         rng = np.random.default_rng(seed)
         again = place(thinner, seen.photographs, seen.boards, rng)
+        cameras = refinement_of(again.session, refine_camera)
         turns = take_turns(again, cameras, lambda _text, _share: None, lambda _step: None)
     except PkmcalError:  # it is not found in these photographs, or not known by them
         return
     found = turns.estimate
     cured = found.statistics.noise_scale <= CURED * TOO_NOISY
+    kept = 0.0 if estimate is None else estimate.edge_weights.sum()
     if cured and found.edge_weights.sum() > kept:
         raise diameters(seen.session.document["mechanism"])
 

@@ -60,6 +60,8 @@ DISAGREES = 2.0
 one of these in twenty is chance."""
 SURELY = 3.0
 """Standard deviations by which a reading's scale is told to be another than the drawing's."""
+SPEAKS = 60.0
+"""Chi2 by which the drawing has to speak for a common factor on all lengths."""
 HOPELESS = 50.0
 """Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
 richer model no help: what is believed ends below ENOUGH."""
@@ -111,11 +113,9 @@ def in_doubt(estimate: Estimate) -> bool:
     )
 
 
-def wrong_scale(estimate: Estimate, chance: float = 60.0) -> float:
+def wrong_scale(estimate: Estimate) -> float:
     """How much larger all lengths came out than the drawing's, 1 where no common factor explains
     it: a board whose squares are larger than written makes the whole machine larger.
-
-    chance : chi2 by which the drawing has to speak for the factor.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -129,7 +129,7 @@ def wrong_scale(estimate: Estimate, chance: float = 60.0) -> float:
     back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
     gain = np.sum(weight * (new - old) ** 2) - np.sum(weight * (back * new - old) ** 2)
     left = np.sum(weight * (back * new - old) ** 2)
-    return 1 / back if gain > chance and gain > left else 1.0
+    return 1 / back if gain > SPEAKS and gain > left else 1.0
 
 
 def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:

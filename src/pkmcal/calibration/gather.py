@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, numbered, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
@@ -181,9 +181,6 @@ def measurements_of(
     cameras: CameraRefinement | None = None,
 ) -> Measurements:
     """What is measured; no cameras at a first look, which is too coarse to refine any."""
-    number = numbered(station.camera_file for station in session.stations)
-    # A tracker has no camera; the first one's number moves nothing of what it measured.
-    number = np.pad(number, (0, len(session.trackers)))
     # What targets are fixed to: the board, then each tracker's own.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
@@ -206,8 +203,8 @@ def measurements_of(
         edges=edges,
         joints=session.joints,
         joint_noise=session.joint_noise,
-        n_stations=len(number),
-        camera_of_station=number,
+        n_stations=len(session.station_names),
+        camera_of_station=session.camera_of_station,
         poses=concatenate(sets),
         mounts=tuple(mounts),
         level=np.array(

@@ -152,6 +152,7 @@ def study_repeats(
         session = load_session(session)
     require_repeats(session)
     calibration = calibrate(session, seed=seed, progress=progress)
+    session = calibration.session  # without photographs by hand that were not placed
     observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
     looks = [_Look.of(calibration, photographs) for photographs in observed]
     looks = [look for look in looks if np.any(look.same.count > 1)]
@@ -168,7 +169,16 @@ def require_repeats(session: Session) -> None:
         rows = [photo.configuration for photo in station.photographs]
         if _sees_legs(station) and len(set(rows)) < len(rows):
             return
-    name = session.stations[0].name
+    name = next((s.name for s in session.stations if not s.handheld), None)
+    if name is None:
+        raise InputError(
+            "the session has no repeated photographs",
+            where="session.yaml, stations",
+            found="no camera that stands in one place",
+            expected="a station from which configurations were photographed several times",
+            next_step="Put a camera on a tripod and photograph some configurations several times,"
+            " moving nothing in between",
+        )
     raise InputError(
         "the session has no repeated photographs",
         where=f"session.yaml, stations.{name}.images",

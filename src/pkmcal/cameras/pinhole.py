@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, final
@@ -79,6 +80,27 @@ def undistort(target: Array, k: Array) -> Array:
     return np.where(good[..., None], xy, np.nan)
 
 
+def in_pixels(parameters: Array, good: Booleans, distorted: Array) -> Array:
+    """Pixels (..., 2) of what :func:`distort` gives, NaN where it is not good (...); parameters :
+    of a camera whose focal lengths and centre come first.
+    """
+    focal, center = parameters[:2].tolist(), parameters[2:4].tolist()
+    return of_components(
+        *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
+    )
+
+
+def moved_in_pixels(parameters: Array, moved: Sequence[Array], by_xy: Array | None) -> Array:
+    """How pixels move (..., 2) as the undistorted x and y (...) do; by_xy : the derivative of
+    :func:`distort` there, None where the lens has none.
+    """
+    x, y = moved
+    if by_xy is not None:
+        x, y = (by_xy[..., k, 0] * moved[0] + by_xy[..., k, 1] * moved[1] for k in (0, 1))
+    focal = parameters[:2].tolist()
+    return of_components(focal[0] * x, focal[1] * y)
+
+
 def unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
     """True before the place where the lens model folds the image back.
 
@@ -146,7 +168,7 @@ class Pinhole(Camera):
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
         good, _, _, distorted, _ = self._imaged(points)
-        return self._pixels(good, distorted)
+        return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
         """All from one pass through the lens, if there is one."""
@@ -156,11 +178,8 @@ class Pinhole(Camera):
         for d in directions:
             # x/z and y/z move by (dx - x/z dz) / z
             own = [(d[..., k] - xy[..., k] * d[..., 2]) / z for k in (0, 1)]
-            if by_xy is not None:
-                own = [by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1)]
-            scaled = zip(self.parameters[:2].tolist(), own, strict=True)
-            moved.append(of_components(*(focal * part for focal, part in scaled)))
-        return self._pixels(good, distorted), *moved
+            moved.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *moved
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
@@ -183,12 +202,6 @@ class Pinhole(Camera):
     def in_field(self, points: Array) -> Booleans:
         """In front of the camera, and before the lens polynomial folds back; (...)."""
         return self._imaged(points)[0]
-
-    def _pixels(self, good: Booleans, distorted: Array) -> Array:
-        focal, center = self.parameters[:2].tolist(), self.parameters[2:4].tolist()
-        return of_components(
-            *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
-        )
 
     def _by_point(self, z: Array, xy: Array, by_xy: Array | None) -> Array:
         """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""

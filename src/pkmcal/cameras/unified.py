@@ -15,7 +15,14 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.cameras.pinhole import distort, distort_by_coefficients, undistort, unfolded
+from pkmcal.cameras.pinhole import (
+    distort,
+    distort_by_coefficients,
+    in_pixels,
+    moved_in_pixels,
+    undistort,
+    unfolded,
+)
 from pkmcal.geometry.rigid import dot, of_components
 
 _LEAST = 1e-9
@@ -50,7 +57,7 @@ class Unified(Camera):
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field."""
         distorted, good = self._imaged(points)[2:4]
-        return self._pixels(good, distorted)
+        return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
         """All from one pass through the lens, if there is one."""
@@ -62,11 +69,8 @@ class Unified(Camera):
             # x / w moves by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
             dw = bend * dot(points, d) + d[..., 2]
             own = [(d[..., k] - xy[..., k] * dw) / depth for k in (0, 1)]
-            if by_xy is not None:
-                own = [by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1)]
-            scaled = zip(self.parameters[:2].tolist(), own, strict=True)
-            moved.append(of_components(*(focal * part for focal, part in scaled)))
-        return self._pixels(good, distorted), *moved
+            moved.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *moved
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
@@ -106,12 +110,6 @@ class Unified(Camera):
     def in_field(self, points: Array) -> Booleans:
         """Where one ray, and only one, has the point's image; (...)."""
         return self._imaged(points)[3]
-
-    def _pixels(self, good: Booleans, distorted: Array) -> Array:
-        focal, center = self.parameters[:2].tolist(), self.parameters[2:4].tolist()
-        return of_components(
-            *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
-        )
 
     def _five(self) -> Array:
         """Distortion in the pinhole's order, without a third radial term."""

@@ -19,7 +19,7 @@ from pkmcal.observe.quality import BLACK
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.planning.first import EdgesOf
 from pkmcal.simulation.placement import PANORAMIC, view_angle
-from pkmcal.wording import brief, capital, count, legs_named, listed
+from pkmcal.wording import brief, capital, count, listed, named
 
 WORTH = 1.2
 """Factor on a standard deviation from which its cause is worth advice: as much as half as many
@@ -102,7 +102,7 @@ def _hidden(look: Look) -> list[str]:
         share = f"{least[bad].mean():.0%}"
         where = f" (best from {station.name})" if len(seen) > 1 else ""
         out.append(
-            f"{capital(legs_named(bad + 1))} {'is' if bad.size == 1 else 'are'} hidden for"
+            f"{capital(named(bad))} {'is' if bad.size == 1 else 'are'} hidden for"
             f" {share}{where}, behind other legs or outside the photograph. Move the camera aside"
             " until the legs stand one beside the other, or back, or add a place that sees"
             f" {'it' if bad.size == 1 else 'them'}."
@@ -174,10 +174,10 @@ def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
     }
     tubes = tubes_of(look.session.machine)
     by_leg = [int((lost[:, tubes.leg == j]).sum()) for j in range(look.session.machine.n_legs)]
-    worst = np.flatnonzero(np.array(by_leg) > 2 * lost.sum() / len(by_leg)) + 1
-    where = f" {capital(legs_named(worst))} lose most." if worst.size > 1 else ""
+    worst = np.flatnonzero(np.array(by_leg) > 2 * lost.sum() / len(by_leg))
+    where = f" {capital(named(worst))} lose most." if worst.size > 1 else ""
     if worst.size == 1:
-        where = f" {capital(legs_named(worst))} loses most."
+        where = f" {capital(named(worst))} loses most."
     return [f"{said} {why[kind]}{where}"]
 
 

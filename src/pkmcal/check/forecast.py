@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, numbered
 from pkmcal.check.look import Look
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import information
 from pkmcal.observe.predict import tubes_of
-from pkmcal.planning.first import EdgesOf, FirstEdges, camera_numbers, first_edges
+from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
 from pkmcal.planning.information import tool_by_free
 from pkmcal.planning.plan import CAPTURE
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
@@ -154,7 +154,7 @@ def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
         machine,
         tuple(station.name for station in stations),
         T_camera_base,
-        camera_numbers(look.session, [s.photographs.station for s in stations]),
+        numbered(look.session.camera_of_station[[s.photographs.station for s in stations]]),
         look.session.joint_noise,
         tuple(LegsFrom(k, s.photographs.camera, T, pools) for k, (s, T, pools) in enumerate(seen)),
         shading=first.estimate.statistics.shading,

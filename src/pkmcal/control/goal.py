@@ -23,7 +23,7 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.velocities import sign_of
-from pkmcal.wording import legs_named
+from pkmcal.wording import named
 
 UNIT = 1e-6
 """By how much a normal's length may differ from 1: six digits written to a file."""
@@ -77,7 +77,7 @@ class Step:
 
 def motor_name(machine: Machine, column: int) -> str:
     """A reading by the leg, or legs, that it drives."""
-    return legs_named(np.flatnonzero(machine.layout.actuated == column) + 1)
+    return named(np.flatnonzero(machine.layout.actuated == column))
 
 
 def missing_clauses(
@@ -88,9 +88,9 @@ def missing_clauses(
     for k in np.flatnonzero(~used):
         left_out = np.isnan(goal[k]).any()
         why = "left out by the goal" if left_out else f"not seen ({reasons[k]})"
-        missing.setdefault(why, []).append(int(legs[k]) + 1)
+        missing.setdefault(why, []).append(int(legs[k]))
     return [
-        f"{legs_named(group)} {'are' if len(group) > 1 else 'is'} {why}"
+        f"{named(group)} {'are' if len(group) > 1 else 'is'} {why}"
         for why, group in missing.items()
     ]
 

@@ -43,7 +43,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.wording import legs_named
+from pkmcal.wording import named
 
 __all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
 
@@ -203,8 +203,8 @@ class VisualServo:
         if not at.closed:
             return self._stopped(sample, Status.UNREACHABLE, "")
         if not self._started and 2 * at.found.sum() < len(at.found):
-            legs = (self.seen.legs[at.found] + 1).tolist()
-            found = f"only {legs_named(legs)} found" if legs else "no leg was found"
+            legs = self.seen.legs[at.found].tolist()
+            found = f"only {named(legs)} found" if legs else "no leg was found"
             return self._stopped(sample, Status.NOT_FOUND, f"{found}; {NOT_FOUND}")
         return self._step(sample)
 
@@ -227,7 +227,7 @@ class VisualServo:
         self._pose = pose
         cosine = dot(sample.normals[used], self.goal.normals[used])
         if np.min(cosine) < 0:
-            far = legs_named(seen.legs[np.min(cosine, axis=1) < 0] + 1)
+            far = named(seen.legs[np.min(cosine, axis=1) < 0])
             why = f"{far} would turn by more than 90 degrees in the image; go there in parts"
             return self._stopped(sample, Status.TOO_FAR, why)
         u = directions_of(sample.normals[used])
@@ -341,7 +341,7 @@ class VisualServo:
         lost = "; ".join(self._lost(sample, used))
         if not used.any():
             return lost
-        left = f"{legs_named(self.seen.legs[used] + 1)} alone cannot show every motion"
+        left = f"{named(self.seen.legs[used])} alone cannot show every motion"
         return f"{left}; {lost}" if lost else left
 
     def _lost(self, sample: _Sample, used: Booleans) -> list[str]:

@@ -146,7 +146,7 @@ def legs_at(seen: SeenMachine, T_base_platform: Array, readings: Array | None = 
     c = closure_at(layout, theta, T_base_platform)
     if readings is not None:
         c = closure(layout, theta, readings, T_base_platform, c.internal)
-    return _of_closure(seen, c, c.u, T_base_platform[..., :3, 3])
+    return _of_closure(seen, c, c.rows.u, T_base_platform[..., :3, 3])
 
 
 def legs_from_image(
@@ -167,7 +167,7 @@ def legs_from_image(
     found = forward(layout, theta, readings, start)
     poses, internal = found.T_base_platform, found.internal
     c = closure(layout, theta, readings, poses, internal)
-    directions = np.array(np.broadcast_to(c.u, (*found.converged.shape, *c.u.shape[-2:])))
+    directions = np.array(np.broadcast_to(c.rows.u, (*found.converged.shape, *c.rows.u.shape[-2:])))
     directions[..., seen.legs, :] = u
     legs = _of_closure(seen, c, directions, poses[..., :3, 3])
     return moved_to(legs, legs.b.mean(axis=-2))
@@ -231,8 +231,8 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
     """
     layout, a_by_reading = c.layout, np.broadcast_to(c.a_by_reading, u.shape)
     b_by_internal = c.platform.by_internal
-    rows, hinges, by_reading = c.by_pose, c.by_internal, c.by_reading
-    if u is not c.u:
+    rows, hinges, by_reading = c.rows.by_pose, c.rows.by_internal, c.by_reading
+    if u is not c.rows.u:
         rows, hinges, by_reading = (np.array(x) for x in (rows, hinges, by_reading))
         keep, n = layout.closing, int(layout.closing.sum())
         own = u[..., keep, :]
@@ -244,7 +244,7 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
         a=np.broadcast_to(c.a, u.shape),
         b=np.broadcast_to(c.b, u.shape),
         u=u,
-        length=np.broadcast_to(c.distance, u.shape[:-1]),
+        length=np.broadcast_to(c.rows.distance, u.shape[:-1]),
         pivot=pivot,
         a_by_reading=a_by_reading,
         b_by_pose=np.broadcast_to(c.b_by_pose, (*u.shape, 6)),

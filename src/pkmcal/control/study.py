@@ -364,7 +364,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
     readings, internal = inverse_result(layout, theta, T_base_platform)
     unreached = np.flatnonzero(~np.isfinite(readings))
     c = closure(layout, theta, np.nan_to_num(readings), T_base_platform, internal)
-    gap = float(np.abs(c.value).max())
+    gap = float(np.abs(c.rows.value).max())
     if unreached.size or gap > CLOSED:
         raise InputError(
             "the machine cannot take this pose",

@@ -233,9 +233,9 @@ def corrected_pose(
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
     to_right = jac.mT @ information * weight[:, None, None]
-    closing = c.by_pose @ motion / LAG
+    closing = c.rows.by_pose @ motion / LAG
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
-    right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.value / LAG
+    right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.rows.value / LAG
     return perturb(T_base_platform, motion @ np.linalg.solve(normal, right))
 
 
@@ -336,7 +336,7 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         warm_up(blur)
     T = closed if _poor(found) else corrected_pose(seen, at.predicted, at.rows, found)
     correction = pose_difference(T, closed)
-    beside = np.abs(at.rows.closure.by_pose @ correction)
+    beside = np.abs(at.rows.closure.rows.by_pose @ correction)
     next_state = TrackState(closed, correction, found, blur, searched)
     reasons = _reasons(sight, at)
     return TrackedLegs(at.lines, found, reasons, T, True, float(beside.max()), next_state)

@@ -7,6 +7,7 @@ import numpy as np
 from pkmcal.control.analysis import Subset
 from pkmcal.control.study import Study, Trials
 from pkmcal.outcome import Verdict
+from pkmcal.wording import named
 
 ENOUGH = 0.9
 """Part of the runs with the identified geometry that must reach their goal."""
@@ -27,7 +28,7 @@ def judgement(found: Study) -> Verdict:
     share = good.reached / len(good.runs.end)
     usable = not own.blind and share >= ENOUGH
     law = found.plan.loop.law
-    legs = named(own, found)
+    legs = chosen_legs(own, found)
     headline = (
         f"Control by the {law} of {legs} brings the platform to its goal in {good.reached} of"
         f" {len(good.runs.end)} runs with the identified geometry."
@@ -45,11 +46,9 @@ def judgement(found: Study) -> Verdict:
     return Verdict(usable, headline, reasons, warnings, _advice(found))
 
 
-def named(choice: Subset, found: Study) -> str:
+def chosen_legs(choice: Subset, found: Study) -> str:
     """``all legs``, ``legs 1, 3 and 5``."""
-    from pkmcal.wording import legs_named
-
-    return legs_named([j + 1 for j in choice.legs], found.scene.machine.n_legs)
+    return named(choice.legs, found.scene.machine.n_legs)
 
 
 def _blind(found: Study) -> tuple[str, ...]:
@@ -57,8 +56,8 @@ def _blind(found: Study) -> tuple[str, ...]:
     if not found.own.blind:
         return ()
     return (
-        f"The {found.plan.loop.law} of {named(found.own, found)} stay the same under some motion of"
-        " the platform, at every pose; the control leaves that motion alone.",
+        f"The {found.plan.loop.law} of {chosen_legs(found.own, found)} stay the same under some"
+        " motion of the platform, at every pose; the control leaves that motion alone.",
     )
 
 
@@ -75,16 +74,16 @@ def _fading(found: Study) -> tuple[str, ...]:
         return ()
     part = own.worst / own.usual
     return (
-        f"There are poses in the workspace at which {named(own, found)} hardly show some motion of"
-        f" the platform (visibility falls to {100 * part:.1g} % of its usual value): near them the"
-        " control is singular, and beyond them it may come to rest at another pose.",
+        f"There are poses in the workspace at which {chosen_legs(own, found)} hardly show some"
+        f" motion of the platform (visibility falls to {100 * part:.1g} % of its usual value):"
+        " near them the control is singular, and beyond them it may come to rest at another pose.",
     )
 
 
 def _others(found: Study) -> tuple[str, ...]:
     """Other equilibria."""
     found_, text = found.equilibria, list[str]()
-    legs = named(found.own, found)
+    legs = chosen_legs(found.own, found)
     for flag, part, what in (
         (True, found_.alike, f"{legs} look exactly as at the goal"),
         (False, found_.cancelled, f"the errors of {legs} cancel"),
@@ -173,15 +172,15 @@ def _advice(found: Study) -> tuple[str, ...]:
     text: list[str] = []
     if more:
         best = max(more, key=lambda c: c.worst)
-        extra = named(Subset(tuple(set(best.legs) - set(own.legs)), 0, 0), found)
+        extra = chosen_legs(Subset(tuple(set(best.legs) - set(own.legs)), 0, 0), found)
         text.append(
             f"Let the camera see {extra} as well: visibility at the worst pose rises from"
             f" {own.worst:.2g} to {best.worst:.2g}."
         )
     if same:
         text.append(
-            f"Of {len(own.legs)} legs, {named(same[0], found)} show the motions best (visibility at"
-            f" the worst pose {same[0].worst:.2g})."
+            f"Of {len(own.legs)} legs, {chosen_legs(same[0], found)} show the motions best"
+            f" (visibility at the worst pose {same[0].worst:.2g})."
         )
     if own.blind and not more and found.plan.loop.law == "directions":
         text.append("Control by edges: they tell where a leg is, and not only how it points.")

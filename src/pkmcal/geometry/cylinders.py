@@ -43,11 +43,6 @@ class EdgeNormals(NamedTuple):
         """(..., 3, 3)."""
         return self.by_b[..., :, None] * self.n[..., None, :]
 
-    @property
-    def dn_dradius(self) -> Array:
-        """(..., 3)."""
-        return self.by_a + self.by_b
-
 
 def line_through(a: Array, b: Array) -> tuple[Array, Array]:
     """Unit direction u from a to b and moment m = a x u, both (..., 3)."""
@@ -70,10 +65,9 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
     Returns unit n (..., 3), NaN where the centre of projection lies inside the cylinder.
     """
     distance = np.sqrt(dot(m, m))
-    with np.errstate(invalid="ignore"):
-        sin = np.where(distance > np.abs(radius), radius / distance, np.nan)[..., None]
+    sine, cosine = (x[..., None] for x in edge_planes(distance, radius, sign))
     m_unit = m / distance[..., None]
-    return sign[..., None] * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)
+    return cosine * m_unit - sine * cross(u, m_unit)
 
 
 def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
@@ -163,20 +157,6 @@ def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> 
 def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:
     """Points of a cylinder where the view ray grazes it: a + s u + R n, (..., 3)."""
     return a + along[..., None] * u + np.asarray(radius)[..., None] * n
-
-
-def axis_from_normals(n0: Array, n1: Array, radius: Array) -> tuple[Array, Array]:
-    """Axis of a cylinder from its two edges: direction u and the point nearest the camera.
-
-    n0, n1 : (..., 3) normals of sides 0 and 1. radius : (...,) m.
-    [A] eq. 4 and 5, with the point solved for as errata has it: (n0 + n1) M = -2 R along
-    the bisector, orthogonal to u.
-    """
-    u = cross(n1, n0)
-    u = u / np.sqrt(dot(u, u))[..., None]
-    # both n.M = -R and u.M = 0: M lies along n0 + n1
-    s = n0 + n1
-    return u, -s * (np.asarray(radius) / (1 + dot(n0, n1)))[..., None]
 
 
 def tangent_basis(n: Array, along: Array) -> Array:

@@ -34,9 +34,9 @@ class Places:
     place: Integers
     shape: tuple[int, int]
 
-    def filled(self, values: Numbers, empty: int = 0) -> Numbers:
-        """Values (N, ...) at their places, (K', G, ...); ``empty`` where there is none."""
-        out = np.full((*self.shape, *values.shape[1:]), empty, dtype=values.dtype)
+    def filled(self, values: Numbers) -> Numbers:
+        """Values (N, ...) at their places, (K', G, ...); zero where there is none."""
+        out = np.zeros((*self.shape, *values.shape[1:]), dtype=values.dtype)
         out[self.row, self.place] = values
         return cast(Numbers, out)
 
@@ -79,7 +79,6 @@ def assemble(
     gauge: Gauge,
     *,
     use_drawing: bool = True,
-    radius_prior: bool = True,
     shading: float | Array = SHADING_SIGMA,
     share: float = 1.0,
 ) -> Assembled:
@@ -110,7 +109,6 @@ def assemble(
         gauge,
         unknowns,
         use_drawing=use_drawing,
-        radius_prior=radius_prior,
         on_platform=measurements.on_platform,
         level=measurements.level,
     )
@@ -318,9 +316,8 @@ def prior_rows(
     unknowns: Unknowns,
     *,
     use_drawing: bool,
-    radius_prior: bool = True,
-    on_platform: Booleans | None = None,
-    level: Booleans | None = None,
+    on_platform: Booleans,
+    level: Booleans,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
@@ -336,12 +333,12 @@ def prior_rows(
     table, u = machine.parameters, unknowns
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
-    held = np.flatnonzero((radius & radius_prior) | (~radius & use_drawing))
+    held = np.flatnonzero(radius | use_drawing)
     optics = np.tile([SHIFT_SIGMA] + [1.0] * (u.n_optics - 1), u.n_cameras)
     lines = np.ones(u.n_lines)
-    moving = np.flatnonzero(np.zeros(0, dtype=bool) if on_platform is None else on_platform)
+    moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
-    upright = np.flatnonzero(np.zeros(0, dtype=bool) if level is None else level)
+    upright = np.flatnonzero(level)
     tilts = (u.stations.start + 6 * upright[:, None] + [0, 1]).ravel()
     known = (
         ("drawing", held, tolerance[held]),

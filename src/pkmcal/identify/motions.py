@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, limb_ends
+from pkmcal.mechanisms.closure import joint_values
 from pkmcal.wording import SCALES, decimals, joined, named, number, split_name, with_unit
 
 AXES = "xyz"
@@ -40,6 +40,8 @@ SAME = 1e-3
 """Part of its greatest number below which a number of a change is nothing."""
 LITTLE = 0.01
 """mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
+MOST_TOLD = 5
+"""Numbers of a change that are told, the last of them for all smaller ones."""
 
 Advice = Literal[
     "more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing", "size"
@@ -95,8 +97,7 @@ class Situation:
     def along(self) -> tuple[Array, Array]:
         """Mean direction (L, 3) of each leg, in the base frame and in the platform frame."""
         poses = self.T_base_platform
-        readings = np.zeros((len(poses), self.machine.n_joints))
-        ends = limb_ends(self.machine.layout, self.machine.values, readings, poses)
+        ends = self.machine.ends_at(np.nan_to_num(self.readings), poses)
         u = ends.b - ends.a
         u = u / np.linalg.norm(u, axis=-1, keepdims=True)
         base, platform = (v.mean(axis=0) for v in (u, u @ poses[:, :3, :3]))
@@ -438,9 +439,7 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
     return how
 
 
-def changes(
-    values: Array, labels: tuple[tuple[str, str], ...], most: int = 5
-) -> tuple[list[str], float]:
+def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[str], float]:
     """``+1 mm of the rod length``, ``+0.2 mm of the radius``: a change (m,) told by its numbers.
 
     labels : name and unit of each. The largest length becomes a millimetre, or, where there is
@@ -462,8 +461,8 @@ def changes(
         said.append(
             f"{with_unit(number(shown[k], places, signed=True), told[k][1])} of {labels[k][0]}"
         )
-    if len(said) > most:
-        said = [*said[: most - 1], f"{len(said) - most + 1} smaller changes"]
+    if len(said) > MOST_TOLD:
+        said = [*said[: MOST_TOLD - 1], f"{len(said) - MOST_TOLD + 1} smaller changes"]
     return said, factor
 
 

@@ -229,7 +229,7 @@ class Problem:
         of_edges = edges.value(state)
         parts = (
             _in_rows(placed(self.blocks, of_edges)[..., None]),
-            self._by_noise(c, c.value[..., None]),
+            self._by_noise(c, c.rows.value[..., None]),
             _in_rows(poses.value[..., None]),
         )
         value = np.concatenate(parts, axis=2)[..., 0]
@@ -407,7 +407,7 @@ class Problem:
         lost = ~np.isfinite(out.sum(axis=-1))
         if lost.any():
             out[lost] = 0.0
-        return out, self._by_noise(c, by_own(self.layout, c))
+        return out, self._by_noise(c, by_own(self.layout, c.rows))
 
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
         """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
@@ -607,11 +607,11 @@ class Problem:
         c = self.closure(state)
         change = shared[:, self.unknowns.machine] @ self.free.T
         change = np.pad(change, ((0, 0), (0, 1)))[:, c.index][:, None]
-        wanted = c.value + np.sum(c.by_theta * change, axis=-1)
-        wanted = wanted + (by_own(layout, c) @ own[..., None])[..., 0]
+        wanted = c.rows.value + np.sum(c.by_theta * change, axis=-1)
+        wanted = wanted + (by_own(layout, c.rows) @ own[..., None])[..., 0]
         for _ in range(CLOSINGS):
             c = self.closure(trial)
-            back = np.linalg.pinv(by_own(layout, c)) @ (wanted - c.value)[..., None]
+            back = np.linalg.pinv(by_own(layout, c.rows)) @ (wanted - c.rows.value)[..., None]
             step = back[..., 0] @ layout.own_motion.T
             trial = replace(
                 trial,

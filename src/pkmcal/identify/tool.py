@@ -42,7 +42,7 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
     c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))
-    return -layout.own_motion[:6] @ np.linalg.pinv(by_own(layout, c)) @ by_theta
+    return -layout.own_motion[:6] @ np.linalg.pinv(by_own(layout, c.rows)) @ by_theta
 
 
 def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:

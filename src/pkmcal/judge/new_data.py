@@ -78,7 +78,8 @@ def check_new(known: Booleans, seen: Booleans, what: str, expected: str, next_st
 def look(
     saved: SavedCalibration, session: Session, seed: int, told: Progress, share: float
 ) -> Calibration:
-    """The session measured, and a first estimate of where everything is; see the module.
+    """The session measured, and a first estimate of where everything is; see the module. Its own
+    session is without the photographs by hand that were not placed, and stations are numbered so.
 
     seed : of the search for the stations. told : gets the first ``share`` of the progress.
     """

@@ -259,9 +259,9 @@ def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, i
         own = e @ poses @ inverse(f)
         internal = inverse_result(machine.layout, machine.values, own)[1]
         c = closure(machine.layout, machine.values, joints, own, np.nan_to_num(internal))
-        jac, value = c.by_pose @ pose_generators(own), c.value
+        jac, value = c.rows.by_pose @ pose_generators(own), c.rows.value
         if machine.layout.n_internal:
-            q = np.linalg.qr(c.by_internal)[0]
+            q = np.linalg.qr(c.rows.by_internal)[0]
             rest = np.eye(q.shape[-2]) - q @ q.mT
             jac, value = rest @ jac, (rest @ value[..., None])[..., 0]
         y, _, rank, _ = np.linalg.lstsq(jac.reshape(-1, 12), -value.reshape(-1), rcond=OPEN)

@@ -106,6 +106,7 @@ def validate(
         if not regions:
             check_new(known, _photographed(session), *NOT_INDEPENDENT)
         looked = look(saved, session, seed, told, 0.8)
+        session = replace(looked.session, machine=session.machine)
         estimate = looked.estimate
         data = estimate.as_found(looked.measurements)
 

@@ -129,6 +129,7 @@ def watch(
         known = known_rows(saved, session)
         check_new(known, np.ones_like(known), *NOTHING_NEW)
         looked = look(saved, session, seed, told, 0.9)
+        session = replace(looked.session, machine=session.machine)
         seen = seen_configurations(looked.measurements)
         check_new(known, seen, *NOTHING_NEW)
 

@@ -318,24 +318,19 @@ class LimbEnds:
 
 @dataclass(frozen=True)
 class Closure(LimbEnds):
-    """The closure's rows as in :class:`Rows`, with the limbs' ends that they are between."""
+    """The closure's rows, with the limbs' ends that they are between."""
 
-    value: Array
-    by_pose: Array
-    by_internal: Array
-    u: Array
-    distance: Array
-    w: Array
+    rows: Rows
 
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
         layout, moved = self.layout, self.base.by_reading
-        by = -dot(self.u, moved) - rod_rates(layout, self.theta)
+        by = -dot(self.rows.u, moved) - rod_rates(layout, self.theta)
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
-        angles = -dot(self.w, moved[..., layout.angles.leg, :])
+        angles = -dot(self.rows.w, moved[..., layout.angles.leg, :])
         return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property
@@ -360,8 +355,8 @@ class Closure(LimbEnds):
 
     def _by_length(self) -> Array:
         """Of |B - A| - length of the legs that close."""
-        layout = self.layout
-        parts = (-along(self.u, self.a_by), along(self.u, self.b_by), np.full((1, 1), -1.0))
+        layout, u = self.layout, self.rows.u
+        parts = (-along(u, self.a_by), along(u, self.b_by), np.full((1, 1), -1.0))
         if layout.scales_move_rods:
             grown = np.where(layout.rod_reads, _leg_readings(layout, self.readings), 0.0)
             parts = (*parts, -grown[..., None])
@@ -417,7 +412,7 @@ def closure(
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    return Closure(layout, theta, readings, poses, internal, base, platform, *rows)
+    return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 
 
 def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
@@ -425,7 +420,7 @@ def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
     return np.where(layout.of_motor, by_reading[..., None], 0.0)
 
 
-def by_own(layout: LimbLayout, rows: Closure | Rows) -> Array:
+def by_own(layout: LimbLayout, rows: Rows) -> Array:
     """Derivatives (..., E, d + n) by the pose's own freedoms, internal coordinates last."""
     by_pose = rows.by_pose[..., layout.freedoms]
     if not layout.n_internal:
@@ -461,9 +456,9 @@ def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
     return out
 
 
-def dense(rows: Closure, n_parameters: int) -> Array:
+def dense(c: Closure, n_parameters: int) -> Array:
     """Derivatives of the rows by all parameters, (..., E, P)."""
-    out = np.zeros((*rows.by_theta.shape[:-1], n_parameters + 1))
-    place = np.broadcast_to(rows.index, rows.by_theta.shape)
-    np.put_along_axis(out, place, rows.by_theta, axis=-1)
+    out = np.zeros((*c.by_theta.shape[:-1], n_parameters + 1))
+    place = np.broadcast_to(c.index, c.by_theta.shape)
+    np.put_along_axis(out, place, c.by_theta, axis=-1)
     return out[..., :n_parameters]

@@ -303,9 +303,9 @@ def _settled(
     x = np.concatenate([readings, internal], axis=-1)
     for _ in range(SETTLING):
         c = closure(layout, theta, x[..., :m], poses, x[..., m:])
-        jac = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
+        jac = np.concatenate([c.by_reading[..., None] * pick, c.rows.by_internal], axis=-1)
         # what is out of reach is NaN and stays so
-        jac, value = np.nan_to_num(jac), np.nan_to_num(c.value)
+        jac, value = np.nan_to_num(jac), np.nan_to_num(c.rows.value)
         step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
         x = x - step
         if np.abs(step).max(initial=0.0) < SETTLED:
@@ -359,11 +359,11 @@ def _at_least(
     """
     for _ in range(LEVELLING):
         c = closure(layout, theta, readings, poses, internal)
-        back = np.linalg.pinv(np.nan_to_num(by_own(layout, c)))
-        step = (back @ np.nan_to_num(c.value)[..., None])[..., 0] @ layout.own_motion.T
+        back = np.linalg.pinv(np.nan_to_num(by_own(layout, c.rows)))
+        step = (back @ np.nan_to_num(c.rows.value)[..., None])[..., 0] @ layout.own_motion.T
         poses, internal = perturb(poses, -step[..., :6]), internal - step[..., 6:]
     c = closure(layout, theta, readings, poses, internal)
-    worst = np.abs(c.value).max(axis=-1)
+    worst = np.abs(c.rows.value).max(axis=-1)
     return Closed(poses, internal, np.where(np.isfinite(worst), worst, np.inf))
 
 
@@ -382,7 +382,7 @@ def scaled_rows(c: Closure) -> Array:
     """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
     hinges' are too, count as the platform's joints' ways.
     """
-    return by_own(c.layout, c) * own_scale(c.layout, c.theta)[..., None, :]
+    return by_own(c.layout, c.rows) * own_scale(c.layout, c.theta)[..., None, :]
 
 
 def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
@@ -469,7 +469,7 @@ def on_manifold(
         own = every if every.ndim == 1 else every[left]
         c = closure_at(layout, own, current[left])
         value, blind = undriven(c)
-        value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.by_pose @ layout.motion)
+        value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
         lost[left] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[left] + 1)
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED * 1e-2
         more &= lost[left] < GIVEN_UP
@@ -481,7 +481,7 @@ def on_manifold(
     current = current.reshape(*shape, 4, 4)
     readings, phi = inverse_result(layout, theta, current)
     c = closure(layout, theta, readings, current, phi)
-    reached = np.isfinite(c.value).all(axis=-1)
+    reached = np.isfinite(c.rows.value).all(axis=-1)
     off = np.abs(undriven(c)[0]).max(axis=-1, initial=0.0)
     error = np.where(reached, off, np.inf)
     return ForwardResult(current, error < CONVERGED, error, phi, layout, theta, readings)
@@ -496,8 +496,8 @@ def undriven(c: Closure) -> tuple[Array, Array]:
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
         drives = c.by_reading[..., None] * layout.of_motor
-        moved = np.concatenate([drives, c.by_internal], axis=-1)
+        moved = np.concatenate([drives, c.rows.by_internal], axis=-1)
         moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]
         blind = q[..., moved.shape[-1] :].mT
-    return (blind @ c.value[..., None])[..., 0], blind
+    return (blind @ c.rows.value[..., None])[..., 0], blind

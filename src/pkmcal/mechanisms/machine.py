@@ -20,7 +20,7 @@ from pkmcal.mechanisms.carriers.contract import (
     of_part,
     platform_carriers,
 )
-from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 from pkmcal.mechanisms.document import (
     CONSTANT,
     OFFSET,
@@ -352,6 +352,16 @@ class Machine:
     def _axes(self, index: Integers) -> Array:
         axes = np.where(index >= 0, self.parameters.unit_axes(self.values)[index], np.nan)
         return axes.reshape(-1, 3)
+
+    def ends_at(self, joints: Array, T_base_platform: Array) -> LimbEnds:
+        """Both ends of every limb at readings (..., m) and poses (..., 4, 4); hinges of an
+        articulated platform turn as its limbs make them, or not at all where these cannot reach.
+        """
+        internal = None
+        if self.layout.n_internal:
+            turns = kinematics.inverse_result(self.layout, self.values, T_base_platform)[1]
+            internal = np.nan_to_num(turns)
+        return limb_ends(self.layout, self.values, joints, T_base_platform, internal)
 
     def _ends(self) -> tuple[Array, Array]:
         ends = limb_ends(self.layout, self.values, self.middle_readings(), np.eye(4))

@@ -47,7 +47,7 @@ def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     legs = np.flatnonzero(layout.closing)[rows]
     gain = c.by_reading[..., rows]
     usable = np.abs(gain) > LOST * _reading_scale(layout, c.base)[..., legs]
-    return -c.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
+    return -c.rows.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
 
 
 def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
@@ -80,8 +80,8 @@ def _of_shared(c: Closure) -> Array:
     parts = (1 / largest, hinges)
     scale = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
     drives = by_motors(layout, c.by_reading)
-    jac = np.concatenate([drives, c.by_internal], axis=-1) * scale[..., None, :]
-    rates = -_pseudo_inverse(jac) @ c.by_pose
+    jac = np.concatenate([drives, c.rows.by_internal], axis=-1) * scale[..., None, :]
+    rates = -_pseudo_inverse(jac) @ c.rows.by_pose
     return (scale[..., :, None] * rates)[..., :m, :]
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from pkmcal.arrays import Booleans, Integers
 from pkmcal.identify.unidentified import Condition
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.four_step_checks import numbered
 from pkmcal.papers.legs import legs_of
+from pkmcal.wording import named
 
 
 def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -30,7 +30,7 @@ def every_leg(seen: Booleans) -> Condition:
     lost = np.flatnonzero(~seen.any(axis=0))
     text = "every leg is seen by a station"
     if lost.size:
-        text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {numbered(lost)}"
+        text += f"; none sees {named(lost)}"
     return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
 
 

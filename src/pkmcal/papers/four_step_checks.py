@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step_base import Items, StationViews
@@ -18,7 +18,7 @@ from pkmcal.papers.four_step_platform import COLLAPSED, deviations
 from pkmcal.papers.leg_axes import Axes, in_base
 from pkmcal.papers.legs import DrawnLegs, legs_of
 from pkmcal.papers.registration import fixes_pose, loose, parts_of
-from pkmcal.wording import joined
+from pkmcal.wording import named
 
 FLAT = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
@@ -63,7 +63,7 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
     if not few.size:
         return
     seen = items.centres_seen[views.of_station[few[0]]]
-    which = f" (legs {numbered(np.flatnonzero(seen))})" if seen.any() else ""
+    which = f" ({named(np.flatnonzero(seen))})" if seen.any() else ""
     need = "two or more" if legs_of(machine).planar else "three or more that are not on one line"
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
@@ -82,12 +82,12 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
     parts = parts_of(items.drawing, seen, free, items.n_directions)
     a, b = (np.flatnonzero(part[: len(items.drawn)]) for part in parts)
     sees = [
-        f"station {s + 1} sees legs {numbered(np.flatnonzero(items.centres_seen[view]))}"
+        f"station {s + 1} sees {named(np.flatnonzero(items.centres_seen[view]))}"
         for s, view in enumerate(views.of_station)
     ]
     raise ResultError(
-        what=f"the stations share too few legs: the base joints of legs {numbered(a)} can "
-        f"move against those of legs {numbered(b)}",
+        what=f"the stations share too few legs: the base joints of {named(a)} can "
+        f"move against those of {named(b)}",
         found="; ".join(sees),
         expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
         next_step="fix a calibration board to the base where the stations see it, or let a "
@@ -119,8 +119,8 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
         a, b = parts_of(*known, free, motion=legs.motion)
         names = np.flatnonzero(legs.closing)
         raise ResultError(
-            what=f"the platform joints of legs {numbered(names[a])} can move against those of legs "
-            f"{numbered(names[b])}",
+            what=f"the platform joints of {named(names[a])} can move against those of "
+            f"{named(names[b])}",
             found="no configurations that show enough of both at once",
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
             next_step=f"photograph the same configurations from more stations, or {BUNDLE}",
@@ -182,7 +182,7 @@ def lengths_are_fixed(
     part = np.abs(vectors[:, free]).max(axis=1)
     names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
     raise ResultError(
-        what=f"the photographs do not tell the lengths of legs {numbered(names)}",
+        what=f"the photographs do not tell the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",
         expected="legs that change their directions against each other, seen at once, [A] 3.4",
         next_step=f"add configurations that tilt and turn the platform more, or {BUNDLE}",
@@ -212,8 +212,3 @@ def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
             expected="two directions at least, [A] 3.5",
             next_step=f"add configurations that tilt or shift the platform, or {BUNDLE}",
         )
-
-
-def numbered(legs: Integers) -> str:
-    """Leg numbers for people, from 1."""
-    return joined([str(leg + 1) for leg in legs])

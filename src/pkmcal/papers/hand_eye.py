@@ -35,7 +35,6 @@ from pkmcal.identify.rows import PoseBlocks, PoseData, pose_rows
 from pkmcal.identify.start import mean_pose
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.solver import Linear, Values, minimise, take
 
 TURN = 0.03
@@ -292,5 +291,5 @@ def _carried_on(
 
 def size_of(machine: Machine) -> float:
     """The limbs' mean length at home, m."""
-    ends = limb_ends(machine.layout, machine.values, machine.middle_readings(), machine.home())
+    ends = machine.ends_at(machine.middle_readings(), machine.home())
     return float(np.linalg.norm(ends.b - ends.a, axis=-1).mean())

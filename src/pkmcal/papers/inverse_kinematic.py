@@ -91,7 +91,7 @@ class _Rows(NamedTuple):
     @property
     def by_pose(self) -> Array:
         """Rows by the platform's whole pose, (B, N, r, 6)."""
-        closures = self.scale[..., None] * (self.closure.by_pose @ self.taken.by)
+        closures = self.scale[..., None] * (self.closure.rows.by_pose @ self.taken.by)
         return np.concatenate([closures, self.taken.off_by], axis=-2)
 
 
@@ -145,7 +145,7 @@ class ImplicitProblem:
             _placed(rows.by_pose @ rows.seen.by_station, stations),
             _placed(rows.by_pose @ rows.seen.by_mount, mounts),
         ], axis=-1)  # fmt: skip
-        by_own = np.pad(rows.scale[..., None] * rows.closure.by_internal, off)
+        by_own = np.pad(rows.scale[..., None] * rows.closure.rows.by_internal, off)
         value = (self.weigh @ rows.value[..., None])[..., 0]
         usable = np.isfinite(value)
         return Linear(
@@ -168,8 +168,8 @@ class ImplicitProblem:
         if self.form == "joint":
             readings = kinematics.inverse(self.layout, theta, own.pose)
         c = closure(self.layout, theta, readings, own.pose, internal)
-        scale = np.ones(c.value.shape)
-        value = c.value
+        scale = np.ones(c.rows.value.shape)
+        value = c.rows.value
         if self.form == "joint":
             motor = self.layout.row_motor
             read = motor >= 0

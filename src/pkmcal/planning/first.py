@@ -111,11 +111,6 @@ def spread_over(configuration: Integers, n_stations: int = 1, most: int = FIRST)
     return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
 
 
-def camera_numbers(session: Session, stations: Sequence[int]) -> Integers:
-    """Number of each station's camera file among theirs, (S,)."""
-    return numbered(session.stations[s].camera_file for s in stations)
-
-
 def first_edges(
     session: Session,
     photographs: Sequence[legs.Photographs],
@@ -129,7 +124,8 @@ def first_edges(
     (S, 4, 4) where the stations were found. poses : T_base_platform (K, 4, 4) by the drawing.
     Raises PkmcalError where they do not carry an estimate.
     """
-    machine, numbers = session.machine, camera_numbers(session, [p.station for p in photographs])
+    machine = session.machine
+    numbers = numbered(session.camera_of_station[[p.station for p in photographs]])
     few = [
         replace(p.select(own), station=number)
         for number, (p, own) in enumerate(zip(photographs, rows, strict=True))

@@ -30,7 +30,6 @@ from pkmcal.measurements import (
     concatenate,
 )
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import EXACT, SEED, EdgePool, Pools, drawn_edges
 from pkmcal.simulation.edges import EdgeNoise, hidden, pixel_angle, simulate_edges
@@ -149,7 +148,7 @@ class BoardFrom:
         machine, tubes = at.machine, tubes_of(at.machine)
         if not len(tubes):
             return seen
-        ends = limb_ends(machine.layout, machine.values, at.joints, at.T_base_platform)
+        ends = machine.ends_at(at.joints, at.T_base_platform)
         a, b = apply(self.T_camera_base, ends.a), apply(self.T_camera_base, ends.b)
         nothing, radius = np.array([-1]), machine.values[tubes.radius]
         pixel = pixel_angle(self.camera)

@@ -195,12 +195,11 @@ def of_session(
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
     found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
-    cameras = numbered(station.camera_file for station in session.stations)
     rig = Rig(
         session.machine,
         session.station_names,
         T_camera_base,
-        np.pad(cameras, (0, len(session.trackers))),  # of a tracker no camera's number matters
+        session.camera_of_station,
         session.joint_noise,
         found.instruments,
         found.mounts,

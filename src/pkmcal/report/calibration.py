@@ -125,7 +125,7 @@ def report_of(
     photographs : of stations by their number, where they are at hand.
     """
     edges = observation.edges
-    camera = residuals.camera_numbers(session)
+    camera = session.camera_of_station
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)

@@ -13,7 +13,6 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import (
     LegsInCamera,
     TubeList,
@@ -107,7 +106,7 @@ def laid_over(
         for start, stop in _runs(seen):
             line = straightened(curve[start:stop])
             edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
     return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
 

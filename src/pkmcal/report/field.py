@@ -24,7 +24,7 @@ from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.drawn import across, measured_curves, own_edges
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import KEPT, camera_numbers
+from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
@@ -146,7 +146,7 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
     own = own_edges(machine, legs, photograph, some)
-    outward = state.edge_shift[camera_numbers(session)[s]]
+    outward = state.edge_shift[session.camera_of_station[s]]
     normal = own.normal + outward * (some.basis @ some.shift[..., None])[..., 0]
     normal /= np.sqrt(dot(normal, normal))[..., None]
     shifted = replace(own, normal=normal)

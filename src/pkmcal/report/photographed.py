@@ -15,7 +15,7 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
+from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.outcome import Plot
 from pkmcal.report.links import Links
 from pkmcal.report.page import N_COLOURS
@@ -48,7 +48,7 @@ class PosedLimbs(NamedTuple):
 
 def limbs_of(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
     """At readings (K, m) and poses (K, 4, 4)."""
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     moved = joint_values(machine.layout, machine.values, joints)
     arms = skeletons(machine.layout, machine.values, moved)
     shape = (len(joints), machine.n_legs, 3)

@@ -14,14 +14,21 @@ from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import Pictures
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.drawn import CURVE, Drawn, Spot, edge_name, measured_curves, polyline
+from pkmcal.report.drawn import (
+    CURVE,
+    Drawn,
+    Spot,
+    edge_name,
+    measured_curves,
+    polyline,
+    residual_words,
+)
 from pkmcal.report.jpegs import small_and_large
 from pkmcal.report.links import Links, Place
 from pkmcal.report.residuals import KEPT
@@ -264,10 +271,9 @@ class _Found:
             across, tilt = estimate.edge_residuals[n].tolist()
             leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
             tip = (
-                f"{edge_name(leg, tube, side).capitalize()}: "
-                f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
-                f"{number(across, 1, signed=True)} σ across, "
-                f"{number(tilt, 1, signed=True)} σ tilt; weight {number(weight, 2)}"
+                f"{edge_name(leg, tube, side).capitalize()}:"
+                f" {number(float(shifts[n]), 2, signed=True)} px outward;"
+                f" {residual_words(across, tilt, weight)}"
             )
             drawn = polyline(leg, curve, weight < KEPT, tip)
             if drawn:
@@ -310,9 +316,9 @@ class _Found:
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
         base, platform = (side.T_calibrated_drawing for side in centres)
-        after = limb_ends(estimate.machine.layout, estimate.machine.values, joints, pose)
+        after = estimate.machine.ends_at(joints, pose)
         old_pose = inverse(base) @ pose @ platform
-        before = limb_ends(session.machine.layout, session.machine.values, joints, old_pose)
+        before = session.machine.ends_at(joints, old_pose)
         seen = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
         drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
         inside = camera.in_image(seen)

@@ -12,7 +12,6 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, plain, yaml_text
 from pkmcal.geometry.rigid import inverse
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.outcome import (
     AXIS,
     LOOKS,
@@ -310,7 +309,7 @@ def _where(found: MeasurementPlan) -> Part:
     """The drawing: the machine, its configurations, the cameras, and the places tried."""
     rig, home = found.subject.rig, found.subject.rig.machine.home()[None]
     machine = rig.machine
-    ends = limb_ends(machine.layout, machine.values, machine.inverse(home), home)
+    ends = machine.ends_at(machine.inverse(home), home)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     legs = [np.stack([a, b]) for a, b in zip(ends.a[0], ends.b[0], strict=True)]
     places = found.T_base_platform[:, :3, 3]

@@ -16,7 +16,6 @@ from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.report import poses
 from pkmcal.report.drawn import edge_name, laid_over, residual_words
@@ -138,7 +137,7 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
         told = {"strips": strips, "radii": radii, "colours": colours}
         labels = [f"leg {j + 1}" for j in legs]
         yield Logged(("machine", name), "lines3d", {**told, "labels": labels}, at)
-    ends = limb_ends(machine.layout, machine.values, joints, pose)
+    ends = machine.ends_at(joints, pose)
     points = np.concatenate([ends.a, ends.b])
     labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
     path = ("machine", "calibrated", "centres")
@@ -154,7 +153,7 @@ def _tubes(
     machine: Machine, joints: Array, T_base_platform: Array
 ) -> tuple[list[Array], list[float], list[int]]:
     """Axes (2, 3), m, and radii of all tubes, with their legs from 0; thin lines for the others."""
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     strips, radii, legs = list[Array](), list[float](), list[int]()
     for j, known in enumerate(machine.radii()):
         line = ends.b[j] - ends.a[j]

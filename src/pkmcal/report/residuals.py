@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, numbered
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
@@ -69,11 +69,6 @@ def section(
         remarks=remarks(session, edges, estimate, shifts),
     )
     return Part("residuals", "Residuals", (READING,), html=shown)
-
-
-def camera_numbers(session: Session) -> Integers:
-    """Number of each station's camera file, in order of first use, (S,)."""
-    return numbered(station.camera_file for station in session.stations)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, rms
 from pkmcal.control.source import Controlled
 from pkmcal.control.study import Study, Trials
-from pkmcal.control.words import judgement, named
+from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
@@ -293,7 +293,7 @@ def choices_table(found: Study) -> Table:
         shown = [s.own, *shown]
     rows = [
         Row(
-            named(c, s) + (", as seen" if c == s.own else ""),
+            chosen_legs(c, s) + (", as seen" if c == s.own else ""),
             (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
              if c.fading else "yes"),
         )

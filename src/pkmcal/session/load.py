@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array, Integers, numbered, short_repr
 from pkmcal.cameras import Camera
 from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import LONGEST_NAME, InputError
@@ -153,6 +153,14 @@ class Session:
     def station_names(self) -> tuple[str, ...]:
         """Names of all stations, trackers last, as measurements number them."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
+
+    @property
+    def camera_of_station(self) -> Integers:
+        """Number of each station's camera file, in order of first use, (S,); a tracker has none,
+        and the first one's number moves nothing of what it measured.
+        """
+        cameras = numbered(station.camera_file for station in self.stations)
+        return np.pad(cameras, (0, len(self.trackers)))
 
     def of_stations(self, numbers: Sequence[int], warnings: tuple[str, ...] = ()) -> Session:
         """The session with some of its stations that have a camera, and what is to be known of

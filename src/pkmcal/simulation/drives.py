@@ -14,7 +14,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
+from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.mechanisms.document import Tube
 from pkmcal.mechanisms.motors import bodies
 
@@ -126,7 +126,7 @@ def _guide_ranges(machine: Machine, by_value: Array) -> Array:
     """Least and largest value of each leg's joint, (L, 2); about home's if the file is silent."""
     layout, home = machine.layout, machine.home()
     readings = machine.inverse(home[None])[0]
-    ends = limb_ends(layout, machine.values, readings, home)
+    ends = machine.ends_at(readings, home)
     speed = np.linalg.norm(by_value, axis=1)
     spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1) / np.where(speed > 0, speed, 1.0)
     theta, ranges = machine.values, machine.joint_ranges
@@ -141,7 +141,7 @@ def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array
     all of them, so that two carriages on one guide agree about it.
     """
     home = machine.home()
-    b = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), home).b
+    b = machine.ends_at(np.zeros(machine.n_joints), home).b
     back = foot - np.array(b).mean(axis=0)
     back = back - dot(back, axis)[:, None] * axis
     # a guide through the platform's middle may stand back to any side
@@ -166,7 +166,7 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
         found = machine.forward_result(wanted)
         poses += list(found.T_base_platform[found.converged])
         readings += list(wanted[found.converged])
-    ends = limb_ends(machine.layout, machine.values, np.stack(readings), np.stack(poses))
+    ends = machine.ends_at(np.stack(readings), np.stack(poses))
     return np.array(ends.a), np.array(ends.b)
 
 
@@ -206,7 +206,7 @@ def with_forearms(machine: Machine) -> Machine:
             expected="arms and rods that reach the platform at home",
             next_step="Check the drawing's lengths and centres, and home",
         )
-    ends = limb_ends(machine.layout, machine.values, readings, home)
+    ends = machine.ends_at(readings, home)
     lengths = np.linalg.norm(ends.b - ends.a, axis=1)
     legs = tuple(
         leg.model_copy(update={"tubes": (_tube(float(length)),)})

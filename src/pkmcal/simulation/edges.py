@@ -23,7 +23,6 @@ from pkmcal.geometry.cylinders import (
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, concatenate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import TubeList, tubes_of
 from pkmcal.simulation.placement import one_a_station
 
@@ -80,7 +79,7 @@ def simulate_edges(
     sets: list[EdgeSet] = []
     for station, one in enumerate(cameras):
         rows = photographs[photographs[:, 0] == station, 1]
-        ends = limb_ends(machine.layout, machine.values, joints[rows], T_base_platform[rows])
+        ends = machine.ends_at(joints[rows], T_base_platform[rows])
         a, b = apply(T_camera_base[station], ends.a), apply(T_camera_base[station], ends.b)
         exact, rays = visible_edges(one, tubes, machine.values[tubes.radius], a, b)
         exact = replace(

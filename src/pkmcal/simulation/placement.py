@@ -17,7 +17,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse, look_at, perturb, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import closure, limb_ends
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import on_manifold, singularity
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
@@ -111,11 +111,11 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     layout, values, home = machine.layout, machine.values, machine.home()
     at_home = closure(layout, values, machine.inverse(home[None])[0], home)
     c = closure(layout, values, joints, T_base_platform)
-    jac, home_jac = (x.by_pose @ layout.motion for x in (c, at_home))
-    good = np.abs(c.value).max(axis=-1) < 1e-9
+    jac, home_jac = (x.rows.by_pose @ layout.motion for x in (c, at_home))
+    good = np.abs(c.rows.value).max(axis=-1) < 1e-9
     # a machine that is weak at home is weak everywhere; it is not refused for that
-    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.by_pose)))
-    good &= singularity(layout, values, c.by_pose) > least
+    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.rows.by_pose)))
+    good &= singularity(layout, values, c.rows.by_pose) > least
     if jac.shape[-1] == jac.shape[-2]:
         with np.errstate(invalid="ignore"):  # where there is no Jacobian, nothing is usable
             good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
@@ -173,7 +173,7 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
     another. Legs that meet in a joint, as in drawings that know no more of a platform than a point,
     come near each other nowhere else.
     """
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     # components slowest: every point of a leg meets every point of another, long rows of numbers
@@ -400,7 +400,7 @@ def _outside(
     distance: float,
     azimuth: float,
     rng: np.random.Generator,
-    elevation: float | None = None,
+    elevation: float | None,
 ) -> StationPlace:
     """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
     centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, _radius(points)
@@ -447,7 +447,7 @@ def share_in_image(
     machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> Array:
     """Part of each leg that lies in the image, (K, L), for poses (K, 4, 4) and readings (K, m)."""
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.96, 12)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     pixels = camera.project(apply(T_camera_base, points))

@@ -145,7 +145,7 @@ def machine_parts(
     """The machine at one pose (4, 4) and its readings (m,); as built, with what hangs on its legs
     and is on no drawing.
     """
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    ends = machine.ends_at(joints, T_base_platform)
     balls = _ball_radii(machine)
     bars = side_bars(machine)
     moved = joint_values(machine.layout, machine.values, joints)

@@ -50,7 +50,6 @@ from pkmcal.solver.strips import (
     StripLayout,
     Strips,
     compact,
-    damped_step,
     eliminated,
 )
 
@@ -72,7 +71,6 @@ __all__ = [
     "column_space",
     "compact",
     "condensed",
-    "damped_step",
     "directions",
     "divisions",
     "eliminate",

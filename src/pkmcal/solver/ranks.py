@@ -16,11 +16,11 @@ RANK_TOLERANCE = 1e-9
 there with exact derivatives, and real directions are many orders above."""
 
 
-def column_space(columns: Array, least: float = RANK_TOLERANCE) -> Array:
+def column_space(columns: Array) -> Array:
     """An orthonormal basis (n, k) of what columns (n, m) can make together."""
     norm = np.linalg.norm(columns, axis=0)
     u, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    return u[:, s > least * s.max(initial=0.0)]
+    return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
 
 
 def directions(rows: Array) -> tuple[Array, Array, Array]:

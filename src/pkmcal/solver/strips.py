@@ -322,12 +322,6 @@ def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquation
     return NormalEquations(matrix, gradient, cost, done)
 
 
-def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
-    """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
-    shared, own = normal_equations([compact(linear)], damping).step(damping)
-    return shared, own[0]
-
-
 def cost_of(value: Array, shared_value: Array, usable: Booleans) -> Array:
     """Sum of squares over usable rows; NaN there means that a leg was lost: infinite."""
     total = np.sum(np.where(usable, value, 0.0) ** 2, axis=(1, 2))

@@ -19,7 +19,6 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import tubes_of
 from pkmcal.simulation.board import board_for, place_board
 from pkmcal.simulation.drives import with_forearms
@@ -207,7 +206,7 @@ def _edges(
     tubes, sets = tubes_of(machine), list[EdgeSet]()
     for station, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
         rows = photographs[photographs[:, 0] == station, 1]
-        ends = limb_ends(machine.layout, machine.values, joints[rows], poses[rows])
+        ends = machine.ends_at(joints[rows], poses[rows])
         radius = machine.values[tubes.radius]
         exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))
         place = np.full(len(exact), station)

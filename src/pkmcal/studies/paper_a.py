@@ -461,7 +461,7 @@ def _tool(machine: Machine, true: Array, fit: Fitted, rng: np.random.Generator) 
     )
     off = pose_difference(there, T_true)
     c = closure(layout, fit.theta[:, None], readings, there)
-    by = layout.own_motion @ np.linalg.solve(by_own(layout, c), dense(c, true.shape[1]))
+    by = layout.own_motion @ np.linalg.solve(by_own(layout, c.rows), dense(c, true.shape[1]))
     if fit.covariance is None:
         return np.stack([off, np.full(off.shape, np.nan)])
     variance = np.einsum("bkip,bpq,bkiq->bki", by, fit.covariance, by, optimize=True)

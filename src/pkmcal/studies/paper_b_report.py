@@ -9,7 +9,6 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.outcome import Outcome, Part, Row, Table, plane
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_b import (
@@ -223,7 +222,7 @@ def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[
     camera, T = views()[view]
     machine = study_machine()
     home = machine.home()
-    ends = limb_ends(machine.layout, machine.values, machine.inverse(home), home)
+    ends = machine.ends_at(machine.inverse(home), home)
     along = ends.a[:, None] + np.linspace(0, 1, 25)[:, None] * (ends.b - ends.a)[:, None]
     pixels = camera.project(apply(T, along))
     gap = np.full((1, 2), np.nan)
@@ -283,7 +282,7 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
     machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
     pose = machine.forward(readings)
     edges = ran.eye.points(pose[None], readings[None], ALONG).pixel[0].reshape(-1, 2, ALONG, 2)
-    ends = limb_ends(machine.layout, machine.values, readings, pose)
+    ends = machine.ends_at(readings, pose)
     base, platform = apply(T, ends.a), apply(T, ends.b)
     data: list[dict[str, Any]] = []
     for leg in np.argsort(-(base + platform)[:, 2]):

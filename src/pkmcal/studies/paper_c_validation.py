@@ -32,6 +32,8 @@ RULERS = (0.2, 0.4)
 """The ruled line's length, m; the paper does not tell it, and errors grow as its square."""
 RULES = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 POINTS = 21
+POSES = 400
+"""Of the workspace, that the error before is the mean of."""
 
 
 def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Array:
@@ -55,10 +57,10 @@ class Before(NamedTuple):
     turn: float
 
 
-def before(count: int = 400) -> Before:
+def before() -> Before:
     """The drawing's poses against the true ones at the same readings, in the machine's frame."""
     machine = model("design")
-    poses = workspace(count, np.random.default_rng(0))
+    poses = workspace(POSES, np.random.default_rng(0))
     readings = inverse(machine.layout, table_2_values(machine, IDENTIFIED), poses)
     found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
     shift = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)

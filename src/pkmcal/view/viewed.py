@@ -17,7 +17,6 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph, label_of
@@ -52,7 +51,7 @@ class Pane:
     def points(self) -> Array:
         """Joint centres (2, L, 3) on base and platform, base frame, m."""
         machine = self.machine
-        ends = limb_ends(machine.layout, machine.values, self.joints, self.T_base_platform)
+        ends = machine.ends_at(self.joints, self.T_base_platform)
         return np.stack([ends.a, ends.b])
 
 
