@@ -14,24 +14,25 @@ of edges, it puts under all of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import KnownScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import bundle
+from pkmcal.identify.bundle import bundle, machine_told
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import concatenate
+from pkmcal.measurements import Measurements, concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationView, grain, settle
+from pkmcal.observe.stations import StationView, apart, grain, settle
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
@@ -48,8 +49,6 @@ NEAR = legs.SEARCH_SIGMA
 """Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
 leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
 that lie near something; it does not offer legs that lie on it."""
-GIVEN_UP = 9.0
-"""What an edge costs at least that the estimate gives up: three standard deviations."""
 
 
 def join(
@@ -66,14 +65,58 @@ def join(
     where nothing but the drawing is known, and LATER elsewhere. Raises a `PkmcalError` where there
     is nothing to be estimated.
     """
+    looks = looks or (LATER if known.edges else FIRST)
+    last = _looked(session, photographs, known, places, boards, looks)
+    return last.known._replace(told=machine_told(last.measurements, last.estimate))
+
+
+def ask(
+    session: Session, photograph: legs.Photographs, known: KnownScene, T_camera_base: Array
+) -> tuple[KnownScene, float]:
+    """What one photograph would make of what is known, if it were taken from a place (4, 4); and
+    what is paid for that, half the squares by which the machine and the readings are moved.
+
+    Those that are placed say what they know of the machine once and for all, so a question costs
+    the same however many they are. Boards are left out: what a place is asked is how the legs look
+    from there. Raises a `PkmcalError` where too few legs are where they should be.
+    """
+    k, looks = photograph.station, LATER if known.edges else FIRST
+    alone, places = known._replace(edges={}), {k: T_camera_base}
+    last = _looked(session, {k: photograph}, alone, places, Boards(), looks)
+    squares = last.estimate.statistics.chi2_drawing + last.estimate.statistics.chi2_joints
+    return last.known, squares / 2
+
+
+class _Look(NamedTuple):
+    """What is known after a look, and the estimate that says so."""
+
+    known: KnownScene
+    measurements: Measurements
+    estimate: Estimate
+
+
+def _looked(
+    session: Session,
+    photographs: Mapping[int, legs.Photographs],
+    known: KnownScene,
+    places: Mapping[int, Array],
+    boards: Boards,
+    looks: tuple[float | None, ...],
+) -> _Look:
+    """What is known once photographs were looked at from places, each look from the estimate
+    before, and the last of these. What was measured in others takes part; without any, what they
+    told of the machine.
+    """
     at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
     for k, T in places.items():
         at[k] = T
+    told = None if known.edges else known.told
     only = replace(session.of_stations(stations), trackers=())
     shown = boards.of(np.array(stations, dtype=int))
     edges = dict(known.edges)
-    state: State | None = None
-    for reach in looks or (LATER if edges else FIRST):
+
+    def look(known: KnownScene, reach: float | None, state: State | None) -> _Look:
+        at = known.T_camera_base.copy()
         for k in places:
             p = photographs[k]
             seen = known.machine, at[k], known.T_base_platform[p.configuration]
@@ -84,62 +127,84 @@ def join(
         ]
         measurements = measurements_of(only, shown, concatenate(numbered))
         start = state or start_state(known.machine, measurements, at[stations])
-        estimate = bundle(session.machine, measurements, start)
-        state = estimate.state
-        at = at.copy()
-        at[stations] = state.T_camera_base
-        known = KnownScene(
-            estimate.machine, at, state.T_base_platform, edges,
-            _costs(estimate, measurements.edges.station, stations),
-            (estimate.statistics.chi2_drawing + estimate.statistics.chi2_joints) / 2,
-        )  # fmt: skip
-    return known
+        estimate = bundle(session.machine, measurements, start, told=told)
+        at[stations] = estimate.state.T_camera_base
+        known = KnownScene(estimate.machine, at, estimate.state.T_base_platform, dict(edges))
+        return _Look(known, measurements, estimate)
+
+    found = look(known._replace(T_camera_base=at), looks[0], None)
+    for reach in looks[1:]:
+        found = look(found.known, reach, found.estimate.state)
+    return found
 
 
-def _costs(estimate: Estimate, station: Integers, stations: Sequence[int]) -> dict[int, float]:
-    """Half the squares of each station's edges; one that is given up costs GIVEN_UP at least."""
-    weight = estimate.edge_weights
-    square = estimate.edge_trust * np.sum(estimate.edge_residuals**2, axis=-1)
-    cost = (weight * square + (1 - weight) * GIVEN_UP) / 2
-    sums = np.bincount(station, cost, len(stations)).tolist()
-    return dict(zip(stations, sums, strict=True))
+class Asked(NamedTuple):
+    """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
+    machine from there, and what was paid (n,) for the machine.
+    """
+
+    T_camera_base: Array
+    evidence: Array
+    paid: Array
+
+    @classmethod
+    def nothing(cls) -> Asked:
+        return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
+
+    def joined(self, other: Asked) -> Asked:
+        """Both."""
+        return Asked(*map(np.concatenate, zip(self, other, strict=True)))
 
 
 def look_closer(
-    session: Session, photograph: legs.Photographs, before: KnownScene, found: Alone, others: Array
-) -> Alone:
+    session: Session,
+    photograph: legs.Photographs,
+    before: KnownScene,
+    found: Alone,
+    others: Array,
+    asked: Asked | None = None,
+) -> tuple[Alone, Asked]:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
-    evidence is then a log likelihood against chance.
+    evidence is then a log likelihood against chance. And what was found out for that.
 
-    others : (n, 4, 4) places that are asked about beside those found in the picture.
+    others : (n, 4, 4) places that are asked about beside those found in the picture. asked : what
+    was found out already with the same machine; nothing is asked about one of its places again.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
     view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        before.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
         before.T_base_platform, distance_tables(p.images, *FINEST),
     )  # fmt: skip
     near = found.evidence > found.evidence[0] - BEHIND * found.unit
-    weighed: list[tuple[float, float]] = []  # evidence and what was paid
-    places: list[Array] = []
-
-    def weigh(known: KnownScene, T: Array) -> None:
-        seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        settled, evidence = settle(seen, T[None], one, 16, 6, NEAR)
-        weighed.append((float(evidence[0]), known.paid(but=p.station) - before.paid(but=p.station)))
-        places.append(settled[0])
-
-    for T in (*found.T_camera_base[near][:CLOSER], *others):
-        weigh(before, T)  # the machine as it is known; where it fits better changed, that is taken
+    places = np.concatenate([found.T_camera_base[near][:CLOSER], others])
+    # the machine as it is known; where it fits better changed, that is taken
+    settled, evidence = settle(view, places, one, 16, 6, NEAR)
+    seen = Asked.nothing() if asked is None else asked
+    order = np.argsort(-evidence, kind="stable")
+    both = np.concatenate([seen.T_camera_base, settled[order]])
+    count = len(seen.T_camera_base)
+    order = order[[k - count for k in apart(view, both, one) if k >= count]]
+    seen = seen.joined(Asked(settled[order], evidence[order], np.zeros(len(order))))
+    for T, here in zip(places[order], evidence[order], strict=True):
+        best = float((seen.evidence / found.unit - seen.paid).max())
+        if before.edges and here / found.unit < best - BEHIND:
+            break  # what is known of the machine already does not change by so much
         try:
-            # without boards: what a place is asked is how the legs look from there
-            known = join(session, {p.station: p}, before, {p.station: T}, Boards())
+            known, cost = ask(session, p, before, T)
         except PkmcalError:
             continue  # too few legs are where they should be
-        weigh(known, known.T_camera_base[p.station])
-    at, (evidence, paid) = np.stack(places), np.array(weighed).T
+        changed = replace(view, machine=known.machine, all_poses=known.T_base_platform)
+        there, fits = settle(changed, known.T_camera_base[[p.station]], one, 16, 6, NEAR)
+        seen = seen.joined(Asked(there, fits, np.array([cost])))
+    return _weighed(view, seen, found.unit), seen
+
+
+def _weighed(view: StationView, asked: Asked, unit: float) -> Alone:
+    """Places by what was found out of them, the likeliest first."""
+    at, evidence, paid = asked
     edge = grain(view, at[np.argmax(evidence)])
-    by_edges, by_legs = evidence / edge - paid, evidence / found.unit - paid
+    by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]
     turned = turn_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
     here = turn_between(at, first) < ALIKE
