@@ -4,7 +4,7 @@ A search in the picture alone knows the machine by its drawing, whose errors of 
 pixels: a machine of equal parts then fits nearly as well when it is turned by one of them. Here the
 photograph is measured from each of the places that it could show, and the machine is estimated with
 it there. What the drawing has wrong is explained by that, and paid for by the drawing's tolerances;
-what photographs that are placed already know of the machine is paid for as well. How well the
+where photographs that are placed already know the machine, by what they know of it. How well the
 machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.stations`) less what
 was paid is the log likelihood of the place. Between places from which the machine lies on the same
 legs, turned onto itself, half an edge counts as one measurement, as it does in a station's
