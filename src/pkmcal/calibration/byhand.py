@@ -23,7 +23,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import AT_LAST, Asked, join, look_closer
+from pkmcal.calibration.closely import Asked, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
@@ -77,8 +77,9 @@ def place(
             loose = {k for k, e in known.edges.items() if len(np.unique(e.leg)) < FEWEST_LEGS}
             sure = {k: known.T_camera_base[k] for k in known.edges}
             sure |= {k: found[k].T_camera_base[0] for k in loose & found.keys()}
+            measured = {k: e for k, e in known.edges.items() if k not in loose}
             with suppress(PkmcalError):  # with all that is observed it is told better why
-                known = join(session, at, known, sure, boards, AT_LAST)
+                known = join(session, at, known, sure, boards, measured)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         return _without(SeenSession(session, photographs, boards, known), lost)
@@ -130,19 +131,19 @@ def search_by_hand(
         half = (len(clearer) + 1) // 2
         step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
         ask(clearer[:half])
-        so_far = _with_sure(session, at, room, so_far, believed(), boards)
+        so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
         step(f"Asking the others, with {len(so_far.placed)} photographs placed", 0.25)
         ask(clearer[half:])
         for k, one in _on_board(found(), boards).items():
             answers[k] = replace(answers[k], places=one)
-        so_far, before = _with_sure(session, at, room, so_far, believed(), boards), drawn
+        before, so_far = drawn, _with_sure(session, at, room, so_far, answers, believed(), boards)
         while so_far is not before:
-            T = believed()
+            before, T = so_far, believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any()]
             placed = len(by_hand) - len(unsure)
             step(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
             ask(unsure)
-            so_far, before = _with_sure(session, at, room, so_far, believed(), boards), so_far
+            so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
     out = believed()
     for k in by_hand:
         if k in so_far.scene.edges:
@@ -180,6 +181,7 @@ def _with_sure(
     photographs: Mapping[int, legs.Photographs],
     room: Surroundings,
     so_far: _SoFar,
+    answers: Mapping[int, _Answer],
     believed: Array,
     boards: Boards,
 ) -> _SoFar:
@@ -189,8 +191,12 @@ def _with_sure(
     new = {k: T for k, T in sure.items() if k not in scene.edges}
     if not new:
         return so_far
+    # what was measured from the places that are believed, when these were asked about
+    asked = {k: answer.asked for k, answer in answers.items() if k in new}
+    found = {k: a.measured_from(new[k]) for k, a in asked.items() if a is not None}
+    measured = {k: edges for k, edges in found.items() if edges is not None}
     try:
-        scene = join(session, photographs, scene, new, boards)
+        scene = join(session, photographs, scene, new, boards, measured)
     except PkmcalError:
         return so_far  # with all that is observed it is told better why
     placed: dict[int, Neighbour] = {}

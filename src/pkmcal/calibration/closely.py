@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import bundle, machine_told
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import Measurements, concatenate
+from pkmcal.measurements import EdgeSet, Measurements, concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
@@ -43,8 +44,8 @@ FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
 LATER: tuple[float | None, ...] = (legs.REACH, None)
 AT_LAST: tuple[float | None, ...] = (legs.AGAIN, None)
 """Pixels within which legs are looked for, one look after the other; None: edges are measured. The
-drawing is off by pixels, a machine that photographs have told is not. When all have told it, the
-first of them are where it says."""
+drawing is off by pixels, a machine that photographs have told is not. AT_LAST follows where all are
+measured already: they are where all together say."""
 NEAR = legs.SEARCH_SIGMA
 """Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
 leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
@@ -57,16 +58,16 @@ def join(
     known: KnownScene,
     places: Mapping[int, Array],
     boards: Boards,
-    looks: tuple[float | None, ...] | None = None,
+    measured: Mapping[int, EdgeSet] = MappingProxyType({}),
 ) -> KnownScene:
     """What is known together with photographs at places T_camera_base (4, 4).
 
-    photographs : by station. boards : what they show of a board. looks : as FIRST, which they are
-    where nothing but the drawing is known, and LATER elsewhere. Raises a `PkmcalError` where there
-    is nothing to be estimated.
+    photographs : by station. boards : what they show of a board. measured : what was measured
+    already in some of them, from where they are; with that they are joined first, and looked at
+    again from where all put them. Raises a `PkmcalError` where there is nothing to be estimated.
     """
-    looks = looks or (LATER if known.edges else FIRST)
-    last = _looked(session, photographs, known, places, boards, looks)
+    looks = (legs.REACH, *AT_LAST) if measured else LATER if known.edges else FIRST
+    last = _looked(session, photographs, known, places, boards, looks, measured)
     return last.known._replace(told=machine_told(last.measurements, last.estimate))
 
 
@@ -102,10 +103,11 @@ def _looked(
     places: Mapping[int, Array],
     boards: Boards,
     looks: tuple[float | None, ...],
+    measured: Mapping[int, EdgeSet] = MappingProxyType({}),
 ) -> _Look:
     """What is known once photographs were looked at from places, each look from the estimate
     before, and the last of these. What was measured in others takes part; without any, what they
-    told of the machine.
+    told of the machine. measured : in place of the first look.
     """
     at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
     for k, T in places.items():
@@ -118,6 +120,9 @@ def _looked(
     def look(known: KnownScene, reach: float | None, state: State | None) -> _Look:
         at = known.T_camera_base.copy()
         for k in places:
+            if state is None and k in measured:
+                edges[k] = measured[k]
+                continue
             p = photographs[k]
             seen = known.machine, at[k], known.T_base_platform[p.configuration]
             look = legs.measure(p, *seen) if reach is None else legs.search(p, *seen, reach)
@@ -140,20 +145,23 @@ def _looked(
 
 class Asked(NamedTuple):
     """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
-    machine from there, and what was paid (n,) for the machine.
+    machine from there, what was paid (n,) for the machine, and what was measured in it; None where
+    too few legs are where they should be, or nothing was asked.
     """
 
     T_camera_base: Array
     evidence: Array
     paid: Array
+    edges: tuple[EdgeSet | None, ...]
 
     @classmethod
     def nothing(cls) -> Asked:
-        return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
+        return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), ())
 
-    def joined(self, other: Asked) -> Asked:
-        """Both."""
-        return Asked(*map(np.concatenate, zip(self, other, strict=True)))
+    def measured_from(self, T_camera_base: Array) -> EdgeSet | None:
+        """What was measured from one of the places (4, 4)."""
+        here = np.all(self.T_camera_base == T_camera_base, axis=(1, 2))
+        return next((self.edges[k] for k in np.flatnonzero(here)), None)
 
 
 def look_closer(
@@ -185,24 +193,28 @@ def look_closer(
     both = np.concatenate([seen.T_camera_base, settled[order]])
     count = len(seen.T_camera_base)
     order = order[[k - count for k in apart(view, both, one) if k >= count]]
-    seen = seen.joined(Asked(settled[order], evidence[order], np.zeros(len(order))))
-    for T, here in zip(places[order], evidence[order], strict=True):
-        best = float((seen.evidence / found.unit - seen.paid).max())
-        if before.edges and here / found.unit < best - BEHIND:
+    at, fits = [*seen.T_camera_base, *settled[order]], [*seen.evidence, *evidence[order]]
+    paid, edges = [*seen.paid, *np.zeros(len(order))], [*seen.edges, *[None] * len(order)]
+    for number, T in enumerate(places[order], start=count):
+        best = max(fit / found.unit - cost for fit, cost in zip(fits, paid, strict=True))
+        if before.edges and fits[number] / found.unit < best - BEHIND:
             break  # what is known of the machine already does not change by so much
         try:
             known, cost = ask(session, p, before, T)
         except PkmcalError:
             continue  # too few legs are where they should be
         changed = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        there, fits = settle(changed, known.T_camera_base[[p.station]], one, 16, 6, NEAR)
-        seen = seen.joined(Asked(there, fits, np.array([cost])))
+        there, fit = settle(changed, known.T_camera_base[[p.station]], one, 16, 6, NEAR)
+        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
+        edges[number] = known.edges[p.station]
+        edges.append(edges[number])
+    seen = Asked(np.stack(at), np.array(fits), np.array(paid), tuple(edges))
     return _weighed(view, seen, found.unit), seen
 
 
 def _weighed(view: StationView, asked: Asked, unit: float) -> Alone:
     """Places by what was found out of them, the likeliest first."""
-    at, evidence, paid = asked
+    at, evidence, paid, _ = asked
     edge = grain(view, at[np.argmax(evidence)])
     by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]

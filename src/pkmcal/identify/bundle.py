@@ -354,10 +354,10 @@ class MachineTold:
     root: Array
 
     def like(self, before: MachineTold) -> bool:
-        """Whether the machine has changed since by less than its deviations, as it does until as
-        much again is told of it.
+        """Whether the machine has changed since by less than half its deviations, as it does until
+        a quarter as much again is told of it.
         """
-        change = self.root @ (self.free - before.free)
+        change = 2 * self.root @ (self.free - before.free)
         return float(change @ change) < len(change)
 
 
