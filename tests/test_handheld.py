@@ -13,7 +13,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand, closely
 from pkmcal.calibration.byhand import misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.closely import Asked, ask, join, look_closer
+from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
@@ -406,7 +406,7 @@ def found_with(monkeypatch, truth, doubts, textured=False):
         T, doubt = truth.T_camera_base[photograph.station], doubts[photograph.station]
         lead = np.log(1 / doubt - 1)
         places = Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
-        return places, Asked.nothing()
+        return places, AskedPlaces.nothing()
 
     nowhere = Alone(np.eye(4)[None], np.zeros(1), 1.0)
     monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)

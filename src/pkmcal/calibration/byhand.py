@@ -23,7 +23,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import Asked, join, look_closer
+from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
@@ -172,7 +172,7 @@ class _Answer:
 
     alone: Alone
     places: Alone
-    asked: Asked | None = None
+    asked: AskedPlaces | None = None
     by: MachineTold | None = None
 
 

@@ -143,7 +143,7 @@ def _looked(
     return found
 
 
-class Asked(NamedTuple):
+class AskedPlaces(NamedTuple):
     """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
     machine from there, what was paid (n,) for the machine, and what was measured in it; None where
     too few legs are where they should be, or nothing was asked.
@@ -155,7 +155,7 @@ class Asked(NamedTuple):
     edges: tuple[EdgeSet | None, ...]
 
     @classmethod
-    def nothing(cls) -> Asked:
+    def nothing(cls) -> AskedPlaces:
         return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), ())
 
     def measured_from(self, T_camera_base: Array) -> EdgeSet | None:
@@ -170,8 +170,8 @@ def look_closer(
     before: KnownScene,
     found: Alone,
     others: Array,
-    asked: Asked | None = None,
-) -> tuple[Alone, Asked]:
+    asked: AskedPlaces | None = None,
+) -> tuple[Alone, AskedPlaces]:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
     evidence is then a log likelihood against chance. And what was found out for that.
 
@@ -188,7 +188,7 @@ def look_closer(
     places = np.concatenate([found.T_camera_base[near][:CLOSER], others])
     # the machine as it is known; where it fits better changed, that is taken
     settled, evidence = settle(view, places, one, 16, 6, NEAR)
-    seen = Asked.nothing() if asked is None else asked
+    seen = AskedPlaces.nothing() if asked is None else asked
     order = np.argsort(-evidence, kind="stable")
     both = np.concatenate([seen.T_camera_base, settled[order]])
     count = len(seen.T_camera_base)
@@ -208,11 +208,11 @@ def look_closer(
         at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
         edges[number] = known.edges[p.station]
         edges.append(edges[number])
-    seen = Asked(np.stack(at), np.array(fits), np.array(paid), tuple(edges))
+    seen = AskedPlaces(np.stack(at), np.array(fits), np.array(paid), tuple(edges))
     return _weighed(view, seen, found.unit), seen
 
 
-def _weighed(view: StationView, asked: Asked, unit: float) -> Alone:
+def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     """Places by what was found out of them, the likeliest first."""
     at, evidence, paid, _ = asked
     edge = grain(view, at[np.argmax(evidence)])
