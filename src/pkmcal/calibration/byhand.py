@@ -47,6 +47,8 @@ share of it."""
 LIKELY = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
+ELSEWHERE = "too few of its edges agree with the other photographs"
+"""Why one is left out that was found in one place and that the others put in another."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
 """Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
 focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
@@ -82,6 +84,10 @@ def place(
                 known = join(session, at, known, sure, boards, measured)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
+        for k in sorted(found.keys() & known.edges.keys()):
+            turn = turn_between(known.T_camera_base[k], found[k].T_camera_base[0])
+            if turn > ALIKE / 2 and found[k].doubt * len(found) < SURE:
+                lost[k] = ELSEWHERE
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
 
@@ -336,8 +342,7 @@ def without_misplaced(
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
     known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
-    why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(seen._replace(known=known), why)
+    return _without(seen._replace(known=known), dict.fromkeys(wrong, ELSEWHERE))
 
 
 def why_lost(found: Alone) -> str:
