@@ -10,7 +10,7 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
-from pkmcal.identify.bundle import bundle, solve_batch, what_data_tell
+from pkmcal.identify.bundle import bundle, machine_told, solve_batch, what_data_tell
 from pkmcal.identify.covariance import identifiability, machine_covariance
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
@@ -304,6 +304,39 @@ def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_sm
     s = estimate(scene, replace(full, edges=edges), rng).statistics
     assert s.chi2 / s.dof == pytest.approx(1, abs=0.1)
     assert s.chi2_as_stated == pytest.approx(s.chi2_edges * 49 / s.dof, rel=0.2)
+
+
+def test_what_is_told_of_a_machine_stands_for_what_told_it():
+    """One station's edges with what the other's told of the machine, against both together."""
+    rng = np.random.default_rng(20)
+    scene = make_scene(rng, configurations=12, n_stations=2)
+    both = scene.measurements(rng)
+    first = (both.edges.station == 0) & (both.edges.configuration < 6)
+    second = (both.edges.station == 1) & (both.edges.configuration >= 6)
+    # nothing but the machine, and a little the camera, is in common
+    one, other, all_ = (
+        replace(both, edges=both.edges.select(part)) for part in (first, second, first | second)
+    )
+    start = start_state(scene.machine, both, guess(rng, scene.T_camera_base))
+    plain = {"robust": False, "scale_noise": False}
+    before = bundle(scene.machine, one, start, **plain)
+    told = machine_told(one, before)
+    start = replace(start, theta=before.state.theta)
+    found = bundle(scene.machine, other, start, told=told, **plain)
+    together = bundle(scene.machine, all_, start, **plain)
+    sigma = np.sqrt(np.diag(together.covariance))
+    known = sigma > 0
+    off = (found.state.theta - together.state.theta)[known] / sigma[known]
+    assert np.abs(off).max() < 0.5
+    alone = bundle(scene.machine, other, start, **plain)
+    moved = (alone.state.theta - together.state.theta)[known] / sigma[known]
+    assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(moved**2))
+    ratio = np.sqrt(np.diag(found.covariance))[known] / sigma[known]
+    np.testing.assert_allclose(ratio, 1, atol=0.05)
+    # what moves by less than its deviations is like before; by the drawing alone it was not
+    after = machine_told(all_, together)
+    assert after.like(after)
+    assert not after.like(replace(told, free=np.zeros_like(told.free)))
 
 
 def test_fixed_and_tied_parameters():

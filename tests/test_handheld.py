@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.views import Boards
-from pkmcal.calibration import byhand
+from pkmcal.calibration import byhand, closely
 from pkmcal.calibration.byhand import misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
@@ -22,6 +22,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import Exif, read_exif, with_exif
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
@@ -401,12 +402,13 @@ def view_of(session, p, poses):
 def found_with(monkeypatch, truth, doubts, textured=False):
     """Photographs are found where they were taken, with doubts; textured: the room tells too."""
 
-    def look(_session, photograph, _before, _found, _others):
+    def look(_session, photograph, _before, _found, _others, _asked):
         T, doubt = truth.T_camera_base[photograph.station], doubts[photograph.station]
         lead = np.log(1 / doubt - 1)
-        return Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
+        places = Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
+        return places, AskedPlaces.nothing()
 
-    nowhere = Alone(np.zeros((0, 4, 4)), np.zeros(0), 1.0)
+    nowhere = Alone(np.eye(4)[None], np.zeros(1), 1.0)
     monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)
     monkeypatch.setattr(byhand, "look_closer", look)
     monkeypatch.setattr(byhand, "WORKERS", 1)
@@ -573,14 +575,15 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     places = np.concatenate([turned_about(view, true[None]), true[None]])
     equal = Alone(places, np.full(len(places), 20.0), 1.0)
     drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    found = look_closer(session, p, drawn, equal, NONE)
+    found, _ = look_closer(session, p, drawn, equal, NONE)
     assert equal.doubt == 0.5
     assert found.doubt < 1e-3
     assert np.degrees(turn_between(found.T_camera_base[0], true)) < 4
     # one place alone is weighed against chance
-    alone = look_closer(session, p, drawn, Alone(true[None], np.array([20.0]), equal.unit), NONE)
+    one = Alone(true[None], np.array([20.0]), equal.unit)
+    alone, _ = look_closer(session, p, drawn, one, NONE)
     # a place that others tell of is asked about as well
-    told = look_closer(
+    told, _ = look_closer(
         session,
         p,
         drawn,
@@ -599,11 +602,36 @@ def test_photographs_join_what_is_known(looked):
     drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     known = join(session, at, drawn, places, Boards())
     assert sorted(known.edges) == [0, 1]
-    right = join(session, at, known, {2: truth.T_camera_base[2]}, Boards())
+    right, paid = ask(session, at[2], known, truth.T_camera_base[2])
+    assert sorted(right.edges) == [2]
     assert len(right.edges[2]) > 6
-    assert right.paid(but=2) - known.paid(but=2) < 3
-    other = {2: replace(at[2], configuration=at[0].configuration, joints=at[0].joints)}
-    assert len(join(session, other, known, {2: truth.T_camera_base[2]}, Boards()).edges[2]) < 3
+    assert paid < 3
+    other = replace(at[2], configuration=at[0].configuration, joints=at[0].joints)
+    with pytest.raises(InputError, match="neither an edge"):
+        ask(session, other, known, truth.T_camera_base[2])
+
+
+def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
+    """It is an estimate of one photograph; and no place is asked about twice."""
+    session, photographs, poses, truth = looked
+    at = {p.station: p for p in photographs}
+    estimated = []
+
+    def counted(machine, measurements, start, **options):
+        estimated.append(measurements.n_stations)
+        return bundle(machine, measurements, start, **options)
+
+    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    known = join(session, at, drawn, dict(enumerate(truth.T_camera_base[:2])), Boards())
+    true = truth.T_camera_base[2:]
+    found = Alone(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
+    monkeypatch.setattr(closely, "bundle", counted)
+    one, asked = look_closer(session, at[2], known, found, true)
+    assert estimated == [1] * len(closely.LATER)
+    again, both = look_closer(session, at[2], known, found, true, asked)
+    assert estimated == [1] * len(closely.LATER)
+    assert len(both.paid) == len(asked.paid)
+    np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 
 
 def test_a_board_on_the_base_weighs_places_together(looked):

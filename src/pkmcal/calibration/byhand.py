@@ -2,30 +2,33 @@
 
 Each photograph by hand is searched by itself (:mod:`pkmcal.observe.alone`), for nothing but the
 machine joins it to others, and from the places that it could show it is looked at more closely
-(:mod:`pkmcal.calibration.closely`). A board on the base places those that see it beside one that is
-placed. Those that are sure tell the machine better than its drawing, and with that the others are
-asked again, until none is added. What stays unsure is left out and told, for one photograph in a
-wrong place spoils the rest; and where the joint estimate gives up most of a photograph's edges, it
-was in a wrong place.
+(:mod:`pkmcal.calibration.closely`), the clearest first. A board on the base places those that see
+it beside one that is placed. Those that are sure tell the machine better than its drawing, and with
+that the others are asked, and asked again, until none is added. What stays unsure is left out and
+told, for one photograph in a wrong place spoils the rest; and where the joint estimate gives up
+most of a photograph's edges, it was in a wrong place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import AT_LAST, join, look_closer
+from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, inverse, pose_difference
+from pkmcal.identify.bundle import MachineTold
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
@@ -44,6 +47,8 @@ share of it."""
 LIKELY = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
+ELSEWHERE = "too few of its edges agree with the other photographs"
+"""Why one is left out that was found in one place and that the others put in another."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
 """Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
 focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
@@ -74,10 +79,15 @@ def place(
             loose = {k for k, e in known.edges.items() if len(np.unique(e.leg)) < FEWEST_LEGS}
             sure = {k: known.T_camera_base[k] for k in known.edges}
             sure |= {k: found[k].T_camera_base[0] for k in loose & found.keys()}
+            measured = {k: e for k, e in known.edges.items() if k not in loose}
             with suppress(PkmcalError):  # with all that is observed it is told better why
-                known = join(session, at, known, sure, boards, AT_LAST)
+                known = join(session, at, known, sure, boards, measured)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
+        for k in sorted(found.keys() & known.edges.keys()):
+            turn = turn_between(known.T_camera_base[k], found[k].T_camera_base[0])
+            if turn > ALIKE / 2 and found[k].doubt * len(found) < SURE:
+                lost[k] = ELSEWHERE
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
 
@@ -99,77 +109,148 @@ def search_by_hand(
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
-    joined = known
-    found: dict[int, Alone] = {}
-    # with the machine that the first of them tell; later ones change it by little
-    looked: dict[int, Alone] = {}
+    answers: dict[int, _Answer] = {}
+    drawn = so_far = _SoFar(known)
+
+    def found() -> dict[int, Alone]:
+        return {k: answer.places for k, answer in answers.items() if answer.asked is not None}
+
+    def step(text: str, share: float) -> None:
+        if told is not None:
+            told(text, share)
+
+    def ask(some: Sequence[int]) -> None:
+        search = partial(_search, session, room, so_far)
+        now = pool.map(search, [at[k] for k in some], [answers[k] for k in some])
+        answers.update(zip(some, now, strict=True))
+
+    def believed() -> Array:
+        return _believed(found(), len(by_hand), boards, known.T_camera_base)
+
     with ThreadPoolExecutor(WORKERS) as pool:
-        alone = partial(_search, session, at, room, joined, {}, {}, {}, {})
-        for k, (_, one) in zip(by_hand, pool.map(alone, by_hand), strict=True):
-            found[k] = one
-            if told is not None:
-                told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
-        found |= _on_board(found, boards)
-        while True:
-            believed = _believed(found, boards, known.T_camera_base)
-            sure = {k: believed[k] for k in at if not np.isnan(believed[k]).any()}
-            unsure = [k for k in by_hand if k not in sure]
-            new = {k: T for k, T in sure.items() if k not in joined.edges}
-            if not new:
-                break
-            if told is not None:
-                count = len(by_hand) - len(unsure)
-                told(f"Asking again, with {count} of {len(by_hand)} photographs placed", 0.3)
-            try:
-                joined = join(session, at, joined, new, boards)
-            except PkmcalError:
-                break  # with all that is observed it is told better why
-            placed: dict[int, Neighbour] = {}
-            for k in sorted(joined.edges):
-                T = joined.T_camera_base[k]
-                placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
-            landmarks = room.landmarks(placed)
-            again = partial(_search, session, at, room, joined, placed, landmarks, looked, found)
-            for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
-                looked[k], found[k] = seen, one
+        alone = pool.map(partial(_alone, session, known), [at[k] for k in by_hand])
+        for k, one in zip(by_hand, alone, strict=True):
+            answers[k] = _Answer(one, one)
+            step(f"Placing photographs by hand: {len(answers)} of {len(by_hand)}", 0.2)
+        # the clearer half tells a machine, with which the others are asked
+        clearer = sorted(by_hand, key=lambda k: answers[k].alone.doubt)
+        half = (len(clearer) + 1) // 2
+        step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
+        ask(clearer[:half])
+        so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
+        step(f"Asking the others, with {len(so_far.placed)} photographs placed", 0.25)
+        ask(clearer[half:])
+        for k, one in _on_board(found(), boards).items():
+            answers[k] = replace(answers[k], places=one)
+        before, so_far = drawn, _with_sure(session, at, room, so_far, answers, believed(), boards)
+        while so_far is not before:
+            before, T = so_far, believed()
+            unsure = [k for k in by_hand if np.isnan(T[k]).any()]
+            placed = len(by_hand) - len(unsure)
+            step(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
+            ask(unsure)
+            so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
+    out = believed()
     for k in by_hand:
-        if k in joined.edges:
-            believed[k] = joined.T_camera_base[k]
-    return found, joined._replace(T_camera_base=believed)
+        if k in so_far.scene.edges:
+            out[k] = so_far.scene.T_camera_base[k]
+    return found(), so_far.scene._replace(T_camera_base=out)
+
+
+class _SoFar(NamedTuple):
+    """What is known when a photograph is asked: the scene, the photographs that are placed, and
+    what they show of the room.
+    """
+
+    scene: KnownScene
+    placed: Mapping[int, Neighbour] = MappingProxyType({})
+    landmarks: Mapping[int, Landmarks] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What is known of the places of one photograph.
+
+    alone : by the search in it alone. places : weighed with all that is known. asked : what was
+    found out of them, None where they were not asked about. by : the machine that was known then,
+    None where it was as drawn.
+    """
+
+    alone: Alone
+    places: Alone
+    asked: AskedPlaces | None = None
+    by: MachineTold | None = None
+
+
+def _with_sure(
+    session: Session,
+    photographs: Mapping[int, legs.Photographs],
+    room: Surroundings,
+    so_far: _SoFar,
+    answers: Mapping[int, _Answer],
+    believed: Array,
+    boards: Boards,
+) -> _SoFar:
+    """What is known with all photographs that are believed; the same where there are no others."""
+    scene = so_far.scene
+    sure = {k: T for k, T in enumerate(believed) if k in photographs and not np.isnan(T).any()}
+    new = {k: T for k, T in sure.items() if k not in scene.edges}
+    if not new:
+        return so_far
+    # what was measured from the places that are believed, when these were asked about
+    asked = {k: answer.asked for k, answer in answers.items() if k in new}
+    found = {k: a.measured_from(new[k]) for k, a in asked.items() if a is not None}
+    measured = {k: edges for k, edges in found.items() if edges is not None}
+    try:
+        scene = join(session, photographs, scene, new, boards, measured)
+    except PkmcalError:
+        return so_far  # with all that is observed it is told better why
+    placed: dict[int, Neighbour] = {}
+    for k in sorted(scene.edges):
+        p, T = photographs[k], scene.T_camera_base[k]
+        placed[k] = Neighbour(p.camera, T, _legs(session, p, scene, T)[0])
+    return _SoFar(scene, placed, room.landmarks(placed))
+
+
+def _alone(session: Session, scene: KnownScene, photograph: legs.Photographs) -> Alone:
+    """The places of a photograph by the search in it alone."""
+    p = photograph
+    view = StationView(
+        scene.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        scene.T_base_platform, distance_tables([p.images[0]]),
+    )  # fmt: skip
+    return find_alone(view, p.images[0])
 
 
 def _search(
     session: Session,
-    photographs: Mapping[int, legs.Photographs],
     room: Surroundings,
-    joined: KnownScene,
-    placed: Mapping[int, Neighbour],
-    landmarks: Mapping[int, Landmarks],
-    looked: Mapping[int, Alone],
-    found: Mapping[int, Alone],
-    k: int,
-) -> tuple[Alone, Alone]:
-    """The places that photograph k could show: by the search in it alone, unless it was looked at,
-    and those that were likely before, weighed by its legs and by what it shares of the room with
-    those that are placed.
+    so_far: _SoFar,
+    photograph: legs.Photographs,
+    before: _Answer,
+) -> _Answer:
+    """The places that a photograph could show, those of before among them, weighed by its legs and
+    by what it shares of the room with those that are placed.
+
+    As soon as photographs have told a machine, it is searched again, once, with that: later ones
+    change it by little. Places that were asked with a machine like this one are not asked again.
     """
-    p = photographs[k]
-    alone = looked.get(k)
-    if alone is None:
-        view = StationView(
-            joined.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-            joined.T_base_platform, distance_tables([p.images[0]]),
-        )  # fmt: skip
-        alone = find_alone(view, p.images[0])
-    others = room.place(k, landmarks)
-    if k in found:
-        others = np.concatenate([others, found[k].T_camera_base[:LIKELY]])
+    p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
+    alone, asked, by = before.alone, None, scene.told
+    if scene.told is not None:
+        if before.by is None:
+            alone = _alone(session, scene, p)
+        elif scene.told.like(before.by):
+            asked, by = before.asked, before.by
+    likely = before.places.T_camera_base[:LIKELY]
+    others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
-        axes = _legs(session, p, joined, alone.T_camera_base)
+        axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
-    closer = look_closer(session, p, joined, alone, others)
-    axes = _legs(session, p, joined, closer.T_camera_base)
-    return alone, room.weighed(closer, k, p.camera, axes, placed)
+    closer, asked = look_closer(session, p, scene, alone, others, asked)
+    axes = _legs(session, p, scene, closer.T_camera_base)
+    places = room.weighed(closer, k, p.camera, axes, placed)
+    return _Answer(alone, places, asked, by)
 
 
 def _legs(
@@ -213,13 +294,15 @@ def _on_board(found: Mapping[int, Alone], boards: Boards) -> dict[int, Alone]:
     return {k: Alone(T[order], total[order], 1.0) for k, T in own.items()}
 
 
-def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
+def _believed(found: dict[int, Alone], count: int, boards: Boards, known: Array) -> Array:
     """Poses T_camera_base (S, 4, 4) with those of photographs of whose place there is little
     doubt, and those that a board on the base joins to them; NaN for the others.
+
+    count : of all photographs by hand, some of which may not be found yet.
     """
     out = known.copy()
     for k, one in found.items():
-        if one.doubt * len(found) < SURE:
+        if one.doubt * count < SURE:
             out[k] = one.T_camera_base[0]
     seen = [None if np.isnan(T).any() else T for T in out]
     joined = boards.joined(seen)
@@ -259,8 +342,7 @@ def without_misplaced(
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
     known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
-    why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(seen._replace(known=known), why)
+    return _without(seen._replace(known=known), dict.fromkeys(wrong, ELSEWHERE))
 
 
 def why_lost(found: Alone) -> str:
@@ -312,5 +394,5 @@ def _without(seen: SeenSession, lost: dict[int, str]) -> SeenSession:
         left,
         [replace(p, station=number[p.station]) for p in seen.photographs if p.station in number],
         seen.boards.of(np.array(kept, dtype=int)),
-        known._replace(T_camera_base=T_camera_base, edges=edges, cost={}),
+        known._replace(T_camera_base=T_camera_base, edges=edges, told=None),
     )

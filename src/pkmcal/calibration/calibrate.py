@@ -172,9 +172,14 @@ def calibrate(
         seen = _observe(session, seed, clock)
         try:
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
-            turns = found.turns
-            at = seen.known.T_camera_base
-            if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
+            # without one that was in a wrong place, another may show itself to be
+            while wrong := misplaced(
+                seen.session,
+                found.turns.measurements,
+                found.turns.estimate,
+                seen.known.T_camera_base,
+            ):
+                turns = found.turns
                 seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
                 found = _identify(seen, refine_camera, method, seed, holdout, clock)
         except ResultError:

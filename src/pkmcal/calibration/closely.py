@@ -4,7 +4,7 @@ A search in the picture alone knows the machine by its drawing, whose errors of 
 pixels: a machine of equal parts then fits nearly as well when it is turned by one of them. Here the
 photograph is measured from each of the places that it could show, and the machine is estimated with
 it there. What the drawing has wrong is explained by that, and paid for by the drawing's tolerances;
-what photographs that are placed already know of the machine is paid for as well. How well the
+where photographs that are placed already know the machine, by what they know of it. How well the
 machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.stations`) less what
 was paid is the log likelihood of the place. Between places from which the machine lies on the same
 legs, turned onto itself, half an edge counts as one measurement, as it does in a station's
@@ -14,24 +14,26 @@ of edges, it puts under all of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import KnownScene
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import bundle
+from pkmcal.identify.bundle import bundle, machine_told
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import concatenate
+from pkmcal.measurements import EdgeSet, Measurements, concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationView, grain, settle
+from pkmcal.observe.stations import StationView, apart, grain, settle
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
@@ -42,14 +44,12 @@ FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
 LATER: tuple[float | None, ...] = (legs.REACH, None)
 AT_LAST: tuple[float | None, ...] = (legs.AGAIN, None)
 """Pixels within which legs are looked for, one look after the other; None: edges are measured. The
-drawing is off by pixels, a machine that photographs have told is not. When all have told it, the
-first of them are where it says."""
+drawing is off by pixels, a machine that photographs have told is not. AT_LAST follows where all are
+measured already: they are where all together say."""
 NEAR = legs.SEARCH_SIGMA
 """Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
 leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
 that lie near something; it does not offer legs that lie on it."""
-GIVEN_UP = 9.0
-"""What an edge costs at least that the estimate gives up: three standard deviations."""
 
 
 def join(
@@ -58,23 +58,71 @@ def join(
     known: KnownScene,
     places: Mapping[int, Array],
     boards: Boards,
-    looks: tuple[float | None, ...] | None = None,
+    measured: Mapping[int, EdgeSet] = MappingProxyType({}),
 ) -> KnownScene:
     """What is known together with photographs at places T_camera_base (4, 4).
 
-    photographs : by station. boards : what they show of a board. looks : as FIRST, which they are
-    where nothing but the drawing is known, and LATER elsewhere. Raises a `PkmcalError` where there
-    is nothing to be estimated.
+    photographs : by station. boards : what they show of a board. measured : what was measured
+    already in some of them, from where they are; with that they are joined first, and looked at
+    again from where all put them. Raises a `PkmcalError` where there is nothing to be estimated.
+    """
+    looks = (legs.REACH, *AT_LAST) if measured else LATER if known.edges else FIRST
+    last = _looked(session, photographs, known, places, boards, looks, measured)
+    return last.known._replace(told=machine_told(last.measurements, last.estimate))
+
+
+def ask(
+    session: Session, photograph: legs.Photographs, known: KnownScene, T_camera_base: Array
+) -> tuple[KnownScene, float]:
+    """What one photograph would make of what is known, if it were taken from a place (4, 4); and
+    what is paid for that, half the squares by which the machine and the readings are moved.
+
+    Those that are placed say what they know of the machine once and for all, so a question costs
+    the same however many they are. Boards are left out: what a place is asked is how the legs look
+    from there. Raises a `PkmcalError` where too few legs are where they should be.
+    """
+    k, looks = photograph.station, LATER if known.edges else FIRST
+    alone, places = known._replace(edges={}), {k: T_camera_base}
+    last = _looked(session, {k: photograph}, alone, places, Boards(), looks)
+    squares = last.estimate.statistics.chi2_drawing + last.estimate.statistics.chi2_joints
+    return last.known, squares / 2
+
+
+class _Look(NamedTuple):
+    """What is known after a look, and the estimate that says so."""
+
+    known: KnownScene
+    measurements: Measurements
+    estimate: Estimate
+
+
+def _looked(
+    session: Session,
+    photographs: Mapping[int, legs.Photographs],
+    known: KnownScene,
+    places: Mapping[int, Array],
+    boards: Boards,
+    looks: tuple[float | None, ...],
+    measured: Mapping[int, EdgeSet] = MappingProxyType({}),
+) -> _Look:
+    """What is known once photographs were looked at from places, each look from the estimate
+    before, and the last of these. What was measured in others takes part; without any, what they
+    told of the machine. measured : in place of the first look.
     """
     at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
     for k, T in places.items():
         at[k] = T
+    told = None if known.edges else known.told
     only = replace(session.of_stations(stations), trackers=())
     shown = boards.of(np.array(stations, dtype=int))
     edges = dict(known.edges)
-    state: State | None = None
-    for reach in looks or (LATER if edges else FIRST):
+
+    def look(known: KnownScene, reach: float | None, state: State | None) -> _Look:
+        at = known.T_camera_base.copy()
         for k in places:
+            if state is None and k in measured:
+                edges[k] = measured[k]
+                continue
             p = photographs[k]
             seen = known.machine, at[k], known.T_base_platform[p.configuration]
             look = legs.measure(p, *seen) if reach is None else legs.search(p, *seen, reach)
@@ -84,62 +132,91 @@ def join(
         ]
         measurements = measurements_of(only, shown, concatenate(numbered))
         start = state or start_state(known.machine, measurements, at[stations])
-        estimate = bundle(session.machine, measurements, start)
-        state = estimate.state
-        at = at.copy()
-        at[stations] = state.T_camera_base
-        known = KnownScene(
-            estimate.machine, at, state.T_base_platform, edges,
-            _costs(estimate, measurements.edges.station, stations),
-            (estimate.statistics.chi2_drawing + estimate.statistics.chi2_joints) / 2,
-        )  # fmt: skip
-    return known
+        estimate = bundle(session.machine, measurements, start, told=told)
+        at[stations] = estimate.state.T_camera_base
+        known = KnownScene(estimate.machine, at, estimate.state.T_base_platform, dict(edges))
+        return _Look(known, measurements, estimate)
+
+    found = look(known._replace(T_camera_base=at), looks[0], None)
+    for reach in looks[1:]:
+        found = look(found.known, reach, found.estimate.state)
+    return found
 
 
-def _costs(estimate: Estimate, station: Integers, stations: Sequence[int]) -> dict[int, float]:
-    """Half the squares of each station's edges; one that is given up costs GIVEN_UP at least."""
-    weight = estimate.edge_weights
-    square = estimate.edge_trust * np.sum(estimate.edge_residuals**2, axis=-1)
-    cost = (weight * square + (1 - weight) * GIVEN_UP) / 2
-    sums = np.bincount(station, cost, len(stations)).tolist()
-    return dict(zip(stations, sums, strict=True))
+class AskedPlaces(NamedTuple):
+    """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
+    machine from there, what was paid (n,) for the machine, and what was measured in it; None where
+    too few legs are where they should be, or nothing was asked.
+    """
+
+    T_camera_base: Array
+    evidence: Array
+    paid: Array
+    edges: tuple[EdgeSet | None, ...]
+
+    @classmethod
+    def nothing(cls) -> AskedPlaces:
+        return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0), ())
+
+    def measured_from(self, T_camera_base: Array) -> EdgeSet | None:
+        """What was measured from one of the places (4, 4)."""
+        here = np.all(self.T_camera_base == T_camera_base, axis=(1, 2))
+        return next((self.edges[k] for k in np.flatnonzero(here)), None)
 
 
 def look_closer(
-    session: Session, photograph: legs.Photographs, before: KnownScene, found: Alone, others: Array
-) -> Alone:
+    session: Session,
+    photograph: legs.Photographs,
+    before: KnownScene,
+    found: Alone,
+    others: Array,
+    asked: AskedPlaces | None = None,
+) -> tuple[Alone, AskedPlaces]:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
-    evidence is then a log likelihood against chance.
+    evidence is then a log likelihood against chance. And what was found out for that.
 
-    others : (n, 4, 4) places that are asked about beside those found in the picture.
+    others : (n, 4, 4) places that are asked about beside those found in the picture. asked : what
+    was found out already with the same machine; nothing is asked about one of its places again.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
     view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        before.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
         before.T_base_platform, distance_tables(p.images, *FINEST),
     )  # fmt: skip
     near = found.evidence > found.evidence[0] - BEHIND * found.unit
-    weighed: list[tuple[float, float]] = []  # evidence and what was paid
-    places: list[Array] = []
-
-    def weigh(known: KnownScene, T: Array) -> None:
-        seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        settled, evidence = settle(seen, T[None], one, 16, 6, NEAR)
-        weighed.append((float(evidence[0]), known.paid(but=p.station) - before.paid(but=p.station)))
-        places.append(settled[0])
-
-    for T in (*found.T_camera_base[near][:CLOSER], *others):
-        weigh(before, T)  # the machine as it is known; where it fits better changed, that is taken
+    places = np.concatenate([found.T_camera_base[near][:CLOSER], others])
+    # the machine as it is known; where it fits better changed, that is taken
+    settled, evidence = settle(view, places, one, 16, 6, NEAR)
+    seen = AskedPlaces.nothing() if asked is None else asked
+    order = np.argsort(-evidence, kind="stable")
+    both = np.concatenate([seen.T_camera_base, settled[order]])
+    count = len(seen.T_camera_base)
+    order = order[[k - count for k in apart(view, both, one) if k >= count]]
+    at, fits = [*seen.T_camera_base, *settled[order]], [*seen.evidence, *evidence[order]]
+    paid, edges = [*seen.paid, *np.zeros(len(order))], [*seen.edges, *[None] * len(order)]
+    for number, T in enumerate(places[order], start=count):
+        best = max(fit / found.unit - cost for fit, cost in zip(fits, paid, strict=True))
+        if before.edges and fits[number] / found.unit < best - BEHIND:
+            break  # what is known of the machine already does not change by so much
         try:
-            # without boards: what a place is asked is how the legs look from there
-            known = join(session, {p.station: p}, before, {p.station: T}, Boards())
+            known, cost = ask(session, p, before, T)
         except PkmcalError:
             continue  # too few legs are where they should be
-        weigh(known, known.T_camera_base[p.station])
-    at, (evidence, paid) = np.stack(places), np.array(weighed).T
+        changed = replace(view, machine=known.machine, all_poses=known.T_base_platform)
+        there, fit = settle(changed, known.T_camera_base[[p.station]], one, 16, 6, NEAR)
+        at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
+        edges[number] = known.edges[p.station]
+        edges.append(edges[number])
+    seen = AskedPlaces(np.stack(at), np.array(fits), np.array(paid), tuple(edges))
+    return _weighed(view, seen, found.unit), seen
+
+
+def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
+    """Places by what was found out of them, the likeliest first."""
+    at, evidence, paid, _ = asked
     edge = grain(view, at[np.argmax(evidence)])
-    by_edges, by_legs = evidence / edge - paid, evidence / found.unit - paid
+    by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]
     turned = turn_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
     here = turn_between(at, first) < ALIKE

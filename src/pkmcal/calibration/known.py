@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
+from pkmcal.identify.bundle import MachineTold
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import Photographs
@@ -19,25 +20,19 @@ class KnownScene(NamedTuple):
     T_base_platform (K, 4, 4) of the configurations.
 
     Of photographs by hand that have told the machine: edges, what was measured in each, by its
-    station; cost, half the squares of these; own, half the squares of the drawing's values and of
-    the readings.
+    station; told, what they and the drawing know of the machine together.
     """
 
     machine: Machine
     T_camera_base: Array
     T_base_platform: Array
     edges: Mapping[int, EdgeSet] = MappingProxyType({})
-    cost: Mapping[int, float] = MappingProxyType({})
-    own: float = 0.0
+    told: MachineTold | None = None
 
     @classmethod
     def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> KnownScene:
         """A drawing; of platforms the nearest poses, where it does not quite close."""
         return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
-
-    def paid(self, but: int) -> float:
-        """What is paid for the machine, by all but one station's edges."""
-        return self.own + sum(cost for k, cost in self.cost.items() if k != but)
 
 
 class SeenSession(NamedTuple):

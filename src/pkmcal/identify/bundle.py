@@ -21,6 +21,7 @@ from pkmcal.identify.covariance import (
     identifiability,
     information,
     machine_covariance,
+    reduced_rows,
 )
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
@@ -341,12 +342,32 @@ def _shading_of(fit: _Fit, least: Array) -> Array:
     return common_shading(unit * fit.info.state.shading, variance, unit, least)
 
 
+@dataclass(frozen=True)
+class MachineTold:
+    """What measurements and the drawing told of a machine.
+
+    free : (n,) its free unknowns; root : (n, n) of their information, ``root^T root`` the inverse
+    of their covariance whatever the other unknowns are.
+    """
+
+    free: Array
+    root: Array
+
+    def like(self, before: MachineTold) -> bool:
+        """Whether the machine has changed since by less than half its deviations, as it does until
+        a quarter as much again is told of it.
+        """
+        change = 2 * self.root @ (self.free - before.free)
+        return float(change @ change) < len(change)
+
+
 def bundle(
     machine: Machine,
     measurements: Measurements,
     start: State,
     *,
     use_drawing: bool = True,
+    told: MachineTold | None = None,
     robust: bool = True,
     scale_noise: bool = True,
     scale_readings: bool = True,
@@ -357,7 +378,8 @@ def bundle(
 
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
-        and edge shifts keep theirs in any case.
+        and edge shifts keep theirs in any case. told : what other measurements told of the
+        machine, with the drawing in it, in the drawing's place.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
         scale_readings : and that of the readings, which may become less.
@@ -372,6 +394,11 @@ def bundle(
     # mounts are known to be near their start, as far as nothing else tells
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
+    if told is not None:
+        drawn, u = np.array(assembled.priors) == "drawing", problem.unknowns
+        prior, target = problem.prior.copy(), problem.prior_target.copy()
+        prior[drawn, u.machine], target[drawn] = told.root, told.root @ told.free
+        problem = replace(problem, prior=prior, prior_target=target)
     result = solve_batch(
         problem,
         batch,
@@ -406,6 +433,17 @@ def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled,
     )
     assembled = replace(assembled, problem=assembled.trusting(weights))
     return assembled, batch_of(machine, assembled, estimate.state)
+
+
+def machine_told(measurements: Measurements, estimate: Estimate) -> MachineTold:
+    """What an estimate knows of the machine, for the estimate of other measurements.
+
+    The frames are as little known as by the drawing, about where the estimate has them.
+    """
+    assembled, state = as_ended(measurements, estimate)
+    rows, _ = reduced_rows(assembled.problem, state, ("machine",), silent=())
+    root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    return MachineTold(state.z[0], root)
 
 
 def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:

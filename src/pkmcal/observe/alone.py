@@ -171,13 +171,16 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
         seen = np.einsum("pij,ptnj->ptni", look, point)
         for turn in range(TURNS):
             score = _scores(seen, tubes.radius, 2 * np.pi * turn / TURNS, chart, windows)
-            best = np.argpartition(score, -EACH, axis=-1)[:, -EACH:]
-            shifts += [best]
-            values += [np.take_along_axis(score, best, axis=-1)]
-    value, best = np.stack(values), np.stack(shifts)  # (distance * turn, place, EACH)
+            for _ in range(EACH):
+                best = score.argmax(axis=-1)[:, None]
+                shifts += [best]
+                values += [np.take_along_axis(score, best, axis=-1)]
+                np.put_along_axis(score, best, -np.inf, axis=-1)
+    # (distance * turn * EACH, place)
+    value, best = (np.concatenate(part, axis=-1).T for part in (values, shifts))
     order = np.argsort(-value.ravel())[:KEPT]
-    step, place, which = np.unravel_index(order, value.shape)
-    shift = best[step, place, which]
+    row, place = np.unravel_index(order, value.shape)
+    step, shift = row // EACH, best[row, place]
     dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
     x, y, zero = dx * CELL / chart.scale, dy * CELL / chart.scale, np.zeros(len(order))
     tilt = rotation(np.stack([-y, x, zero], axis=-1))

@@ -12,6 +12,7 @@ turn of the camera is nearly a shift.
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -123,7 +124,8 @@ def _support(grey: Array) -> Array:
             bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
             dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
             pair = np.maximum(bright, dark)[: height * COARSE, : width * COARSE]
-            pair = pair.reshape(height, COARSE, width, COARSE).max(axis=(1, 3))
+            rows = reduce(np.maximum, (pair[n::COARSE] for n in range(COARSE)))
+            pair = reduce(np.maximum, (rows[:, n::COARSE] for n in range(COARSE)))
             length = max(SLENDER * wide, SHORTEST) / COARSE
             out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
     return out
