@@ -37,6 +37,7 @@ from pkmcal.observe.predict import (
     plane_normals,
     visible_stretch,
 )
+from pkmcal.observe.shadows import lightness, without_shadows
 from pkmcal.observe.tables import BIN, DistanceTables
 
 SEARCH_ANGLE = np.radians(6.0)
@@ -234,6 +235,9 @@ def find_station(
     every = view.few(count)
     candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
+    legs = view.legs(every).moved(candidates[order])
+    light = lightness(view.camera, view.tubes, legs, view.tables)
+    order = order[without_shadows(candidates[order], light)]
     first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
     order = order[apart(view, candidates[order], every)]
