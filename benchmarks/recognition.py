@@ -1,6 +1,7 @@
 """Recognition: stations of all machines without a pose, and sessions with a usual mistake in them.
 
     python benchmarks/recognition.py [--stations 100]         right, refused, wrong; seconds
+    python benchmarks/recognition.py --machines 3-rps ...     of some machines alone
     python benchmarks/recognition.py --mistakes [--no-pose]   named, refused otherwise, not noticed
     python benchmarks/recognition.py --keep FOLDER ...        draws photographs once and keeps them
 
@@ -271,11 +272,13 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
 # ------------------------------------------------------------------ told
 
 
-def of_catalogue(count: int, keep: Path) -> Iterator[tuple[str, Outcome]]:
-    """Stations of all machines in turn, each without a pose."""
+def of_catalogue(
+    count: int, keep: Path, machines: list[str] | None = None
+) -> Iterator[tuple[str, Outcome]]:
+    """Stations of all machines, or of some, in turn, each without a pose."""
     from pkmcal.mechanisms import catalogue
 
-    names = sorted(set(catalogue()) - set(HINGED))
+    names = machines or sorted(set(catalogue()) - set(HINGED))
     for k in range(count):
         name, seed = names[k % len(names)], k // len(names)
         folder = simulated(name, seed, 1, PHOTOGRAPHS, keep)
@@ -300,6 +303,7 @@ def main() -> None:
     """One line a session as it is done, then the counts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--stations", type=int, default=100)
+    parser.add_argument("--machines", nargs="+", metavar="NAME", help="of these machines alone")
     parser.add_argument("--mistakes", action="store_true")
     parser.add_argument("--sessions", type=int, default=5, help="of each mistake")
     parser.add_argument("--no-pose", action="store_true", help="mistakes: drop the rough poses")
@@ -310,7 +314,7 @@ def main() -> None:
         if options.mistakes:
             outcomes = of_mistakes(options.sessions, keep, options.no_pose)
         else:
-            outcomes = of_catalogue(options.stations, keep)
+            outcomes = of_catalogue(options.stations, keep, options.machines)
         counts: dict[str, Counter[str]] = {}
         seconds: dict[str, list[float]] = {}
         for name, outcome in outcomes:

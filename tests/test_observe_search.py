@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.observe.legs import REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.shadows import without_shadows
 from pkmcal.observe.stations import StationView, find_station
 from pkmcal.observe.tables import DIRECTIONS, direction_of, distance_tables
 from test_observe_drawing import (
@@ -320,3 +321,25 @@ def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():
     assert many.look(level, on_shelf, number)[0] > 20
     upright = direction_of(np.array([1.0, 0.0]))
     assert many.look(upright, np.array([[100.0, 300.0]]), number)[0] < 2
+
+
+def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
+    """A bright bar that moves before a grey wall, and its shadow below."""
+    pictures = []
+    for k in range(5):
+        picture = np.full((480, 640), 120, np.uint8)
+        picture[100:120, 60 + 90 * k : 140 + 90 * k] = 240
+        picture[300:320, 60 + 90 * k : 140 + 90 * k] = 60
+        pictures.append(picture)
+    tables = distance_tables(pictures)
+    pixel = np.array([[100.0, 110.0], [100.0, 310.0], [100.0, 200.0], [-5.0, 110.0]])
+    for seen, turn in ((tables, 1), (tables.mirrored(), -1)):
+        at = pixel if turn > 0 else pixel * (-1, 1) + (639, 0)
+        sign, inside = seen.brighter(at, np.zeros(4, dtype=int))
+        assert sign.tolist() == [1, -1, 0, 0]
+        assert inside.tolist() == [True, True, True, False]
+    places = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
+    assert without_shadows(places, np.array([-1.0, 0.9, 0.0])).tolist() == [1, 2]
+    assert without_shadows(places, np.array([-1.0, 0.2, -0.9])).tolist() == [0, 1, 2]
+    places[1] = pose(rotation(np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    assert without_shadows(places, np.array([-1.0, 0.9, 0.0])).tolist() == [0, 1, 2]

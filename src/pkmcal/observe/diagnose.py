@@ -218,7 +218,8 @@ def _likelier(
         also.append("the pose by hand is of another side of the machine")
     if not also:
         return error
-    said = f"{error.found}; they fit as well if {' or '.join(also)}"
+    distinct = dict.fromkeys(also)  # several numberings are told by the same words
+    said = f"{error.found}; they fit as well if {' or '.join(distinct)}"
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 

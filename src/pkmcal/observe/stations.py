@@ -37,6 +37,7 @@ from pkmcal.observe.predict import (
     plane_normals,
     visible_stretch,
 )
+from pkmcal.observe.shadows import lightness, without_shadows
 from pkmcal.observe.tables import BIN, DistanceTables
 
 SEARCH_ANGLE = np.radians(6.0)
@@ -46,8 +47,9 @@ is 10 degrees and 10 cm."""
 TRIES = 800
 FEWER_TRIES = 160
 """Poses tried where one of thirty hypotheses is looked at."""
-ANYWHERE = 600
-"""Poses from all round the machine that are looked at more closely."""
+ANYWHERE, LIKELIER = 1200, 300
+"""Poses from all round the machine that descend, and how many of them go on: before a descent the
+pictures hardly tell which is near, least of all of three legs that are alike."""
 FIRST_DAMPING = 1e-3
 """Of a step, relative to the normal equations' diagonal."""
 SHAKEN, LIKELY = 48, 16
@@ -220,19 +222,24 @@ def find_station(
     halves = HALVES if T_camera_base is None else HALVES_TOLD
     folds = 2 if count >= halves else 3 if count >= THIRDS else count
     kept: list[Array] = []
-    surely = np.zeros(0)
+    surely: list[Array] = []
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
         asked = number % folds == fold
         searched, other = np.flatnonzero(~asked), np.flatnonzero(asked)
         found = _search(view.select(searched), T_camera_base, rng)
         kept.append(found)
-        surely = np.concatenate([surely, _surely(view, found[0], searched, other, rng)])
+        surely.append(_surely(view, found[0], searched, other, rng))
         if _by_chance(surely) < BY_CHANCE / DECIDED:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
     every = view.few(count)
     candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
+    legs = view.legs(every).moved(candidates[order])
+    light = lightness(view.camera, view.tubes, legs, view.tables)
+    order = order[without_shadows(candidates[order], light)]
+    first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
+    confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
     order = order[apart(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
@@ -245,7 +252,7 @@ def find_station(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
         evidence=float(evidence[0]),
-        by_chance=_by_chance(surely),
+        by_chance=confirmed,
         second=_second(evidence, each := grain(view, candidates[0])),
         told=T_camera_base is not None,
         grain=each,
@@ -258,15 +265,14 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
     if T_camera_base is None:
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
         candidates = _anywhere(view, few, each * ANYWHERE)
-        candidates = _best(view, candidates, few, reach=12, keep=each * 96)
         candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
-        candidates = _best(view, candidates, few, reach=8, keep=each * 24)
+        candidates = _best(view, candidates, few, reach=8, keep=each * LIKELIER)
     else:
         candidates = _random_search(view, T_camera_base, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
-    candidates = _best(view, candidates, more, reach=5, keep=12)
+    candidates = _best(view, candidates, more, reach=5, keep=24)
     candidates = descend(view, candidates, more, 5, (5, 4, 4, 3))
-    candidates = _best(view, candidates, more, reach=3, keep=12)
+    candidates = _best(view, candidates, more, reach=3, keep=24)
     candidates = candidates[apart(view, candidates, more)[:4]]
     # the picture is rugged: what lies beside a good place may be better
     beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
@@ -633,10 +639,27 @@ def _second(evidence: Array, grain: float) -> float:
     return 1 / (1 + math.exp(min(float(evidence[0] - evidence[1:].max()) / grain, 500.0)))
 
 
-def _by_chance(surely: Array) -> float:
-    """Probability of so sure photographs (K,), taken together, by chance."""
-    if not len(surely):
+def _confirmed(view: StationView, place: Array, asked: Array, surely: list[Array]) -> float:
+    """Probability by chance of what photographs said of a pose (4, 4), which was chosen from those
+    (F, 4, 4) that they were asked about, ``surely`` (K,) of each.
+
+    A search that ended elsewhere has asked about another place, which says nothing of this one. But
+    from so many different ones this was chosen, and any may be confirmed by chance.
+    """
+    every = view.few(len(view.configuration))
+    own = [len(apart(view, np.stack([place, other]), every)) == 1 for other in asked]
+    if not any(own):
+        return _by_chance(surely)
+    choices = len(apart(view, asked, every))
+    about = [sure for sure, mine in zip(surely, own, strict=True) if mine]
+    return min(choices * _by_chance(about), 1.0)
+
+
+def _by_chance(parts: list[Array]) -> float:
+    """Probability of so sure photographs, (K,) of each part, taken together, by chance."""
+    if not parts:
         return 1.0
+    surely = np.concatenate(parts)
     return 0.5 * math.erfc(float(surely.sum()) / math.sqrt(2 * len(surely)))
 
 

@@ -52,7 +52,8 @@ class DistanceTables:
     n % rows and column n // rows. row : (K,) each photograph's table. edges : of each photograph.
     moving : (h, w) share of the photographs in which each place differs from the others; where a
     single one cannot tell, where it has edges. chance : (DIRECTIONS, bins) of BIN: how often a
-    place taken anywhere has that distance.
+    place taken anywhere has that distance. against : (n, h, w) of each table, 1 where a place is
+    brighter than in the median photograph, -1 darker, 0 much the same, or where there is no median.
     """
 
     tables: Array
@@ -61,6 +62,7 @@ class DistanceTables:
     edges: tuple[PictureEdges, ...]
     moving: Array
     chance: Array
+    against: Integers
 
     def direction(self, normal: Array) -> Integers:
         """Direction number of edges whose image normals are (..., 2)."""
@@ -92,6 +94,17 @@ class DistanceTables:
         ahead = self._looked_up(x + right, y + down, cv2.INTER_LINEAR)
         behind = self._looked_up(x - right, y - down, cv2.INTER_LINEAR)
         return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
+
+    def brighter(self, pixel: Array, photograph: Integers) -> tuple[Integers, Booleans]:
+        """Whether places at full-size pixels (..., 2) are brighter (1) or darker (-1) than in the
+        median photograph, 0 outside, and which lie in the photograph.
+        """
+        height, width = self.against.shape[1:]
+        x, y = ((pixel[..., i] + 0.5) / self.scale for i in (0, 1))
+        with np.errstate(invalid="ignore"):
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        x, y = (np.where(inside, v, 0.0).astype(np.intp) for v in (x, y))
+        return np.where(inside, self.against[self.row[photograph], y, x], 0), inside
 
     def _place(
         self, direction: Integers, pixel: Array, photograph: Integers
@@ -147,6 +160,7 @@ class DistanceTables:
             tuple(edges),
             self.moving[:, ::-1],
             self.chance[::-1],
+            self.against[..., ::-1],
         )
 
 
@@ -198,7 +212,11 @@ def distance_tables(
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
         small.append(_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
     height, across = small[0].shape
-    differs = _differs(np.stack(small)) if len(small) >= ENOUGH_TO_COMPARE else None
+    against = np.zeros((len(small), height, across), dtype=np.int8)
+    differs = None
+    if len(small) >= ENOUGH_TO_COMPARE:
+        against = _against_median(np.stack(small))
+        differs = against != 0
     edges = tuple(map(_edges_of, small, [None] * len(small) if differs is None else differs))
     moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
     rows = min(len(small), MOST_ACROSS // height)
@@ -211,11 +229,11 @@ def distance_tables(
         distances(e.pixel.astype(int), number, table.shape, table)
         count += _counted(table)
     chance = (count / count.sum(axis=1, keepdims=True) / BIN).astype(np.float32)
-    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, chance)
+    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, chance, against)
 
 
-def _differs(small: Integers) -> Booleans:
-    """Where photographs (K, h, w) differ from the median of all."""
+def _against_median(small: Integers) -> Integers:
+    """Where photographs (K, h, w) are brighter (1) or darker (-1) than the median of all."""
     # neighbours exchanged until all are in order: over pictures, thirty times as fast as sorting
     # the levels of one place after the other
     order = small.copy()
@@ -227,7 +245,8 @@ def _differs(small: Integers) -> Booleans:
     n = len(order)
     # twice the median, in whole levels
     twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
-    return np.abs(2 * small.astype(np.int16) - twice) > 2 * STILL
+    off = 2 * small.astype(np.int16) - twice
+    return (off > 2 * STILL).astype(np.int8) - (off < -2 * STILL)
 
 
 def _moving(small: Integers, edges: PictureEdges) -> Array:
