@@ -349,7 +349,7 @@ def why_lost(found: Alone) -> str:
     """Why a photograph could not be placed, in words."""
     return (
         "its edges fit the legs nearly as well from another place, which with probability"
-        f" {found.doubt:.2f} is the right one"
+        f" {found.doubt:.2g} is the right one"
     )
 
 

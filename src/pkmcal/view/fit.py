@@ -76,7 +76,7 @@ def _alone(view: StationView, image: Integers) -> tuple[Array, bool, str]:
     best = found.T_camera_base[0]
     if found.doubt < DOUBT:
         return best, True, "Placed: from no other place does the machine fit as well."
-    why = f"with probability {found.doubt:.2f} another place is the right one"
+    why = f"with probability {found.doubt:.2g} another place is the right one"
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
