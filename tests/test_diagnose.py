@@ -11,8 +11,9 @@ import pytest
 
 from pkmcal.observe import diagnose
 from pkmcal.observe.diagnose import SeenStation, _numbering, mistake
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import FoundStation, StationView, find_station
+from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
 from test_observe_drawing import camera_of, draw, machine, photographs, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose

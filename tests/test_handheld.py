@@ -28,9 +28,10 @@ from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import legs, surroundings
 from pkmcal.observe.alone import Alone, find_alone, turn_between, turned_about
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import DOUBT, StationView
+from pkmcal.observe.stations import DOUBT
 from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
 from pkmcal.observe.tubes import DIRECTIONS, WORTH, tube_chart

@@ -9,10 +9,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.legs import REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
-from pkmcal.observe.stations import StationView, find_station
+from pkmcal.observe.stations import find_station
 from pkmcal.observe.tables import DIRECTIONS, direction_of, distance_tables
 from test_observe_drawing import (
     FRONT,

@@ -33,13 +33,13 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, Alone, find_alone, turn_between
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
-from pkmcal.observe.stations import StationView
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
-from pkmcal.wording import listed
+from pkmcal.wording import brief, listed
 
 SURE = 0.05
 """Probability that any photograph of a session is believed to be where it is not; each has an equal
@@ -349,7 +349,7 @@ def why_lost(found: Alone) -> str:
     """Why a photograph could not be placed, in words."""
     return (
         "its edges fit the legs nearly as well from another place, which with probability"
-        f" {found.doubt:.2g} is the right one"
+        f" {brief(found.doubt)} is the right one"
     )
 
 

@@ -5,7 +5,7 @@ pixels: a machine of equal parts then fits nearly as well when it is turned by o
 photograph is measured from each of the places that it could show, and the machine is estimated with
 it there. What the drawing has wrong is explained by that, and paid for by the drawing's tolerances;
 where photographs that are placed already know the machine, by what they know of it. How well the
-machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.stations`) less what
+machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.evidence`) less what
 was paid is the log likelihood of the place. Between places from which the machine lies on the same
 legs, turned onto itself, half an edge counts as one measurement, as it does in a station's
 photographs; against other places half a leg, since what chance puts under a leg in a picture full
@@ -32,8 +32,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
+from pkmcal.observe.evidence import StationView, apart, grain, settle
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationView, apart, grain, settle
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 

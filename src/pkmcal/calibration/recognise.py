@@ -15,9 +15,10 @@ from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import KEPT, Pictures, fitting
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import FoundStation, StationView, find_station
+from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session, Station

@@ -3,7 +3,7 @@
 Places all round the machine, at distances from which it fills the picture or a third of it, turns
 about the line of sight and places in the picture are tried, by the middles of the tubes on a chart
 of what could be tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as those of a
-station do (:mod:`pkmcal.observe.stations`), on tables that tell three times as many directions
+station do (:mod:`pkmcal.observe.evidence`), on tables that tell three times as many directions
 apart; the best of these again on twice and four times as fine a picture, where texture yields far
 less evidence and the machine more.
 
@@ -23,9 +23,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, inverse, pose, rotation
+from pkmcal.observe.evidence import StationView, apart, descend, evidence_of, settle
 from pkmcal.observe.places import PLACES, TURNS, frame_of, sphere
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
-from pkmcal.observe.stations import StationView, apart, descend, evidence_of, settle
 from pkmcal.observe.tables import WORKING_WIDTH, distance_tables
 from pkmcal.observe.tubes import CELL, DIRECTIONS, TubeChart, tube_chart
 
@@ -66,7 +66,7 @@ class Alone(NamedTuple):
     """Places that a photograph could show, the one with the most evidence first.
 
     T_camera_base : (H, 4, 4), none near the first. evidence : (H,) as
-    :mod:`pkmcal.observe.stations` has it. unit : evidence that counts as one measurement.
+    :mod:`pkmcal.observe.evidence` has it. unit : evidence that counts as one measurement.
     """
 
     T_camera_base: Array

@@ -20,15 +20,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose_difference
-from pkmcal.observe.stations import (
-    FoundStation,
-    StationView,
-    evidence_by_name,
-    evidence_from,
-    evidence_nearby,
-    find_station,
-    settled,
-)
+from pkmcal.observe.evidence import StationView, evidence_by_name, evidence_from, settled
+from pkmcal.observe.stations import FoundStation, evidence_nearby, find_station
 from pkmcal.wording import listed
 
 DECIDED = math.log(30 / 0.05)

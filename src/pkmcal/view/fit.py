@@ -9,13 +9,14 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.observe.alone import find_alone
+from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import DOUBT, StationView, find_station
+from pkmcal.observe.stations import DOUBT, find_station
 from pkmcal.observe.tables import distance_tables
 from pkmcal.view.overlay import moved, overlay, pane_of
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Viewed
-from pkmcal.wording import count
+from pkmcal.wording import brief, count
 
 LOOKED_AT = 16
 """Photographs of a station that take part: a search looks at eight and asks the others, in about a
@@ -76,7 +77,7 @@ def _alone(view: StationView, image: Integers) -> tuple[Array, bool, str]:
     best = found.T_camera_base[0]
     if found.doubt < DOUBT:
         return best, True, "Placed: from no other place does the machine fit as well."
-    why = f"with probability {found.doubt:.2g} another place is the right one"
+    why = f"with probability {brief(found.doubt)} another place is the right one"
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 

@@ -24,7 +24,7 @@ from pkmcal.session.photographs import Photograph, label_of
 if TYPE_CHECKING:
     from pkmcal.boards.board import Board, Detection
     from pkmcal.calibration.saved import SavedCalibration
-    from pkmcal.observe.stations import StationView
+    from pkmcal.observe.evidence import StationView
 
 KEPT = 16
 """Decoded photographs that are kept: those that one goes back and forth between."""

@@ -1,0 +1,455 @@
+"""How much the edges of photographs speak for the machine at a place, and the descent to the most.
+
+Places descend by damped steps on the distances of predicted silhouettes from picture edges
+(:mod:`pkmcal.observe.tables`). A point of a predicted silhouette has either a picture edge of the
+machine near by, or what chance has put there: a mixture, whose two numbers each place may choose
+for itself. Its likelihood against chance alone is the evidence, counted by the length of the
+silhouettes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.predict import (
+    LegsInCamera,
+    TubeList,
+    edge_points,
+    legs_in_camera,
+    of_edges,
+    plane_normals,
+    visible_stretch,
+)
+from pkmcal.observe.tables import BIN, DistanceTables
+
+FIRST_DAMPING = 1e-3
+"""Of a step, relative to the normal equations' diagonal."""
+FURTHER = 1e4
+"""Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
+SETTLED = 0.1
+"""Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
+AT_ONCE = 30_000
+"""Places on silhouettes that are looked up together, so that what is worked out of them stays in
+the processor's cache."""
+NAMES_AT_ONCE = 16
+"""Names under which all photographs are looked at together: some 15 MB of 64 photographs."""
+LAST_REACH = 4.0
+"""Reduced pixels at which the final score cuts distances off."""
+FEWEST_RIVALS, MOST_RIVALS = 8, 24
+"""Other readings for each photograph, which tell what evidence chance gives."""
+AWAY = np.repeat([0.2, 0.1], 3)
+"""Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
+APART = 8.0
+"""Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
+
+
+@dataclass(frozen=True)
+class StationView:
+    """What the search looks at: one station's photographs and what should be in them.
+
+    configuration : (K,) rows of the session's readings. all_joints : (M, m) these readings.
+    all_poses : T_base_platform (M, 4, 4) by the drawing. guessed : where the legs would be in the
+    photographs by hypotheses, (H, K, L), one for each place that is asked for; none where they are
+    as the readings say.
+    """
+
+    machine: Machine
+    camera: Camera
+    tubes: TubeList
+    configuration: Integers
+    all_joints: Array
+    all_poses: Array
+    tables: DistanceTables
+    guessed: LegsInCamera | None = None
+
+    @property
+    def joints(self) -> Array:
+        """Readings (K, m) of the photographs."""
+        return self.all_joints[self.configuration]
+
+    @property
+    def poses(self) -> Array:
+        """Poses (K, 4, 4) of the platform in the photographs."""
+        return self.all_poses[self.configuration]
+
+    @cached_property
+    def all_legs(self) -> LegsInCamera:
+        """The legs' axes in the base frame, (M, L), in the search's single precision."""
+        return self.legs_at(self.all_poses, self.all_joints)
+
+    def legs_at(self, poses: Array, joints: Array) -> LegsInCamera:
+        """The same at other poses (..., 4, 4) and readings (..., m)."""
+        return legs_in_camera(self.machine, np.eye(4), poses, joints).single()
+
+    def legs(self, photographs: Integers) -> LegsInCamera:
+        """Of some photographs (n,): (n, L), or (H, n, L) where they are guessed."""
+        if self.guessed is not None:
+            return self.guessed[:, photographs]
+        return self.all_legs[self.configuration[photographs]]
+
+    def guess(self, which: slice | Integers) -> StationView:
+        """The same for some of the hypotheses that are guessed, if there are as many as places."""
+        if self.guessed is None or len(self.guessed) == 1:
+            return self
+        return replace(self, guessed=self.guessed[which])
+
+    def few(self, count: int) -> Integers:
+        """Numbers of up to ``count`` photographs, spread over all."""
+        n = len(self.configuration)
+        return np.unique(np.linspace(0, n - 1, min(count, n)).astype(int))
+
+    def with_joints(self, joints: Array) -> StationView:
+        """The same photographs with other readings (M, m)."""
+        found = self.machine.forward_result(joints).T_base_platform
+        return replace(self, all_joints=joints, all_poses=found)
+
+    def select(self, photographs: Integers) -> StationView:
+        """Some of the photographs alone."""
+        return replace(
+            self,
+            configuration=self.configuration[photographs],
+            tables=self.tables.select(photographs),
+            guessed=self.guessed and self.guessed[:, photographs],
+        )
+
+    def rivals(self, rng: np.random.Generator) -> LegsInCamera:
+        """Where legs would be at readings that are not the photographs' own, (R, K, L): each time
+        those of the configurations that follow by so many; where the session has few, on platforms
+        elsewhere too.
+        """
+        count, own = len(self.all_joints), self.configuration
+        steps = np.unique(np.linspace(1, max(count - 1, 1), MOST_RIVALS).astype(int))
+        steps = steps[steps < count]
+        others = self.all_legs[(own + steps[:, None]) % count]
+        rest = max(FEWEST_RIVALS - len(steps), 0)
+        if not rest:
+            return others
+        away = rng.normal(size=(rest, len(own), 6)) * AWAY
+        away[..., 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
+        return others.joined(self.legs_at(perturb(self.poses, away), self.joints))
+
+
+def apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
+    """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
+    legs = view.legs(photographs).moved(candidates)
+    pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
+    kept: list[int] = []
+    for h in range(len(candidates)):
+        away = pixel[kept] - pixel[h]
+        off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
+        if all(np.median(other) > APART for other in off):
+            kept.append(h)
+    return kept
+
+
+def score(
+    view: StationView, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
+) -> Array:
+    """Mean distance from predicted edges to picture edges, cut off at ``reach``: (H,), 0 to 1.
+
+    T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
+    between their ends, which is exact for a pinhole and near enough for this search elsewhere.
+    """
+    parts = _parts(view, len(T_camera_base), len(photographs) * samples)
+    if len(parts) > 1:
+        return np.concatenate(
+            [score(view.guess(k), T_camera_base[k], photographs, reach, samples) for k in parts]
+        )
+    tubes = view.tubes
+    legs = view.legs(photographs).moved(T_camera_base)
+    a, b, u = of_edges(legs, tubes)
+    radius = view.machine.values[tubes.radius].astype(a.dtype)
+    normal, ok = plane_normals(a, u, radius, tubes)
+    first, last = visible_stretch(a, b, tubes)
+    base = a + radius[:, None] * normal
+    begin, end = (view.camera.project(base + at[..., None] * u) for at in (first, last))
+    chord = end - begin
+    direction = view.tables.direction(of_components(-chord[..., 1], chord[..., 0]))
+    fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
+    points = of_components(
+        *(begin[..., None, k] + fraction * chord[..., None, k] for k in (0, 1))
+    )  # (H, K, E, n, 2)
+    number = np.arange(len(view.configuration))[photographs][:, None, None]
+    found, inside = view.tables.look(direction[..., None], points, number)
+    cost = np.where(inside & ok[..., None], np.minimum(found, reach) / reach, 1.0)
+    weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
+    total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
+    return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / total
+
+
+class _Mixture(NamedTuple):
+    """What a hypothesis says of the distances found, (H,): the share that chance has put there, and
+    the standard deviation (reduced px) of the rest.
+    """
+
+    share: Array
+    sigma: Array
+
+    def likelier(self, look: _Look) -> Array:
+        """Density (H, E, n) of the distances found on the machine's edges, times the share that is
+        on these, by the density that chance gives.
+        """
+        share, sigma = (v.astype(np.float32)[:, None, None] for v in self)
+        near = np.exp(look.found**2 * (-0.5 / sigma**2))
+        return near * ((1 - share) * np.sqrt(2 / np.pi) / sigma) * look.rare
+
+
+class _Look(NamedTuple):
+    """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
+    FURTHER outside the image; its slope, by metres that the edge moves outward; one by the density
+    of such distances by chance; reduced pixels of silhouette for which each place stands, none
+    outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
+    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
+    """
+
+    found: Array
+    slope: Array
+    rare: Array
+    length: Array
+    begins: Array
+    grows: Array
+
+    def weight(self, reach: float) -> Array:
+        """Geman-McClure: what is further than the reach is another edge."""
+        return (1 + (self.found * (1 / reach)) ** 2) ** -2
+
+    def cost(self, reach: float) -> Array:
+        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
+        part = (self.found * (1 / reach)) ** 2
+        return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
+
+    def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
+        """The likeliest mixture, from another on (expectation and maximisation)."""
+        total = np.maximum(_summed(self.length), 1e-9)
+        for _ in range(rounds):
+            own = self.length * self.own(mixture)
+            mine = _summed(own)
+            square = _summed(own * self.found**2) / np.maximum(mine, 1e-9)
+            sigma = np.clip(np.sqrt(square), BIN, widest)
+            mixture = _Mixture(np.clip(1 - mine / total, 0.01, 0.99), sigma)
+        return mixture
+
+    def own(self, mixture: _Mixture) -> Array:
+        """Probability (H, E, n) of each place's edge being the machine's."""
+        own = mixture.likelier(self)
+        return own / (own + mixture.share.astype(np.float32)[:, None, None])
+
+    def evidence(self, mixture: _Mixture) -> Array:
+        """Log likelihood (H, E, n) of each place against chance."""
+        share = mixture.share.astype(np.float32)[:, None, None]
+        return self.length * np.log(mixture.likelier(self) + share)
+
+    def where(self, better: Booleans, other: _Look) -> _Look:
+        """Take some of the hypotheses from here, the rest from the other look."""
+        if better.all():
+            return self
+        out = [mine.copy() for mine in self]
+        for mine, its in zip(out, other, strict=True):
+            mine[~better] = its[~better]
+        return _Look(*out)
+
+
+def _summed(values: Array) -> Array:
+    """Sums (H,) over all places (H, E, n)."""
+    return values.reshape(len(values), -1).sum(axis=-1, dtype=float)
+
+
+def descend(
+    view: StationView,
+    candidates: Array,
+    photographs: Integers,
+    samples: int,
+    reaches: tuple[float, ...],
+) -> Array:
+    """Levenberg-Marquardt on the distances, candidates (H, 4, 4) side by side, a step a reach.
+
+    Upright legs hardly say where their camera stands; undamped, steps there go astray.
+    """
+    look = look_under(view, candidates, photographs, samples)
+    damping = np.full(len(candidates), FIRST_DAMPING)
+    for reach in reaches:
+        trial = _step(candidates, look, look.weight(reach), damping)
+        seen = look_under(view, trial, photographs, samples)
+        better = seen.cost(reach) < look.cost(reach)
+        candidates = np.where(better[:, None, None], trial, candidates)
+        look = seen.where(better, look)
+        damping = np.where(better, 0.3, 10.0) * damping
+    return candidates
+
+
+def settle(
+    view: StationView,
+    candidates: Array,
+    photographs: Integers,
+    samples: int,
+    steps: int,
+    widest: float = LAST_REACH,
+) -> tuple[Array, Array]:
+    """The same to the most evidence: how far edges scatter, up to ``widest`` reduced pixels, is
+    learnt on the way.
+
+    Returns the places (H, 4, 4) and their evidence (H,).
+    """
+    look = look_under(view, candidates, photographs, samples)
+    damping = np.full(len(candidates), FIRST_DAMPING)
+    mixture = first_mixture(len(candidates))
+    last = np.inf
+    for _ in range(steps):
+        mixture = look.mixture(mixture, widest=widest)
+        trial = _step(candidates, look, look.length * look.own(mixture), damping)
+        seen = look_under(view, trial, photographs, samples)
+        gain = _summed(seen.evidence(mixture)) - _summed(look.evidence(mixture))
+        better = gain > 0
+        candidates = np.where(better[:, None, None], trial, candidates)
+        look = seen.where(better, look)
+        damping = np.where(better, 0.3, 10.0) * damping
+        if max(last, last := float(gain.max())) < SETTLED:
+            break  # one step may have been too long
+    mixture = look.mixture(first_mixture(len(candidates)), 10, widest)
+    return candidates, _summed(look.evidence(mixture))
+
+
+def first_mixture(count: int) -> _Mixture:
+    """Where each of so many places begins: half edges, half chance."""
+    return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
+
+
+def evidence_of(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
+    """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
+    look = look_under(view, candidates, photographs, samples)
+    mixture = look.mixture(first_mixture(len(candidates)), rounds=10)
+    return by_photograph(look.evidence(mixture), len(photographs))
+
+
+def by_photograph(evidence: Array, count: int) -> Array:
+    """Sums (H, K) over each photograph's places, (H, E, n) of all in a row."""
+    return evidence.reshape(len(evidence), count, -1).sum(axis=-1, dtype=float)
+
+
+def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -> Array:
+    """Evidence (K, n) of a pose (4, 4) in each photograph under each of the names (n,), rows of the
+    readings; edges scatter as they do under the names that the view has.
+    """
+    every = view.few(len(view.configuration))
+    mixture = look_under(view, T_camera_base[None], every, 8).mixture(first_mixture(1), rounds=10)
+    fits: list[Array] = []
+    for first in range(0, len(names), NAMES_AT_ONCE):
+        some = names[first : first + NAMES_AT_ONCE]
+        guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
+        places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
+        look = look_under(replace(view, guessed=guessed), places, every, 8)
+        fits.append(by_photograph(look.evidence(mixture), len(every)))
+    return np.concatenate(fits).T
+
+
+def settled(view: StationView, T_camera_base: Array) -> Array:
+    """The pose (4, 4) with the most evidence near another."""
+    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0][0]
+
+
+def evidence_from(view: StationView, places: Array) -> float:
+    """The most evidence, of all photographs, to which any of the places (H, 4, 4) settles.
+
+    Searches end up to fifty measurements apart, whatever they look for; so explanations of the same
+    photographs are compared from the same places.
+    """
+    every = view.few(len(view.configuration))
+    return float(settle(view, places, every, 8, 8)[1].max())
+
+
+def grain(view: StationView, T_camera_base: Array) -> float:
+    """Reduced pixels of half a predicted edge: what moves an edge moves its places together, so
+    each half counts as one measurement.
+    """
+    every = view.few(len(view.configuration))
+    length = look_under(view, T_camera_base[None], every, 2).length[0]
+    seen = length[length > 0]
+    # two samples stand for an edge's length each; where no edge is in the picture none counts
+    return float(seen.mean()) / 2 if seen.size else 1.0
+
+
+def _parts(view: StationView, count: int, places: int) -> list[slice]:
+    """Of so many hypotheses those that are looked at together, at so many places of each edge."""
+    each = max(places * len(view.tubes), 1)
+    parts = max(min(round(count * each / AT_ONCE), count), 1)
+    ends = [count * k // parts for k in range(parts + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def look_under(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
+    """Distances under the edges predicted from poses (H, 4, 4)."""
+    parts = _parts(view, len(candidates), len(photographs) * samples)
+    if len(parts) > 1:
+        looks = [look_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
+        return _Look(*map(np.concatenate, zip(*looks, strict=True)))
+    number = np.arange(len(view.configuration))[photographs][:, None, None]
+    legs = view.legs(photographs).moved(candidates)
+    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
+    direction = view.tables.direction(points.outward)
+    found, slope, inside = view.tables.look_along(direction, points.pixel, points.outward, number)
+    inside = inside & points.valid
+    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
+    length = np.hypot(chord[..., 0], chord[..., 1]) / np.float32(view.tables.scale * (samples - 1))
+    rare = 1 / view.tables.by_chance(direction, found)
+    # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
+    first, last = points.point[..., 0, :], points.point[..., -1, :]
+    seen = np.any(inside, axis=-1, keepdims=True)[..., 0]
+    begins = _stacked((cross(first, points.normal), points.normal), seen)
+    grows = _stacked((cross(last - first, points.normal),), seen)
+    shape = (len(candidates), -1, samples)
+    return _Look(
+        np.where(inside, found, FURTHER).reshape(shape),
+        (slope * np.where(inside, points.gain, 0.0)).reshape(shape),
+        rare.reshape(shape),
+        np.where(inside, length[..., None], 0.0).reshape(shape),
+        begins,
+        grows,
+    )
+
+
+def _stacked(vectors: tuple[Array, ...], seen: Booleans) -> Array:
+    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where not seen."""
+    out = np.zeros((len(seen), 3 * len(vectors), seen[0].size), np.float32)
+    for k, vector in enumerate(vectors):
+        for c in range(3):
+            part = out[:, 3 * k + c].reshape(seen.shape)
+            np.copyto(part, vector[..., c], where=seen)
+    return out
+
+
+def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Array:
+    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
+
+    weight : (H, E, n) of the places. damping : (H,).
+    """
+    # the places of an edge lie evenly between its first and its last
+    at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
+    powers = np.stack([at**0, at, at**2], axis=-1)
+    weighted = weight * look.slope
+    one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
+    here, there = np.moveaxis((weighted * look.found) @ powers[:, :2], -1, 0)
+    begins, grows = look.begins, look.grows
+    normal = (begins * one) @ begins.mT
+    mixed = (grows * both) @ begins.mT
+    normal[:, :3] += mixed
+    normal[:, :, :3] += mixed.mT
+    normal[:, :3, :3] += (grows * two) @ grows.mT
+    right = begins @ here[..., None]
+    right[:, :3] += grows @ there[..., None]
+    normal, right = normal.astype(float), right.astype(float)
+    diagonal = np.einsum("hii->hi", normal) + 1e-12
+    normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+    step = -np.linalg.solve(normal, right)[..., 0]
+    step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
+    # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
+    turned = pose(rotation(step[:, :3]), np.zeros((len(step), 3))) @ candidates
+    return perturb(turned, np.concatenate([np.zeros((len(step), 3)), step[:, 3:]], axis=-1))
