@@ -202,7 +202,7 @@ def test_turned_photographs_are_found_from_nothing(turn):
 
 def test_one_photograph_says_where_but_not_that_it_is_the_machine():
     """Of one photograph the place is right; no other is there to confirm it."""
-    for seed in range(4):
+    for seed in range(2):
         found = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
         assert misplaced(found.T_camera_base) < 5
         assert not found.good
@@ -248,8 +248,8 @@ def sticks(rng):
 
 @pytest.mark.parametrize(
     ("scene", "count"),
-    [*((scene, 2) for scene in (blank, noisy, texture, clouds, sticks)), (sticks, 6),
-     *(often(scene, 6) for scene in (blank, noisy, texture, clouds))],
+    [*((scene, 2) for scene in (blank, noisy, texture, clouds, sticks)),
+     *(often(scene, 6) for scene in (blank, noisy, texture, clouds, sticks))],
 )  # fmt: skip
 def test_photographs_of_something_else_are_not_recognised(scene, count):
     rng = np.random.default_rng(1)
