@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-import pkmcal.report
+import pkmcal.pages
 from conftest import run
 from pkmcal.check import advice as words
 from pkmcal.check.check import check_session
@@ -253,7 +253,7 @@ def test_each_number_stands_once_and_apart(found):
 
 
 def test_colours_are_those_of_the_style_sheet():
-    style = Path(pkmcal.report.__file__).with_name("templates") / "style.css"
+    style = Path(pkmcal.pages.__file__).with_name("templates") / "style.css"
     blue, green, red = leg_colours()[0]
     assert f"--leg1: #{red:02x}{green:02x}{blue:02x}" in style.read_text()
 

@@ -18,10 +18,11 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
-from pkmcal.report import drawn, parameters, pictures, provenance, residuals
+from pkmcal.pages import drawn
+from pkmcal.pages.charts import enlargement, ticks_between
+from pkmcal.pages.drawn import CURVE, STRAIGHT
+from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
-from pkmcal.report.charts import enlargement, ticks_between
-from pkmcal.report.drawn import CURVE, STRAIGHT
 from test_report_case import OUTWARD, RADIUS, TOLD, Case, edges_of, make_case
 
 

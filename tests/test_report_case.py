@@ -16,8 +16,8 @@ from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
-from pkmcal.report.page import page_html
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph
 

@@ -14,9 +14,9 @@ import pytest
 
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Level, Outcome, Part, Row, Table, Verdict
+from pkmcal.pages.charts import UprightBar, bar_chart
+from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
-from pkmcal.report.charts import UprightBar, bar_chart
-from pkmcal.report.page import page_html
 from test_report_case import TOLD, Case, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"

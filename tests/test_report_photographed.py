@@ -10,6 +10,7 @@ from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.pages.plots import frustum
 from pkmcal.report import photographed, pictures, scene
 from test_report_case import RADIUS, Case, make_case
 
@@ -78,7 +79,7 @@ def test_a_crank_is_drawn_with_its_arm():
 def test_a_frustum_is_what_the_camera_sees():
     camera = Pinhole((320, 240), np.array([280.0, 281.0, 160.2, 119.1, -0.3, 0.05, 1e-3, 0, 0]))
     T_base_camera = perturb(np.eye(4), np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
-    border, *rays = photographed.frustum(camera, T_base_camera, 0.5)
+    border, *rays = frustum(camera, T_base_camera, 0.5)
     inside = apply(inverse(T_base_camera), border)
     np.testing.assert_allclose(inside[:, 2], 0.5)
     pixel = camera.project(inside)
@@ -91,7 +92,7 @@ def test_a_frustum_is_what_the_camera_sees():
 
 def test_a_mirrors_field_has_no_plane():
     camera = Unified((640, 480), np.array([200.0, 200.0, 319.5, 239.5, 1.0, 0, 0, 0, 0]))
-    border, *_ = photographed.frustum(camera, np.eye(4), 0.5)
+    border, *_ = frustum(camera, np.eye(4), 0.5)
     np.testing.assert_allclose(np.linalg.norm(border, axis=1), 0.5)
 
 

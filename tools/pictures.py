@@ -28,9 +28,10 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
+from pkmcal.pages import page
 from pkmcal.planning.plan import plan as make_plan
 from pkmcal.planning.subject import of_machine
-from pkmcal.report import page, pictures, scene
+from pkmcal.report import pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save

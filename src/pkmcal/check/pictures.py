@@ -17,11 +17,10 @@ from pkmcal.arrays import Array
 from pkmcal.check.look import Look, StationLook
 from pkmcal.files import staged_folder
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.drawn import Drawn, Spot, laid_over
-from pkmcal.report.jpegs import jpeg
-from pkmcal.report.page import N_COLOURS
-from pkmcal.report.pictures import Picture
+from pkmcal.pages import page
+from pkmcal.pages.drawn import Drawn, Picture, Spot, laid_over
+from pkmcal.pages.jpegs import jpeg
+from pkmcal.pages.page import N_COLOURS
 
 SHIFT = 4
 """Binary digits of a pixel to which cv2 draws."""
@@ -172,7 +171,7 @@ def _colour(leg: int) -> tuple[int, int, int]:
 @cache
 def leg_colours() -> tuple[tuple[int, int, int], ...]:
     """What the page's style sheet gives legs on photographs: it stands once, there."""
-    style = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+    style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
     (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)\}", style, flags=re.MULTILINE)
     found = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
     numbers = [int(found[str(k + 1)], 16) for k in range(N_COLOURS)]

@@ -90,7 +90,7 @@ def answer(
 def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | bytes]:
     """The content of each of the files."""
     from pkmcal.files import json_text
-    from pkmcal.report.page import page_html
+    from pkmcal.pages.page import page_html
 
     texts, made = dict(outcome.texts), datetime.now()
     for name in files:

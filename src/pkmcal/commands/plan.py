@@ -107,9 +107,9 @@ def plan(
     """The next configurations worth measuring."""
     from threadpoolctl import threadpool_limits
 
-    from pkmcal.api.plan import as_it_stands
     from pkmcal.files import check_own_folder
     from pkmcal.planning.plan import plan as run
+    from pkmcal.planning.subject import as_it_stands
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import load_session, session_folder
 
@@ -125,8 +125,10 @@ def plan(
         region = None
         if session is not None:
             _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
-            source, region = as_it_stands(
-                load_session(session, measured=False),
+            measured = load_session(session, measured=False)
+            region = measured.workspace
+            source = as_it_stands(
+                measured,
                 after,
                 from_drawing=from_drawing,
                 same_place=same_place,

@@ -24,10 +24,11 @@ from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Outcome, Verdict, doubtful
+from pkmcal.pages import page
+from pkmcal.pages.drawn import KEPT
 from pkmcal.report import (
     field,
     identifiability,
-    page,
     parameters,
     photographed,
     pictures,
@@ -38,7 +39,6 @@ from pkmcal.report import (
     validation,
     workspace,
 )
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.wording import brief, count, number
 

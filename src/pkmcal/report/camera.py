@@ -13,11 +13,11 @@ from markupsafe import Markup
 from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
-from pkmcal.report import charts, page
-from pkmcal.report.charts import enlargement
+from pkmcal.pages import charts, page
+from pkmcal.pages.charts import enlargement
+from pkmcal.pages.drawn import Corner, Picture
+from pkmcal.pages.jpegs import THREADS, jpeg
 from pkmcal.report.field import CellShift, ImageField
-from pkmcal.report.jpegs import THREADS, jpeg
-from pkmcal.report.pictures import Corner, Picture
 from pkmcal.wording import brief, count, decimals, number
 
 ARROW = 0.05

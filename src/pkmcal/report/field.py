@@ -19,12 +19,11 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.charts import enlargement
+from pkmcal.pages import page
+from pkmcal.pages.charts import enlargement
+from pkmcal.pages.drawn import KEPT, across, measured_curves, own_edges
 from pkmcal.report.corners import BoardCorners
-from pkmcal.report.drawn import across, measured_curves, own_edges
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 

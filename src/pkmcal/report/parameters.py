@@ -18,8 +18,9 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.outcome import AXIS, LOOKS, Part, Plot
-from pkmcal.report import page
+from pkmcal.outcome import Part, Plot
+from pkmcal.pages import page
+from pkmcal.pages.plots import AXIS, LOOKS
 from pkmcal.wording import (
     SCALES,
     capital,

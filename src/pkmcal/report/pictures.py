@@ -17,21 +17,23 @@ from pkmcal.measurements import Observation, Rejection
 from pkmcal.observe.images import Pictures
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.charts import enlargement
-from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.drawn import (
+from pkmcal.pages import page
+from pkmcal.pages.charts import enlargement
+from pkmcal.pages.drawn import (
     CURVE,
+    KEPT,
+    Corner,
     Drawn,
+    Picture,
     Spot,
     edge_name,
     measured_curves,
     polyline,
     residual_words,
 )
-from pkmcal.report.jpegs import small_and_large
+from pkmcal.pages.jpegs import small_and_large
+from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Links, Place
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
 from pkmcal.wording import brief, count, number
@@ -42,42 +44,6 @@ ROOM = 8_000_000
 """Characters of all their JPEGs."""
 ARROW = 0.03
 """Length of a large corner's residual as drawn, in picture widths."""
-
-
-@dataclass(frozen=True)
-class Corner:
-    """A board's corner in pixels: where found, and the way to where it is expected, enlarged."""
-
-    x: float
-    y: float
-    dx: float
-    dy: float
-    quiet: bool
-    tip: str
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
-    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
-    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
-    the page.
-    """
-
-    station: str
-    configuration: str
-    width: int
-    height: int
-    jpeg: str
-    edges: tuple[Drawn, ...]
-    spots: tuple[Spot, ...]
-    why: str = ""
-    caption: str = ""
-    kind: str = "measured"
-    anchor: str = ""
-    large: str = ""
-    missed: tuple[Drawn, ...] = ()
-    corners: tuple[Corner, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,22 +12,10 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, plain, yaml_text
 from pkmcal.geometry.rigid import inverse
-from pkmcal.outcome import (
-    AXIS,
-    LOOKS,
-    Figure,
-    Outcome,
-    Part,
-    Plot,
-    Row,
-    Table,
-    Verdict,
-    note,
-)
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, note
+from pkmcal.pages.plots import AXIS, LOOKS, beside, frustum, line, markers, seen_whole
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.report.photographed import frustum
-from pkmcal.report.scene import beside, line, markers, seen_whole
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
 

@@ -10,8 +10,8 @@ from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.report import charts
-from pkmcal.report.charts import (
+from pkmcal.pages import charts
+from pkmcal.pages.charts import (
     NORMAL_90,
     BarChart,
     RowChart,
@@ -20,8 +20,9 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
+from pkmcal.pages.drawn import KEPT
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import KEPT, SIGMAS, level_bar
+from pkmcal.report.residuals import SIGMAS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 

@@ -15,8 +15,9 @@ from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
-from pkmcal.report import page, parameters
-from pkmcal.report.drawn import SIDES
+from pkmcal.pages import page
+from pkmcal.pages.drawn import SIDES
+from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 

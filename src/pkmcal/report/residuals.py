@@ -13,8 +13,8 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.report import charts
-from pkmcal.report.charts import (
+from pkmcal.pages import charts
+from pkmcal.pages.charts import (
     NORMAL_90,
     BarChart,
     RowChart,
@@ -23,13 +23,11 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.drawn import SIDES
+from pkmcal.pages.drawn import KEPT, SIDES
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
-KEPT = 0.5
-"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
 STANDS_OUT = 1.5
 """A group whose residuals are this many times the middle group's is worth a sentence."""
 SHADED = 0.05

@@ -14,19 +14,9 @@ from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.outcome import (
-    Figure,
-    Outcome,
-    Part,
-    Plot,
-    Row,
-    Table,
-    Verdict,
-    doubtful,
-    plane,
-)
-from pkmcal.report.page import N_COLOURS
-from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, doubtful
+from pkmcal.pages.page import N_COLOURS
+from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_layout
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2

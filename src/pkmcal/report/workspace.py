@@ -11,9 +11,9 @@ from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN
-from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
+from pkmcal.outcome import Part, Plot, Row, Table
+from pkmcal.pages.plots import AXIS, COLOURS, LOOKS, coloured, markers, space_layout
 from pkmcal.report.links import Links
-from pkmcal.report.scene import COLOURS, coloured, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 

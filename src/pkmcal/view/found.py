@@ -16,8 +16,9 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.report.drawn import (
+from pkmcal.pages.drawn import (
     CURVE,
+    KEPT,
     across,
     edge_name,
     measured_curves,
@@ -25,7 +26,6 @@ from pkmcal.report.drawn import (
     polyline,
     residual_words,
 )
-from pkmcal.report.residuals import KEPT
 from pkmcal.view.overlay import moved, pane_of
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Pane, Viewed

@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
+from pkmcal.pages.drawn import CURVE, Drawn, laid_over, straightened
 from pkmcal.session.schema import Vector
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of

@@ -97,7 +97,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return Response(_template("view.js"), media_type="text/javascript")
 
     async def style(_request: Request) -> Response:
-        report = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+        report = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
         return Response(report + _template("view.css"), media_type="text/css")
 
     routes = [
@@ -153,7 +153,7 @@ def serve(app: Guard, found: socket.socket) -> None:
 
 def page_html(viewed: Viewed) -> str:
     """The page itself; photographs and overlays are asked for by it."""
-    from pkmcal.report.page import environment
+    from pkmcal.pages.page import environment
 
     session = viewed.session
     stations = [

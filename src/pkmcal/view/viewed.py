@@ -88,7 +88,7 @@ class Viewed:
 
     def jpeg(self, s: int, k: int) -> bytes:
         """A photograph at a size for the screen."""
-        from pkmcal.report.jpegs import coded, narrowed
+        from pkmcal.pages.jpegs import coded, narrowed
 
         return coded(narrowed(self.image(s, k), WIDEST), QUALITY)
 

@@ -35,6 +35,8 @@ FINE = 65
 """Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
 NUMBER = 0.04
 """Width of a leg's number with its joint, in picture widths."""
+KEPT = 0.5
+"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,42 @@ class Spot:
             return f"Leg {self.leg}, {self.end} joint"
         away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
         return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A board's corner in pixels: where found, and the way to where it is expected, enlarged."""
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+    quiet: bool
+    tip: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
+    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
+    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
+    the page.
+    """
+
+    station: str
+    configuration: str
+    width: int
+    height: int
+    jpeg: str
+    edges: tuple[Drawn, ...]
+    spots: tuple[Spot, ...]
+    why: str = ""
+    caption: str = ""
+    kind: str = "measured"
+    anchor: str = ""
+    large: str = ""
+    missed: tuple[Drawn, ...] = ()
+    corners: tuple[Corner, ...] = ()
 
 
 def laid_over(
