@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from pkmcal import wording
+from pkmcal.boards.views import Boards
 from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.found import found_parameters
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
@@ -23,7 +25,7 @@ from pkmcal.pages.charts import enlargement, ticks_between
 from pkmcal.pages.drawn import CURVE, STRAIGHT
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
-from test_report_case import OUTWARD, RADIUS, TOLD, Case, edges_of, make_case
+from test_report_case import OUTWARD, RADIUS, Case, calibration, edges_of, make_case
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +59,13 @@ def test_ticks_are_round_and_inside():
 # ------------------------------------------------------------------ parameters
 
 
+def found_of(case):
+    e = case.estimate
+    return found_parameters(case.session.machine.values, e.machine, e.covariance, e.data_share)
+
+
 def test_table_rows_carry_value_change_and_sigma(case):
-    rows = {r.name: r for g in parameters.parameter_groups(case.session.machine, case.estimate)
+    rows = {r.name: r for g in parameters.parameter_groups(found_of(case))
             for r in g.rows}  # fmt: skip
     row = rows["legs[2].base.center.x"]
     k = case.session.machine.parameters.index(row.name)
@@ -87,21 +94,21 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
     )  # fmt: skip
     refused = Verdict(False, "Not to be used.", ("The edges disagree with the machine.",))
     estimate = replace(case.estimate, statistics=noisy)
-    found = report_of(case.session, case.observation, estimate, refused, TOLD)
+    found = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
     assert "1.04 after the edges' stated noise was multiplied by 7.00" in card.note
     assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
     plain = replace(noisy, noise_scale=1.0)
     estimate = replace(estimate, statistics=plain)
-    found = report_of(case.session, case.observation, estimate, refused, TOLD)
+    found = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("1.04", "χ² per degree of freedom"),)
     assert "multiplied" not in card.note
 
 
 def test_groups_follow_the_legs(case):
-    groups = parameters.parameter_groups(case.session.machine, case.estimate)
+    groups = parameters.parameter_groups(found_of(case))
     assert [g.leg for g in groups] == [1, 2, 3, 4, 5, 6]
     assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
 
@@ -237,7 +244,7 @@ def album_of(case: Case, **changed) -> pictures.Album:
     )
     centres = joint_centres(case.session.machine, estimate.machine, estimate.covariance)
     shifts = np.zeros(len(observation.edges))
-    return pictures.album(case.session, observation, estimate, shifts, centres)
+    return pictures.album(case.session, observation, estimate, shifts, centres, Boards(), {})
 
 
 def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.boards.views import Boards
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
@@ -29,6 +30,8 @@ def figure(case: Case):
         case.estimate,
         shifts,
         centres,
+        Boards(),
+        {},
     )
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
     return album, photographed.plot(case.session, case.estimate, album.links, none)

@@ -79,8 +79,8 @@ def album(
     estimate: Estimate,
     shifts: Array,
     centres: tuple[Centres, ...],
-    boards: Boards | None = None,
-    photographs: Mapping[int, Sequence[Integers]] | None = None,
+    boards: Boards,
+    photographs: Mapping[int, Sequence[Integers]],
 ) -> Album:
     """The photographs, those in which nothing is in use first, then by their residuals, the largest
     first, as many as there is room for. shifts : (N,) px of the edges, for tooltips. photographs :
@@ -93,16 +93,14 @@ def album(
         for photo in {p.configuration: p for p in reversed(station.photographs)}.values()
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
-    images = {s: _images(session, s) for s in range(len(session.stations))} | {
-        **(photographs or {})
-    }
+    images = {s: _images(session, s) for s in range(len(session.stations))} | {**photographs}
     files = [
         (images[s], session.stations[s].photographs.index(photo)) for s, photo in ordered[:MOST]
     ]
     shots = list(small_and_large(files, ROOM))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
-    found = _Found(session, observation, estimate, shifts, centres, boards or Boards(), chosen)
+    found = _Found(session, observation, estimate, shifts, centres, boards, chosen)
     return Album(
         tuple(
             found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
