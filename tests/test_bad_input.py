@@ -16,14 +16,8 @@ import pytest
 import yaml
 
 from conftest import run
+from faults import replaced
 from pkmcal.session.load import load_session
-
-
-def replaced(session, name, old, new, count=-1):
-    path = session / name
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, count))
 
 
 def rows(session, change):
@@ -99,7 +93,7 @@ def test_a_missing_file(session):
 
 
 def test_an_unknown_key(session):
-    replaced(session, "session.yaml", "observe: legs", "obsserve: legs", 1)
+    replaced(session / "session.yaml", "observe: legs", "obsserve: legs", 1)
     refused(session, "session.yaml, line ", "obsserve", "observe")
 
 
@@ -225,13 +219,13 @@ LONG = "n" * 5000
     ],
 )  # fmt: skip
 def test_names_of_five_thousand_letters(session, name, old, new, said):
-    replaced(session, name, old, new, 1)
+    replaced(session / name, old, new, 1)
     assert len(refused(session, said)) < 1000
 
 
 def test_a_path_through_what_was_not_measured(session):
     replaced(
-        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0001', 'x']}\njoints:", 1
+        session / "session.yaml", "joints:", "paths: {ruler: ['0000', '0001', 'x']}\njoints:", 1
     )
     refused(
         session, "session.yaml, line 3, paths.ruler[3]: there is no such configuration; found x"
@@ -240,7 +234,7 @@ def test_a_path_through_what_was_not_measured(session):
 
 def test_a_path_that_is_too_short(session):
     replaced(
-        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0000', '0001']}\njoints:", 1
+        session / "session.yaml", "joints:", "paths: {ruler: ['0000', '0000', '0001']}\njoints:", 1
     )
     refused(
         session, "session.yaml, line 3, paths.ruler: too few configurations for a straight path"
@@ -248,7 +242,7 @@ def test_a_path_that_is_too_short(session):
 
 
 def test_a_zero_in_a_pattern(session):
-    replaced(session, "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
+    replaced(session / "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
     refused(session, "session.yaml, line ", "images: this text holds a character")
 
 
