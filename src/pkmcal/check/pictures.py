@@ -9,7 +9,7 @@ import re
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,13 +30,6 @@ GAP = 6
 """Pixels between the two."""
 
 
-class Laid(NamedTuple):
-    """The drawing over a station's photographs by one pose. said : which pose, in words."""
-
-    said: str
-    T_camera_base: Array
-
-
 def with_pictures(look: Look) -> Part:
     """The page's section: the stations' first photographs, each by every pose that there is."""
     pairs: list[tuple[Picture, ...]] = []
@@ -47,13 +40,13 @@ def with_pictures(look: Look) -> Part:
             width, height = station.photographs.camera.image_size
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
-            for laid in poses_of(station):
-                edges, spots = overlay(look, station, laid, int(k))
+            for said, T_camera_base in poses_of(station):
+                edges, spots = overlay(look, station, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
                         configuration=look.session.configurations[configuration],
-                        why=laid.said,
+                        why=said,
                         width=width,
                         height=height,
                         jpeg=shot,
@@ -67,17 +60,17 @@ def with_pictures(look: Look) -> Part:
     return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
 
 
-def poses_of(station: StationLook) -> tuple[Laid, ...]:
-    """The poses by which the drawing is laid over, first that by hand."""
+def poses_of(station: StationLook) -> tuple[tuple[str, Array], ...]:
+    """The poses, T_camera_base, by which the drawing is laid over, each with its name; first that
+    by hand.
+    """
     after = "pose found" if station.recognised else "best pose found, not recognised"
-    found = Laid(after, station.found)
-    if station.by_hand is None:
-        return (found,)
-    return Laid("pose by hand", station.by_hand), found
+    by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
+    return *by_hand, (after, station.found)
 
 
 def overlay(
-    look: Look, station: StationLook, laid: Laid, k: int
+    look: Look, station: StationLook, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
     joint centres.
@@ -86,7 +79,7 @@ def overlay(
     return laid_over(
         look.session.machine,
         station.photographs.camera,
-        laid.T_camera_base,
+        T_camera_base,
         look.session.joints[configuration],
         look.poses[configuration],
     )
@@ -123,12 +116,12 @@ def picture(look: Look, station: StationLook, k: int) -> Any:
 
     name = look.session.configurations[int(station.photographs.configuration[k])]
     panes: list[Any] = []
-    for laid in poses_of(station):
+    for said, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(station.photographs.images[k]), cv2.COLOR_GRAY2BGR)
-        edges, spots = overlay(look, station, laid, k)
+        edges, spots = overlay(look, station, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((BAR, pane.shape[1], 3), 32, dtype=np.uint8)
-        text = f"{station.name} / {name}: {laid.said}"
+        text = f"{station.name} / {name}: {said}"
         cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
         panes.append(np.concatenate([bar, pane]))
     gap = np.full((len(panes[0]), GAP, 3), 32, dtype=np.uint8)

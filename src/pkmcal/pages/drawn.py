@@ -140,10 +140,9 @@ def laid_over(
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
     edges: list[Drawn] = []
     for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
-        leg, tip = int(tubes.leg[e]) + 1, f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        for start, stop in _runs(seen):
-            line = straightened(curve[start:stop])
-            edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
+        leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
+        lines = (polyline(leg, curve[start:stop], False, tip) for start, stop in _runs(seen))
+        edges += [line for line in lines if line]
     ends = machine.ends_at(joints, T_base_platform)
     both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
     return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])

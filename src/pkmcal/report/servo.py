@@ -134,18 +134,17 @@ def stillness(s: Study) -> str:
     )
 
 
-def document_of(subject: Controlled, found: Study, verdict: Verdict) -> dict[str, Any]:
+def document_of(subject: Controlled, s: Study, verdict: Verdict) -> dict[str, Any]:
     """Plain data for JSON: m, rad, s; legs count from 1."""
-    s, j = found, verdict
     return {
         "machine": subject.name,
         "origin": subject.origin,
         "station": subject.station,
-        "usable": j.usable,
-        "headline": j.headline,
-        "reasons": j.reasons,
-        "warnings": (*subject.warnings, *j.warnings),
-        "advice": j.advice,
+        "usable": verdict.usable,
+        "headline": verdict.headline,
+        "reasons": verdict.reasons,
+        "warnings": (*subject.warnings, *verdict.warnings),
+        "advice": verdict.advice,
         "settings": _settings(s),
         "estimates": {o.estimate.name: _outcome_document(o) for o in s.outcomes},
         "stillness": {
@@ -185,9 +184,8 @@ def shown_run(found: Study) -> int:
     return int(np.argmax(np.where(everywhere, found.outcome("hand").astray, -1.0)))
 
 
-def cards(found: Study) -> tuple[Figure, ...]:
+def cards(s: Study) -> tuple[Figure, ...]:
     """The main numbers."""
-    s = found
     good, hand = s.outcome("identified"), s.outcome("hand")
     n = s.plan.runs
     return (
@@ -273,9 +271,8 @@ def ends_table(found: Study) -> Table | None:
     return Table("Runs that did not reach their goal", columns, tuple(rows), brief=False)
 
 
-def choices_table(found: Study) -> Table:
+def choices_table(s: Study) -> Table:
     """Which legs must be seen."""
-    s = found
     useful = [c for c in s.choices if not c.blind]
     sizes = sorted({len(c.legs) for c in useful})
     shown = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]

@@ -51,16 +51,6 @@ from pkmcal.session.schema import (
 )
 from pkmcal.wording import count, listed
 
-__all__ = [
-    "Photograph",
-    "Session",
-    "SessionDocument",
-    "Station",
-    "load_session",
-    "look_at_pose",
-    "photograph_header",
-]
-
 FILE = "session.yaml"
 VERSION = 1
 SHORTEST_PATH = 3
@@ -479,14 +469,10 @@ def _stations(
     if not station.handheld:
         return [whole]
     return [
-        replace(whole, name=_name_of(name, names[photo.configuration], photo), photographs=(photo,))
+        replace(whole, name="-".join(filter(None, called)), photographs=(photo,))
         for photo in photographs
+        for called in [(name, names[photo.configuration], photo.repeat)]
     ]
-
-
-def _name_of(entry: str, configuration: str, photo: Photograph) -> str:
-    """What a hand-held photograph is called as a station."""
-    return "-".join([entry, configuration] + ([photo.repeat] if photo.repeat else []))
 
 
 def _check_handheld(document: Document, name: str, station: StationDocument) -> None:

@@ -5,21 +5,17 @@ Here and in the modules beside, what the first picture can do without is importe
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.pages.drawn import CURVE, Drawn, laid_over, straightened
-from pkmcal.session.schema import Vector
+from pkmcal.pages.drawn import CURVE, Drawn, laid_over, polyline
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of
 from pkmcal.view.viewed import Pane, Viewed
-
-if TYPE_CHECKING:
-    from pkmcal.simulation.placement import StationPlace
 
 DIGITS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
@@ -60,7 +56,7 @@ def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     ]
     return {
         "pose": T_camera_base,
-        "place": vars(place_of(T_camera_base)),
+        "place": place_of(T_camera_base),
         "legs": paths,
         "joints": joints,
     }
@@ -103,16 +99,11 @@ def moved(viewed: Viewed, pane: Pane, look: LookRequest) -> Array:
     return T_camera_base
 
 
-def place_of(T_camera_base: Array) -> StationPlace:
+def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """A pose as session.yaml has it, with as many digits as are written there."""
     from pkmcal.simulation.placement import StationPlace
 
-    def rounded(part: Vector) -> Vector:
-        x, y, z = (round(value, DIGITS) + 0.0 for value in part)  # never -0.0
-        return x, y, z
-
-    place = StationPlace.of(T_camera_base)
-    return StationPlace(rounded(place.position), rounded(place.look_at), rounded(place.up))
+    return StationPlace.of(T_camera_base).rounded(DIGITS)
 
 
 def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
@@ -134,9 +125,6 @@ def _bare_limbs(pane: Pane, T_camera_base: Array) -> list[Drawn]:
     pixel = pane.camera.project(
         apply(T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
     )
-    out: list[Drawn] = []
-    for j, curve in zip(bare, pixel, strict=True):
-        if np.isfinite(curve).all():
-            line = straightened(curve)
-            out.append(Drawn(j + 1, tuple((float(x), float(y)) for x, y in line), True, ""))
-    return out
+    whole = [(j, curve) for j, curve in zip(bare, pixel, strict=True) if np.isfinite(curve).all()]
+    lines = (polyline(j, curve, True, "") for j, curve in whole)
+    return [line for line in lines if line]

@@ -79,10 +79,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
-            def work() -> dict[str, Any]:
-                return answer(viewed, checked(_json(body), LookRequest))
-
-            return await _answered(work)
+            return await _answered(lambda: answer(viewed, checked(body)))
 
         return endpoint
 
@@ -183,12 +180,3 @@ def page_html(viewed: Viewed) -> str:
 
 def _template(name: str) -> str:
     return (resources.files("pkmcal.view") / "templates" / name).read_text("utf-8")
-
-
-def _json(body: bytes) -> Any:
-    import json
-
-    try:
-        return json.loads(body)
-    except ValueError:
-        raise InputError("the request is not valid JSON", where="the page") from None
