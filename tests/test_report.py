@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pkmcal import wording
-from pkmcal.boards.views import Boards
 from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
@@ -201,7 +200,7 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
         estimate.machine, state.T_camera_base, state.T_base_platform, session.joints, 0.0
     )
     seen = replace(case.observation, edges=edges)
-    curves = pictures.edge_curves(session, seen, estimate, np.arange(len(edges)), 0)
+    curves = pictures.edge_curves(calibration(session, seen, estimate), np.arange(len(edges)), 0)
     legs = legs_in_camera(
         estimate.machine, state.T_camera_base[0], state.T_base_platform[0], session.joints[0]
     )
@@ -244,7 +243,7 @@ def album_of(case: Case, **changed) -> pictures.Album:
     )
     centres = joint_centres(case.session.machine, estimate.machine, estimate.covariance)
     shifts = np.zeros(len(observation.edges))
-    return pictures.album(case.session, observation, estimate, shifts, centres, Boards(), {})
+    return pictures.album(calibration(case.session, observation, estimate), shifts, centres)
 
 
 def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
@@ -278,7 +277,7 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
     )  # fmt: skip
     one = np.flatnonzero((exact.leg == 2) & (exact.tube == 1) & (exact.side == 0))
     seen = replace(case.observation, edges=exact)
-    curve = pictures.edge_curves(case.session, seen, case.estimate, one, 0)[0]
+    curve = pictures.edge_curves(calibration(case.session, seen, case.estimate), one, 0)[0]
     at = np.linspace(0, len(line.points) - 1, 4000)
     x, y = (np.interp(at, range(len(line.points)), c) for c in zip(*line.points, strict=True))
     away = np.hypot(curve[:, :1] - x, curve[:, 1:] - y).min(axis=1)

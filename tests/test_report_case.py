@@ -39,7 +39,7 @@ TOLD = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 
 """Findings where the data tell of everything."""
 
 
-def calibration(session, observation, estimate, verdict, findings=TOLD, timings=None):
+def calibration(session, observation, estimate, verdict=None, findings=TOLD, timings=None):
     """The case as `calibrate` gives it, as far as the report looks at it."""
     return Calibration(
         session, observation, None, estimate, verdict, findings, None, "bundle", 0, timings or {}

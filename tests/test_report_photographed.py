@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.boards.views import Boards
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.pages.plots import frustum
-from pkmcal.report import photographed, pictures, scene
-from test_report_case import RADIUS, Case, make_case
+from pkmcal.report import photographed, pictures
+from test_report_case import RADIUS, Case, calibration, make_case
 
 
 @pytest.fixture(scope="module")
@@ -24,15 +23,8 @@ def case(tmp_path_factory) -> Case:
 def figure(case: Case):
     centres = joint_centres(case.session.machine, case.estimate.machine, case.estimate.covariance)
     shifts = np.zeros(len(case.observation.edges))
-    album = pictures.album(
-        case.session,
-        case.observation,
-        case.estimate,
-        shifts,
-        centres,
-        Boards(),
-        {},
-    )
+    found = calibration(case.session, case.observation, case.estimate)
+    album = pictures.album(found, shifts, centres)
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
     return album, photographed.plot(case.session, case.estimate, album.links, none)
 
@@ -74,9 +66,10 @@ def test_a_crank_is_drawn_with_its_arm():
         length = machine.document.legs[leg].base.arm
         assert np.linalg.norm(end - held) == pytest.approx(length)
         assert np.linalg.norm(away - end) == pytest.approx(2 * length * np.sin(0.05))
-    drawn = scene._arms(machine)
+    drawn = machine.arms_at(machine.middle_readings())
     assert [len(arm) for arm in drawn] == [2] * 4
-    assert [len(arm) for arm in scene._arms(load_mechanism("gough-stewart"))] == [1] * 6
+    hexapod = load_mechanism("gough-stewart")
+    assert [len(arm) for arm in hexapod.arms_at(hexapod.middle_readings())] == [1] * 6
 
 
 def test_a_frustum_is_what_the_camera_sees():

@@ -91,9 +91,7 @@ def result(case: Case) -> Shot:
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
     drawn = scene.scene_of(session, estimate, centres)
-    taken = pictures.album(
-        session, case.result.observation, estimate, outward(case), centres, case.result.boards, {}
-    )
+    taken = pictures.album(case.result, outward(case), centres)
     shots = {(p.station, p.configuration): p for p in taken.pictures}
     shot = shots.get(("station2", "0011")) or taken.pictures[0]
     shot = replace(shot, jpeg=shot.large)

@@ -49,13 +49,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.images import KEPT, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
-from pkmcal.outcome import (
-    Finding,
-    Level,
-    doubtful,
-    note,
-    wrong,
-)
+from pkmcal.outcome import Finding, Level, doubtful, note, wrong
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files

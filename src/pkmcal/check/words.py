@@ -11,18 +11,7 @@ import numpy as np
 from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
-from pkmcal.outcome import (
-    Finding,
-    Level,
-    Mark,
-    Outcome,
-    Part,
-    Row,
-    Table,
-    Verdict,
-    doubtful,
-    note,
-)
+from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import listed

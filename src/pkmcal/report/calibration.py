@@ -101,15 +101,14 @@ def report_of(
     """
     c, session, observation = calibration, calibration.session, calibration.observation
     estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
-    camera = session.camera_of_station
-    shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
+    shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    album = pictures.album(session, observation, estimate, shifts, centres, c.boards, c.photographs)
+    album = pictures.album(c, shifts, centres)
     links = album.links
     space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
-        provenance.stations(session, observation, estimate, camera, space),
+        provenance.stations(session, observation, estimate, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
@@ -131,7 +130,7 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(session, observation, estimate, centres, tool, findings.bed),
+        figures=cards(c, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(doubtful(text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
@@ -142,16 +141,11 @@ def report_of(
 
 
 def cards(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    centres: tuple[Centres, ...],
-    tool: ToolError,
-    bed: Bed | None = None,
+    calibration: Calibration, centres: tuple[Centres, ...], tool: ToolError
 ) -> tuple[Figure, ...]:
-    """The cards in their order; those that have nothing to tell are left out. bed : where nothing
-    but heights was measured.
-    """
+    """The cards in their order; those that have nothing to tell are left out."""
+    session, observation = calibration.session, calibration.observation
+    estimate, bed = calibration.estimate, calibration.findings.bed  # where only heights were felt
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(

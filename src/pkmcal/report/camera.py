@@ -14,7 +14,6 @@ from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
-from pkmcal.pages.charts import enlargement
 from pkmcal.pages.drawn import Corner, Picture
 from pkmcal.pages.jpegs import THREADS, jpeg
 from pkmcal.report.field import CellShift, ImageField
@@ -58,7 +57,7 @@ def outcome_of(
     """
     c = calibration
     wanted = ARROW * c.camera.image_size[0]
-    factor = enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
+    factor = charts.enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
     # with its covariance, so that `calibrate --refine-camera` knows how far to move it
@@ -254,7 +253,7 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
+    factor = charts.enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     drawn = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),

@@ -21,16 +21,7 @@ from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
 from pkmcal.pages.plots import AXIS, LOOKS
-from pkmcal.wording import (
-    SCALES,
-    capital,
-    decimals,
-    joined,
-    named,
-    number,
-    percent,
-    split_name,
-)
+from pkmcal.wording import SCALES, capital, decimals, joined, named, number, percent, split_name
 
 TIGHT = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""

@@ -14,7 +14,6 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.outcome import Plot
 from pkmcal.pages.page import N_COLOURS
 from pkmcal.pages.plots import beside, frustum, line, markers, ring, seen_whole
@@ -46,9 +45,7 @@ class PosedLimbs(NamedTuple):
 def limbs_of(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
     """At readings (K, m) and poses (K, 4, 4)."""
     ends = machine.ends_at(joints, T_base_platform)
-    moved = joint_values(machine.layout, machine.values, joints)
-    arms = skeletons(machine.layout, machine.values, moved)
-    shape = (len(joints), machine.n_legs, 3)
+    arms, shape = machine.arms_at(joints), (len(joints), machine.n_legs, 3)
     a, b = (np.broadcast_to(x, shape) for x in (ends.a, ends.b))
     return PosedLimbs(a, b, tuple(np.broadcast_to(x, (len(joints), *x.shape[-2:])) for x in arms))
 

@@ -189,7 +189,7 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     yield Logged((*path, "photograph"), "photograph", {"jpeg": coded(grey, QUALITY)}, at)
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
-    curves = edge_curves(session, c.observation, estimate, mine, s)
+    curves = edge_curves(c, mine, s)
     used = estimate.edge_weights[mine] >= KEPT
     for part, chosen in (("edges", used), ("aside", ~used)):
         rows = np.flatnonzero(chosen)

@@ -17,8 +17,6 @@ from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
 from pkmcal.pages.charts import WIDTH, enlargement
@@ -142,7 +140,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     factor = enlargement(change, SHARE * size)
     spread_factor = enlargement(ELLIPSE * sigma, SHARE / 3 * size)
     joints: list[Joint] = []
-    before, after = _arms(session.machine), _arms(estimate.machine)
+    before, after = (m.arms_at(m.middle_readings()) for m in (session.machine, estimate.machine))
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
@@ -160,12 +158,6 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
                 arm = np.stack([old, old + factor * (after[j] - old)])
             joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
-
-
-def _arms(machine: Machine) -> tuple[Array, ...]:
-    """What carries each leg's end on the base, (k, 3) m, its last point the joint itself."""
-    moved = joint_values(machine.layout, machine.values, machine.middle_readings())
-    return skeletons(machine.layout, machine.values, moved)
 
 
 def views(scene: BeforeAfter) -> tuple[Projection, Projection]:

@@ -12,8 +12,6 @@ from pkmcal.control.source import Controlled
 from pkmcal.control.study import Study, Trials
 from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
-from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, doubtful
 from pkmcal.pages.page import N_COLOURS
 from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_layout
@@ -479,9 +477,7 @@ def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
 def _limbs(s: Study, poses: Array) -> tuple[Array, Array]:
     """Ends A and B (n, L, 3) of the true limbs at poses (n, 4, 4), m."""
     machine = s.eye.true.machine
-    layout, theta = machine.layout, machine.values
-    readings, internal = inverse_result(layout, theta, poses)
-    ends = limb_ends(layout, theta, np.nan_to_num(readings), poses, internal)
+    ends = machine.ends_at(np.nan_to_num(machine.inverse(poses)), poses)
     return np.broadcast_to(ends.a, ends.b.shape), ends.b
 
 

@@ -43,12 +43,7 @@ from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
-from pkmcal.session.schema import (
-    Body,
-    SessionDocument,
-    StationDocument,
-    Vector,
-)
+from pkmcal.session.schema import Body, SessionDocument, StationDocument, Vector
 from pkmcal.wording import count, listed
 
 FILE = "session.yaml"
