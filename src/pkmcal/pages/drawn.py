@@ -87,15 +87,18 @@ class Spot:
 
 
 @dataclass(frozen=True)
-class Corner:
-    """A board's corner in pixels: where found, and the way to where it is expected, enlarged."""
+class Arrow:
+    """From a place in a picture, px, as far as it is drawn: from a board's corner, where it was
+    found, to where it is expected, or a cell's mean residual. lead : a link to what it is of.
+    """
 
     x: float
     y: float
     dx: float
     dy: float
-    quiet: bool
-    tip: str
+    quiet: bool = False
+    tip: str = ""
+    lead: str = ""
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ class Picture:
     anchor: str = ""
     large: str = ""
     missed: tuple[Drawn, ...] = ()
-    corners: tuple[Corner, ...] = ()
+    corners: tuple[Arrow, ...] = ()
 
 
 def laid_over(

@@ -14,9 +14,9 @@ from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
-from pkmcal.pages.drawn import Corner, Picture
+from pkmcal.pages.drawn import Arrow, Picture
 from pkmcal.pages.jpegs import THREADS, jpeg
-from pkmcal.report.field import CellShift, ImageField
+from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
 ARROW = 0.05
@@ -204,7 +204,7 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
 def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
     """One view with the corners found in it."""
     seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
-    corners: list[Corner] = []
+    corners: list[Arrow] = []
     for i in seen.tolist():
         (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
         places = decimals(max(c.rms, 1e-6)) + 1
@@ -213,7 +213,7 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
             f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
         )
         dx, dy = (off * factor).tolist()
-        corners.append(Corner(x, y, dx, dy, not c.kept[v, i], tip))
+        corners.append(Arrow(x, y, dx, dy, not c.kept[v, i], tip))
     aside = sum(corner.quiet for corner in corners)
     caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
@@ -257,7 +257,7 @@ def _field(c: CameraCalibration) -> Markup:
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     drawn = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
-        tuple(CellShift(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
+        tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
     return page.render("field.html.j2", field=drawn, cells=cells, factor=factor)
 

@@ -20,7 +20,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
-from pkmcal.pages.drawn import KEPT, across, measured_curves, own_edges
+from pkmcal.pages.drawn import KEPT, Arrow, across, measured_curves, own_edges
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
@@ -49,27 +49,16 @@ HOW = (
 
 
 @dataclass(frozen=True)
-class CellShift:
-    """A cell's mean residual: from (x, y), px, by (dx, dy), as drawn. loud : beyond chance."""
-
-    x: float
-    y: float
-    dx: float
-    dy: float
-    loud: bool = True
-    tip: str = ""
-    lead: str = ""
-
-
-@dataclass(frozen=True)
 class ImageField:
-    """The mean residuals over one camera's picture. middle : its centre, px."""
+    """The mean residuals over one camera's picture, those within chance quiet. middle : its centre,
+    px.
+    """
 
     title: str
     width: int
     height: int
     middle: tuple[float, float]
-    cells: tuple[CellShift, ...]
+    cells: tuple[Arrow, ...]
 
 
 @dataclass(frozen=True)
@@ -170,7 +159,7 @@ def fields(
     all arrows are enlarged, and the longest of them, px. None without any cell.
     """
     entries = [station.entry or station.name for station in session.stations]
-    shown: list[tuple[str, int, list[CellShift]]] = []
+    shown: list[tuple[str, int, list[Arrow]]] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
         mine = np.isin(found.station, of_entry)
@@ -191,7 +180,7 @@ def fields(
 
 
 def _field(
-    session: Session, entry: str, s: int, cells: Sequence[CellShift], factor: float
+    session: Session, entry: str, s: int, cells: Sequence[Arrow], factor: float
 ) -> ImageField:
     camera = session.stations[s].camera
     values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
@@ -203,7 +192,7 @@ def _field(
     )
 
 
-def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[CellShift]:
+def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     """The mean shifts of the cells of one picture that hold enough, px."""
     from scipy.special import fdtrc
 
@@ -237,7 +226,7 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[CellShif
     left = np.maximum(total(value**2) - explained, 1e-300)
     loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CHANCE
     places = (np.stack([cells % COLUMNS, cells // COLUMNS], axis=-1) + 0.5) * side - 0.5
-    out: list[CellShift] = []
+    out: list[Arrow] = []
     for c in np.flatnonzero(n >= FEWEST).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
@@ -248,5 +237,5 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[CellShif
         )
         size_of = np.abs(value[number_of == c])
         lead = links.to_largest(some.station[here], some.configuration[here], size_of)
-        out.append(CellShift(x, y, right, down, bool(loud[c]), tip, lead))
+        out.append(Arrow(x, y, right, down, not loud[c], tip, lead))
     return out

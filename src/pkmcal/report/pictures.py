@@ -22,7 +22,7 @@ from pkmcal.pages.charts import enlargement
 from pkmcal.pages.drawn import (
     CURVE,
     KEPT,
-    Corner,
+    Arrow,
     Drawn,
     Picture,
     Spot,
@@ -205,13 +205,13 @@ class _Found:
             anchor=anchor,
         )
 
-    def _corner(self, corners: BoardCorners, n: int) -> Corner:
+    def _corner(self, corners: BoardCorners, n: int) -> Arrow:
         (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
         tip = (
             f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
             f" {number(-dy, 2, signed=True)} px from where it is expected"
         )
-        return Corner(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
+        return Arrow(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
 
     def _edges(self, shifts: Array, s: int, configurations: Integers) -> None:
         """The fitted edges of a station."""
