@@ -114,8 +114,8 @@ class Picture:
     width: int
     height: int
     jpeg: str
-    edges: tuple[Drawn, ...]
-    spots: tuple[Spot, ...]
+    edges: tuple[Drawn, ...] = ()
+    spots: tuple[Spot, ...] = ()
     why: str = ""
     caption: str = ""
     kind: str = "measured"

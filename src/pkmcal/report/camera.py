@@ -225,8 +225,6 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
         width=width,
         height=height,
         jpeg=jpeg,
-        edges=(),
-        spots=(),
         caption=caption,
         corners=tuple(corners),
     )

@@ -150,19 +150,16 @@ def _bars(
         return None
     largest = np.zeros(len(session.configurations))
     np.maximum.at(largest, poses.configuration, size)
-    bars: list[charts.UprightBar] = []
-    for k in np.unique(poses.configuration).tolist():
-        value, name = float(largest[k]), session.configurations[k]
-        bars.append(
-            charts.UprightBar(
-                name,
-                f"configuration {name}: {brief(value)} {unit}",
-                value,
-                None,
-                True,
-                links.to_configuration(k),
-            )
+    bars = [
+        charts.UprightBar(
+            session.configurations[k],
+            f"configuration {session.configurations[k]}: {brief(float(largest[k]))} {unit}",
+            float(largest[k]),
+            quiet=True,
+            lead=links.to_configuration(k),
         )
+        for k in np.unique(poses.configuration).tolist()
+    ]
     alt = f"Bars of the poses' errors in {unit}"
     under = f"configurations; largest of each, {unit}"
     return charts.bar_chart(title, under, bars, charts.six_labels(bars), alt)
