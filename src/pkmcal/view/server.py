@@ -12,7 +12,7 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import plain
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
-from pkmcal.view.overlay import moved, overlay, pane_of
+from pkmcal.view.overlay import overlay, placed
 from pkmcal.view.requests import LookRequest, checked
 from pkmcal.view.viewed import Viewed
 
@@ -72,7 +72,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return fitted(viewed, look)
 
     def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        pose = moved(viewed, pane_of(viewed, look), look)
+        pose = placed(viewed, look).T_camera_base
         return {"said": kept.write(viewed.station(look.station), pose)}
 
     def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
