@@ -35,8 +35,8 @@ def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
     from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.pages.page import page_html
     from pkmcal.report.calibration import outcome_of
-    from pkmcal.report.page import page_html
     from pkmcal.session.load import load_session
 
     start_up = time.perf_counter() - begin

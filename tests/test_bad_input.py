@@ -1,14 +1,14 @@
 """What people get wrong with a session: each mistake answered by one sentence to act on.
 
 Every mistake goes through ``pkmcal calibrate``, and most through ``pkmcal check``, which must say
-the same. What photographs betray takes a search of many seconds, so ``calibrate`` alone is asked
-here, ``check`` in test_check.py; test_diagnose.py has the other mistakes of this kind.
+the same; what loading a session refuses besides is in test_session.py. What photographs betray
+takes a search of many seconds, so ``calibrate`` alone is asked here, ``check`` in test_check.py;
+test_diagnose.py has the other mistakes of this kind.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 
 import cv2
 import numpy as np
@@ -16,14 +16,8 @@ import pytest
 import yaml
 
 from conftest import run
+from faults import replaced
 from pkmcal.session.load import load_session
-
-
-def replaced(session, name, old, new, count=-1):
-    path = session / name
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, count))
 
 
 def rows(session, change):
@@ -99,7 +93,7 @@ def test_a_missing_file(session):
 
 
 def test_an_unknown_key(session):
-    replaced(session, "session.yaml", "observe: legs", "obsserve: legs", 1)
+    replaced(session / "session.yaml", "observe: legs", "obsserve: legs", 1)
     refused(session, "session.yaml, line ", "obsserve", "observe")
 
 
@@ -115,76 +109,7 @@ def test_wrong_columns(session):
     )
 
 
-def test_columns_in_another_order(session):
-    rows(session, lambda table: [cells.insert(1, cells.pop()) for cells in table])
-    refused(session, "the columns are not in the order of the machine's legs", "Sort the columns")
-
-
-def test_a_configuration_twice(session):
-    rows(session, lambda table: table.append(table[1]))
-    refused(session, "joints.csv, line 14: the configuration 0000 stands twice, on lines 2 and 14.")
-
-
-def test_an_unknown_configuration(session):
-    shutil.move(photographs(session, "station1")[0], session / "images" / "station1" / "0099.png")
-    refused(session, "0099.png is of a configuration without joint readings", "configuration 0099")
-
-
-def test_a_reading_that_is_no_number(session):
-    def spoil(table):
-        table[3][2] = "NaN"
-
-    rows(session, spoil)
-    refused(session, "joints.csv, line 4, column leg2: this is not a finite number; found 'NaN'")
-
-
-def test_readings_in_millimetres(session):
-    def spoil(table):
-        for cells in table[1:]:
-            cells[1:] = [f"{1e3 * float(cell):.3f}" for cell in cells[1:]]
-
-    rows(session, spoil)
-    refused(
-        session,
-        "joints.csv, line 2, column leg1: the readings look like millimetres",
-        "expected metres, between 0.345 and 0.485. Divide them by 1000, or head the columns leg1",
-    )
-
-
-def test_only_one_configuration(session):
-    for station in ("station1", "station2", "station3"):
-        for path in photographs(session, station):
-            shutil.move(path, path.with_name("0000.png"))
-    rows(session, lambda table: table.__delitem__(slice(2, None)))
-    refused(
-        session,
-        "joints.csv: there is only one configuration; found 0000, expected two at least;"
-        " one cannot tell a joint's place from its offset.",
-    )
-
-
-def test_all_configurations_alike(session):
-    def spoil(table):
-        for cells in table[2:]:
-            cells[1:] = table[1][1:]
-
-    rows(session, spoil)
-    refused(
-        session, "joints.csv: all configurations are alike: no joint moves by more than its noise"
-    )
-
-
 # photographs
-
-
-def test_an_image_of_another_size(session):
-    path = photographs(session, "station2")[1]
-    assert cv2.imwrite(str(path), np.zeros((300, 400), np.uint8))
-    refused(
-        session,
-        f"images/station2/{path.name}: the photograph has another size than its camera;"
-        " found 400x300, expected 480x360 (cameras/camera.yaml).",
-    )
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
@@ -225,13 +150,13 @@ LONG = "n" * 5000
     ],
 )  # fmt: skip
 def test_names_of_five_thousand_letters(session, name, old, new, said):
-    replaced(session, name, old, new, 1)
+    replaced(session / name, old, new, 1)
     assert len(refused(session, said)) < 1000
 
 
 def test_a_path_through_what_was_not_measured(session):
     replaced(
-        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0001', 'x']}\njoints:", 1
+        session / "session.yaml", "joints:", "paths: {ruler: ['0000', '0001', 'x']}\njoints:", 1
     )
     refused(
         session, "session.yaml, line 3, paths.ruler[3]: there is no such configuration; found x"
@@ -240,7 +165,7 @@ def test_a_path_through_what_was_not_measured(session):
 
 def test_a_path_that_is_too_short(session):
     replaced(
-        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0000', '0001']}\njoints:", 1
+        session / "session.yaml", "joints:", "paths: {ruler: ['0000', '0000', '0001']}\njoints:", 1
     )
     refused(
         session, "session.yaml, line 3, paths.ruler: too few configurations for a straight path"
@@ -248,7 +173,7 @@ def test_a_path_that_is_too_short(session):
 
 
 def test_a_zero_in_a_pattern(session):
-    replaced(session, "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
+    replaced(session / "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
     refused(session, "session.yaml, line ", "images: this text holds a character")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from faults import replaced
 from pkmcal.boards.prints import Print
 from pkmcal.boards.views import Boards, StationBoard, find_boards
 from pkmcal.calibration.recognise import (
@@ -56,13 +57,6 @@ def found(rendered):
     session = load_session(rendered)
     photographs = read_photographs(session)
     return session, photographs, boards_of(session, photographs)
-
-
-def changed(folder, old, new):
-    path = folder / "session.yaml"
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
 
 
 def without_pose(folder, station):
@@ -297,7 +291,7 @@ def test_one_photograph_of_a_board_is_noted(folder, found):
 
 
 def test_a_board_on_the_platform_needs_no_rough_pose(folder):
-    changed(folder, "fixed_to: base", "fixed_to: platform")
+    replaced(folder / "session.yaml", "fixed_to: base", "fixed_to: platform")
     for station in ("station1", "station2"):
         without_pose(folder, station)
     check_observable(load_session(folder))

@@ -6,7 +6,7 @@ import gzip
 import pytest
 
 from pkmcal.files import remember, remembered
-from pkmcal.report.page import environment, plotly_script
+from pkmcal.pages.page import environment, plotly_script
 
 
 @pytest.fixture

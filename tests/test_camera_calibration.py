@@ -31,8 +31,8 @@ from pkmcal.boards.selection import (
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
+from pkmcal.pages.page import page_html
 from pkmcal.report.camera import outcome_of
-from pkmcal.report.page import page_html
 from test_boards import CAMERAS, render, view
 
 BOARD = chessboard((8, 6), 0.03)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-import pkmcal.report
+import pkmcal.pages
 from conftest import run
 from pkmcal.check import advice as words
 from pkmcal.check.check import check_session
@@ -227,33 +227,32 @@ def test_pictures_of_all_photographs(found, tmp_path):
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the photograph changes; under those by hand, that are off, it does less."""
-    from pkmcal.check.pictures import overlay, poses_of
+    from pkmcal.check.pictures import overlay
 
-    def strength(laid, k):
+    def strength(T_camera_base, k):
         image = station.photographs.images[k].astype(np.float32)
         slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
-        for edge in overlay(found.look, station, laid, k)[0]:
+        for edge in overlay(found.look, station, T_camera_base, k)[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
         return float(np.median(slope[mask > 0]))
 
     for station in found.look.stations:
-        by_hand, after = poses_of(station)
-        assert strength(after, 0) > 1.15 * strength(by_hand, 0)
+        assert strength(station.found, 0) > 1.15 * strength(station.by_hand, 0)
 
 
 def test_each_number_stands_once_and_apart(found):
-    from pkmcal.check.pictures import overlay, poses_of
+    from pkmcal.check.pictures import overlay
 
     station = found.look.stations[0]
-    _, spots = overlay(found.look, station, poses_of(station)[-1], 0)
+    _, spots = overlay(found.look, station, station.found, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
 
 def test_colours_are_those_of_the_style_sheet():
-    style = Path(pkmcal.report.__file__).with_name("templates") / "style.css"
+    style = Path(pkmcal.pages.__file__).with_name("templates") / "style.css"
     blue, green, red = leg_colours()[0]
     assert f"--leg1: #{red:02x}{green:02x}{blue:02x}" in style.read_text()
 

@@ -18,8 +18,8 @@ from pkmcal.identify.change import machine_change
 from pkmcal.identify.gauge import moved_centres
 from pkmcal.judge.difference import _shared, difference
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.pages.page import page_html
 from pkmcal.report.difference import outcome_of
-from pkmcal.report.page import page_html
 from test_bundle import estimate
 from test_identify_scene import make_scene
 

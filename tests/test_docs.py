@@ -14,7 +14,7 @@ from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
 from pkmcal.files import parse_yaml, read_json, validate
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
-from pkmcal.session.load import SessionDocument
+from pkmcal.session.schema import SessionDocument
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
+from faults import fault, written
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Schema,
@@ -23,20 +24,6 @@ from pkmcal.files import (
     yaml_text,
 )
 from pkmcal.wording import listed
-
-
-def write(tmp_path, content, name="a.yaml"):
-    path = tmp_path / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-def fault(function, *arguments, **keywords):
-    """The message of the InputError that a call raises."""
-    with pytest.raises(InputError) as caught:
-        function(*arguments, **keywords)
-    return str(caught.value)
-
 
 # YAML
 
@@ -54,7 +41,7 @@ list: [1, 2.5, .inf]
 
 
 def test_scalars_follow_yaml_1_2(tmp_path):
-    data = read_yaml(write(tmp_path, WORDS)).data
+    data = read_yaml(written(tmp_path / "a.yaml", WORDS)).data
     assert data == {
         "number": 1e-5,
         "small": 3e-6,
@@ -70,12 +57,12 @@ def test_scalars_follow_yaml_1_2(tmp_path):
 
 
 def test_explicit_text_and_numbers(tmp_path):
-    data = read_yaml(write(tmp_path, "a: !!str 5\nb: '5'\nc: !!float 5\n5: x\n")).data
+    data = read_yaml(written(tmp_path / "a.yaml", "a: !!str 5\nb: '5'\nc: !!float 5\n5: x\n")).data
     assert data == {"a": "5", "b": "5", "c": 5.0, "5": "x"}
 
 
 def test_lines_of_values_lists_and_missing_fields(tmp_path):
-    document = read_yaml(write(tmp_path, "a:\n  b:\n    - 1\n    - c: 2\n"))
+    document = read_yaml(written(tmp_path / "a.yaml", "a:\n  b:\n    - 1\n    - c: 2\n"))
     assert document.where("a", "b", 1, "c") == "a.yaml, line 4, a.b[2].c"
     assert document.where("a", "b", 0) == "a.yaml, line 3, a.b[1]"
     assert document.where("a", "missing") == "a.yaml, line 1, a.missing"
@@ -85,7 +72,7 @@ def test_lines_of_values_lists_and_missing_fields(tmp_path):
 
 def test_aliases_and_merges(tmp_path):
     text = "- &leg {r: 1, s: 2}\n- <<: *leg\n  s: 3\n- *leg\n- &own\n  <<: *leg\n  s: 4\n- *own\n"
-    document = read_yaml(write(tmp_path, f"legs:\n{text}"))
+    document = read_yaml(written(tmp_path / "a.yaml", f"legs:\n{text}"))
     legs = document.data["legs"]
     assert legs[:4] == [{"r": 1, "s": 2}, {"r": 1, "s": 3}, {"r": 1, "s": 2}, {"r": 1, "s": 4}]
     assert legs[4] == legs[3]
@@ -93,13 +80,13 @@ def test_aliases_and_merges(tmp_path):
 
 
 def test_bom_and_windows_line_ends(tmp_path):
-    path = write(tmp_path, b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
+    path = written(tmp_path / "a.yaml", b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
     assert read_yaml(path).data == {"a": 1, "b": 2}
     assert read_yaml(path).lines["b",] == 2
 
 
 def test_a_label_stands_for_the_path(tmp_path):
-    path = write(tmp_path, "a: [1", "b.yaml")
+    path = written(tmp_path / "b.yaml", "a: [1")
     assert fault(read_yaml, path, "cameras/b.yaml").startswith("cameras/b.yaml, line ")
 
 
@@ -131,7 +118,7 @@ def test_a_label_stands_for_the_path(tmp_path):
     ],
 )  # fmt: skip
 def test_yaml_faults(tmp_path, content, parts):
-    message = fault(read_yaml, write(tmp_path, content))
+    message = fault(read_yaml, written(tmp_path / "a.yaml", content))
     for part in parts:
         assert part in message
 
@@ -139,30 +126,31 @@ def test_yaml_faults(tmp_path, content, parts):
 def test_a_bomb_of_aliases_is_refused(tmp_path):
     lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
-    assert "far too often" in fault(read_yaml, write(tmp_path, "\n".join(lines)))
+    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", "\n".join(lines)))
 
 
 def test_aliases_that_nest_ever_deeper_are_refused(tmp_path):
     lines = ["a0: &a0 [1]", *(f"a{n}: &a{n} [*a{n - 1}]" for n in range(1, 100))]
-    assert "nested too deeply" in fault(read_yaml, write(tmp_path, "\n".join(lines)))
+    assert "nested too deeply" in fault(read_yaml, written(tmp_path / "a.yaml", "\n".join(lines)))
 
 
 def test_a_bomb_of_merges_is_no_more_than_its_keys(tmp_path):
     lines = ["a0: &a0 {x: 1, y: 2}"]
     lines += [f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 4)}]}}" for n in range(1, 40)]
-    document = read_yaml(write(tmp_path, "\n".join(lines)))  # 4**40 pairs, taken by their word
+    # 4**40 pairs, taken by their word
+    document = read_yaml(written(tmp_path / "a.yaml", "\n".join(lines)))
     assert document.data["a39"] == {"x": 1, "y": 2}
 
 
 def test_merges_that_repeat_much_are_refused(tmp_path):
     lines = ["d: &d {" + ", ".join(f"k{n}: {n}" for n in range(1000)) + "}"]
     lines += [f"e{n}: {{<<: *d}}" for n in range(300)]
-    assert "far too often" in fault(read_yaml, write(tmp_path, "\n".join(lines)))
+    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", "\n".join(lines)))
 
 
 def test_a_bomb_of_long_texts_is_refused(tmp_path):
     text = f"s: &s {'x' * 100_000}\nl: [{', '.join(['*s'] * 200)}]\n"
-    assert "far too often" in fault(read_yaml, write(tmp_path, text))
+    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", text))
 
 
 def test_json_that_cannot_be_written_again(tmp_path):
@@ -174,7 +162,7 @@ def test_json_that_cannot_be_written_again(tmp_path):
 
 
 def test_missing_file_names_its_neighbour(tmp_path):
-    write(tmp_path, "a: 1", "session.yaml")
+    written(tmp_path / "session.yaml", "a: 1")
     message = fault(read_yaml, tmp_path / "sesion.yaml")
     assert "sesion.yaml: the file does not exist" in message
     assert "there is session.yaml" in message
@@ -247,7 +235,7 @@ BASE = "name: m\ncount: 2\n"
 
 
 def check(tmp_path, text):
-    return validate(read_yaml(write(tmp_path, text)), Machine)
+    return validate(read_yaml(written(tmp_path / "a.yaml", text)), Machine)
 
 
 def test_a_valid_document_becomes_the_model(tmp_path):
@@ -313,7 +301,7 @@ def test_a_validators_own_sentence_is_kept(tmp_path):
     class Outer(Schema):
         inner: Ordered
 
-    document = read_yaml(write(tmp_path, "inner:\n  low: 2\n  high: 1\n"))
+    document = read_yaml(written(tmp_path / "a.yaml", "inner:\n  low: 2\n  high: 1\n"))
     assert fault(validate, document, Outer) == ("a.yaml, line 1, inner: low should be below high.")
 
 

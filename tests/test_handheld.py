@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from faults import fault, replaced
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand, closely
 from pkmcal.calibration.byhand import misplaced, without_misplaced
@@ -86,19 +87,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def change(folder, old, new):
-    path = folder / "session.yaml"
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-
-
-def fault(folder):
-    with pytest.raises(InputError) as caught:
-        load_session(folder)
-    return str(caught.value)
-
-
 # EXIF
 
 
@@ -148,27 +136,29 @@ def test_each_photograph_by_hand_is_a_station(folder):
 
 
 def test_a_pose_of_a_camera_by_hand(folder):
-    change(folder, "handheld: true", "handheld: true\n    pose: {position: [1, 0, 0], look_at:"
-           " [0, 0, 0]}")  # fmt: skip
-    message = fault(folder)
+    posed = "handheld: true\n    pose: {position: [1, 0, 0], look_at: [0, 0, 0]}"
+    replaced(folder / "session.yaml", "handheld: true", posed)
+    message = fault(load_session, folder)
     assert "stations.phone.pose: a camera that is held by hand has no one pose" in message
 
 
 def test_a_board_alone_by_hand(folder):
-    change(folder, "observe: legs", "observe: board")
-    change(folder, "stations:", "board: cameras/phone.yaml\nstations:")
-    assert "photographs by hand of a board alone tell nothing of the machine" in fault(folder)
+    replaced(folder / "session.yaml", "observe: legs", "observe: board")
+    replaced(folder / "session.yaml", "stations:", "board: cameras/phone.yaml\nstations:")
+    assert "photographs by hand of a board alone tell nothing of the machine" in fault(
+        load_session, folder
+    )
 
 
 def test_two_stations_of_one_name(folder):
     jpeg(folder / "other" / "0001.jpg")
-    change(
-        folder,
+    replaced(
+        folder / "session.yaml",
         "stations:",
         "stations:\n  phone-0001-1: {camera: cameras/phone.yaml,"
         ' images: "other/{configuration}.jpg", observe: legs}',
     )
-    message = fault(folder)
+    message = fault(load_session, folder)
     assert "two stations, or photographs by hand, have the same name; found phone-0001-1" in message
 
 
@@ -176,7 +166,7 @@ def test_two_stations_of_one_name(folder):
 
 
 def test_a_camera_by_exif(folder):
-    change(folder, "cameras/phone.yaml", "exif")
+    replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     station = load_session(folder).stations[0]
     assert station.from_exif
     assert station.camera.image_size == (8, 6)
@@ -188,16 +178,16 @@ def test_a_camera_by_exif(folder):
 
 
 def test_a_photograph_without_a_focal_length(folder):
-    change(folder, "cameras/phone.yaml", "exif")
+    replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0000-2.jpg", Exif(6, None))
-    message = fault(folder)
+    message = fault(load_session, folder)
     assert "0000-2.jpg: the photograph does not tell the focal length" in message
 
 
 def test_photographs_by_different_lenses(folder):
-    change(folder, "cameras/phone.yaml", "exif")
+    replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0001-1.jpg", Exif(6, 52.0))
-    message = fault(folder)
+    message = fault(load_session, folder)
     assert "tell different focal lengths or sizes" in message
     assert "52 mm at 8x6, where images/phone/0000-1.jpg has 26 mm at 8x6" in message
 

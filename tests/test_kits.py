@@ -48,10 +48,7 @@ def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
 def test_the_report_promises_what_is_kept(by_board):
     """The card about the platform's pose, by the poses and not by joints that nobody saw."""
     kit, found = by_board
-    told = report_of(
-        found.session, found.observation, found.estimate, found.verdict, found.findings
-    )
-    cards = told.figures
+    cards = report_of(found).figures
     questions = [card.question for card in cards]
     assert "How well are the joint centres known?" not in questions
     card = cards[questions.index("How well is the platform's pose known?")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.report.page import page_html
+from pkmcal.pages.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_c_expected as expected
 from pkmcal.studies.paper_c import (

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
 from pkmcal.observe.images import decode
@@ -93,9 +94,8 @@ def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
 def test_broken_images(tmp_path, content, sentence):
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        photograph_header(path, "front/a.png")
-    assert str(caught.value).startswith(f"front/a.png: the {sentence}")
+    told = fault(photograph_header, path, "front/a.png")
+    assert told.startswith(f"front/a.png: the {sentence}")
 
 
 def test_an_image_that_is_not_there(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose, pose_difference, rotation
 from pkmcal.session.poses import check_lengths, read_poses
@@ -17,12 +18,6 @@ def table(tmp_path, text, names=NAMES, turn=1e-4):
     path = tmp_path / "poses.csv"
     path.write_text(text)
     return read_poses(path, "poses.csv", names, 2e-5, turn, "tracker")
-
-
-def fault(tmp_path, text, **more):
-    with pytest.raises(InputError) as caught:
-        table(tmp_path, text, **more)
-    return str(caught.value)
 
 
 def rows(values, names=NAMES):
@@ -104,13 +99,13 @@ def spoilt(row, column, value):
     ],
 )  # fmt: skip
 def test_faults_are_told_with_their_place(tmp_path, text, parts):
-    message = fault(tmp_path, text)
+    message = fault(table, tmp_path, text)
     for part in parts:
         assert part in message
 
 
 def test_whole_poses_need_the_noise_of_their_turns(tmp_path):
-    message = fault(tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
+    message = fault(table, tmp_path, FULL + "\n" + rows(whole()[1]), turn=None)
     assert "orientations have no stated noise" in message
     assert "rotation" in message
 

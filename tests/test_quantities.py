@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.files import Metres, Radians, Reading, Share, read_csv, with_unit
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
@@ -91,9 +92,7 @@ def changed(tmp_path, old, new):
     assert re.search(old, text)
     path = tmp_path / "m.yaml"
     path.write_text(re.sub(old, new, text, count=1))
-    with pytest.raises(InputError) as caught:
-        load_mechanism(path)
-    return str(caught.value)
+    return fault(load_mechanism, path)
 
 
 @pytest.mark.parametrize(
@@ -119,12 +118,9 @@ def test_a_drawing_in_millimetres_without_a_unit_is_told(tmp_path):
     text = yaml.safe_dump(scaled(content, lambda path: only.get(unit_of(path, "m"), "")))
     path = tmp_path / "m.yaml"
     path.write_text(text.replace(" mm", ""))
-    with pytest.raises(InputError) as caught:
-        load_mechanism(path)
-    assert str(caught.value).startswith(
-        "m.yaml: the drawing's lengths look like millimetres; found legs["
-    )
-    assert "Write each length with its unit, such as 269.3 mm" in str(caught.value)
+    told = fault(load_mechanism, path)
+    assert told.startswith("m.yaml: the drawing's lengths look like millimetres; found legs[")
+    assert "Write each length with its unit, such as 269.3 mm" in told
     path.write_text(text.replace(" mm", " m"))  # a machine of some hundred metres, in so many words
     assert np.abs(load_mechanism(path).values).max() > 100
 
@@ -135,9 +131,7 @@ def test_a_tables_heads_name_their_units(tmp_path):
     table = read_csv(path)
     assert table.columns == ("leg1", "leg2", "leg 3", "q [counts]")
     np.testing.assert_allclose(table.values, [[0.2693, math.pi / 6, 1, 7]], rtol=1e-15)
-    with pytest.raises(InputError) as caught:
-        table.check_kinds(["m", "m", "m", ""])
-    assert str(caught.value) == (
+    assert fault(table.check_kinds, ["m", "m", "m", ""]) == (
         "joints.csv, line 1, column leg2: this column is in another kind of unit than what it "
         "holds; found an angle, such as deg, expected a length, such as mm."
     )

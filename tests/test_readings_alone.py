@@ -25,8 +25,8 @@ from pkmcal.mechanisms import (
     machine_from_document,
     mechanism_text,
 )
+from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import outcome_of, save
-from pkmcal.report.page import page_html
 from pkmcal.session.load import load_session
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.simulation.truth import true_machine

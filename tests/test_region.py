@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from faults import fault, replaced
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
-from test_session import change, fault, folder  # noqa: F401 - a fixture
+from pkmcal.session.load import load_session
+from test_session import folder  # noqa: F401 - a fixture
 from test_workspace import cube
 
 
@@ -83,7 +85,9 @@ def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
     from pkmcal.session.load import load_session
 
     assert load_session(folder).workspace is None
-    change(folder, "session.yaml", "stations:", "workspace: {x: [-0.1, 0.1], turn: 0.2}\nstations:")
+    replaced(
+        folder / "session.yaml", "stations:", "workspace: {x: [-0.1, 0.1], turn: 0.2}\nstations:"
+    )
     session = load_session(folder)
     assert session.workspace == Region(x=(-0.1, 0.1), turn=0.2)
     assert session.document["workspace"]["x"] == [-0.1, 0.1]
@@ -101,7 +105,7 @@ def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
 def test_a_workspace_that_is_none_is_told(folder, line, said):  # noqa: F811
     import re
 
-    change(folder, "session.yaml", "stations:", f"workspace: {line}\nstations:")
-    message = fault(folder)
+    replaced(folder / "session.yaml", "stations:", f"workspace: {line}\nstations:")
+    message = fault(load_session, folder)
     assert re.search(said, message), message
     assert "session.yaml, line 4, workspace" in message

@@ -15,14 +15,16 @@ from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.found import found_parameters
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
-from pkmcal.report import drawn, parameters, pictures, provenance, residuals
+from pkmcal.pages import drawn
+from pkmcal.pages.charts import enlargement, ticks_between
+from pkmcal.pages.drawn import CURVE, STRAIGHT
+from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
-from pkmcal.report.charts import enlargement, ticks_between
-from pkmcal.report.drawn import CURVE, STRAIGHT
-from test_report_case import OUTWARD, RADIUS, TOLD, Case, edges_of, make_case
+from test_report_case import OUTWARD, RADIUS, Case, calibration, edges_of, make_case
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +58,13 @@ def test_ticks_are_round_and_inside():
 # ------------------------------------------------------------------ parameters
 
 
+def found_of(case):
+    e = case.estimate
+    return found_parameters(case.session.machine.values, e.machine, e.covariance, e.data_share)
+
+
 def test_table_rows_carry_value_change_and_sigma(case):
-    rows = {r.name: r for g in parameters.parameter_groups(case.session.machine, case.estimate)
+    rows = {r.name: r for g in parameters.parameter_groups(found_of(case))
             for r in g.rows}  # fmt: skip
     row = rows["legs[2].base.center.x"]
     k = case.session.machine.parameters.index(row.name)
@@ -86,21 +93,21 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
     )  # fmt: skip
     refused = Verdict(False, "Not to be used.", ("The edges disagree with the machine.",))
     estimate = replace(case.estimate, statistics=noisy)
-    found = report_of(case.session, case.observation, estimate, refused, TOLD)
+    found = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
     assert "1.04 after the edges' stated noise was multiplied by 7.00" in card.note
     assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
     plain = replace(noisy, noise_scale=1.0)
     estimate = replace(estimate, statistics=plain)
-    found = report_of(case.session, case.observation, estimate, refused, TOLD)
+    found = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("1.04", "χ² per degree of freedom"),)
     assert "multiplied" not in card.note
 
 
 def test_groups_follow_the_legs(case):
-    groups = parameters.parameter_groups(case.session.machine, case.estimate)
+    groups = parameters.parameter_groups(found_of(case))
     assert [g.leg for g in groups] == [1, 2, 3, 4, 5, 6]
     assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
 
@@ -193,7 +200,7 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
         estimate.machine, state.T_camera_base, state.T_base_platform, session.joints, 0.0
     )
     seen = replace(case.observation, edges=edges)
-    curves = pictures.edge_curves(session, seen, estimate, np.arange(len(edges)), 0)
+    curves = pictures.edge_curves(calibration(session, seen, estimate), np.arange(len(edges)), 0)
     legs = legs_in_camera(
         estimate.machine, state.T_camera_base[0], state.T_base_platform[0], session.joints[0]
     )
@@ -236,7 +243,7 @@ def album_of(case: Case, **changed) -> pictures.Album:
     )
     centres = joint_centres(case.session.machine, estimate.machine, estimate.covariance)
     shifts = np.zeros(len(observation.edges))
-    return pictures.album(case.session, observation, estimate, shifts, centres)
+    return pictures.album(calibration(case.session, observation, estimate), shifts, centres)
 
 
 def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
@@ -270,7 +277,7 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
     )  # fmt: skip
     one = np.flatnonzero((exact.leg == 2) & (exact.tube == 1) & (exact.side == 0))
     seen = replace(case.observation, edges=exact)
-    curve = pictures.edge_curves(case.session, seen, case.estimate, one, 0)[0]
+    curve = pictures.edge_curves(calibration(case.session, seen, case.estimate), one, 0)[0]
     at = np.linspace(0, len(line.points) - 1, 4000)
     x, y = (np.interp(at, range(len(line.points)), c) for c in zip(*line.points, strict=True))
     away = np.hypot(curve[:, :1] - x, curve[:, 1:] - y).min(axis=1)

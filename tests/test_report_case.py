@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pkmcal.calibration.calibrate import Calibration
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
@@ -16,8 +17,8 @@ from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
-from pkmcal.report.page import page_html
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph
 
@@ -38,9 +39,16 @@ TOLD = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 
 """Findings where the data tell of everything."""
 
 
-def report_html(*found, findings=TOLD, **more) -> str:
-    """The report's page; as `report_of`."""
-    return page_html(report_of(*found, findings, **more))
+def calibration(session, observation, estimate, verdict=None, findings=TOLD, timings=None):
+    """The case as `calibrate` gives it, as far as the report looks at it."""
+    return Calibration(
+        session, observation, None, estimate, verdict, findings, None, "bundle", 0, timings or {}
+    )
+
+
+def report_html(*found, **more) -> str:
+    """The report's page; as :func:`calibration`."""
+    return page_html(report_of(calibration(*found, **more)))
 
 
 def camera() -> Pinhole:

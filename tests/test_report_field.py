@@ -45,12 +45,12 @@ def test_cells_have_the_shift_that_their_edges_agree_on(case):
     # half a cell of 320 / 14 px: the lens moves the corner by 1.6 px
     np.testing.assert_allclose(shift, lens(place), atol=0.12)
     far = np.linalg.norm(place - one.middle, axis=1) > 60
-    assert all(cell.loud for cell, away in zip(one.cells, far, strict=True) if away)
+    assert all(not cell.quiet for cell, away in zip(one.cells, far, strict=True) if away)
 
 
 def test_noise_alone_stands_out_in_one_cell_of_a_hundred(case):
     one, _ = drawn_field(case, np.zeros_like, noise=0.2, n=20000)
-    loud = sum(cell.loud for cell in one.cells)
+    loud = sum(not cell.quiet for cell in one.cells)
     assert len(one.cells) > 130
     assert loud <= 6  # 1.5 expected; more than six by chance once in a thousand
 

@@ -14,10 +14,10 @@ import pytest
 
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Level, Outcome, Part, Row, Table, Verdict
+from pkmcal.pages.charts import UprightBar, bar_chart
+from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
-from pkmcal.report.charts import UprightBar, bar_chart
-from pkmcal.report.page import page_html
-from test_report_case import TOLD, Case, make_case, report_html
+from test_report_case import Case, calibration, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 CHROMIUM = next(
@@ -73,7 +73,7 @@ def test_page_tells_verdict_numbers_and_model_error(page):
 def test_page_tells_when_and_from_what_it_was_made(case):
     noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
     fine = Verdict(True, "Fine.")
-    found = report_of(noted, case.observation, case.estimate, fine, TOLD, digest="3f2a")
+    found = report_of(calibration(noted, case.observation, case.estimate, fine), digest="3f2a")
     html = page_html(found, datetime(2026, 3, 4, 15, 2))
     text = Found(html).text
     assert "4 March 2026, 15:02" in text

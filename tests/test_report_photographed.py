@@ -10,8 +10,9 @@ from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report import photographed, pictures, scene
-from test_report_case import RADIUS, Case, make_case
+from pkmcal.pages.plots import frustum
+from pkmcal.report import photographed, pictures
+from test_report_case import RADIUS, Case, calibration, make_case
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +23,8 @@ def case(tmp_path_factory) -> Case:
 def figure(case: Case):
     centres = joint_centres(case.session.machine, case.estimate.machine, case.estimate.covariance)
     shifts = np.zeros(len(case.observation.edges))
-    album = pictures.album(
-        case.session,
-        case.observation,
-        case.estimate,
-        shifts,
-        centres,
-    )
+    found = calibration(case.session, case.observation, case.estimate)
+    album = pictures.album(found, shifts, centres)
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
     return album, photographed.plot(case.session, case.estimate, album.links, none)
 
@@ -70,15 +66,16 @@ def test_a_crank_is_drawn_with_its_arm():
         length = machine.document.legs[leg].base.arm
         assert np.linalg.norm(end - held) == pytest.approx(length)
         assert np.linalg.norm(away - end) == pytest.approx(2 * length * np.sin(0.05))
-    drawn = scene._arms(machine)
+    drawn = machine.arms_at(machine.middle_readings())
     assert [len(arm) for arm in drawn] == [2] * 4
-    assert [len(arm) for arm in scene._arms(load_mechanism("gough-stewart"))] == [1] * 6
+    hexapod = load_mechanism("gough-stewart")
+    assert [len(arm) for arm in hexapod.arms_at(hexapod.middle_readings())] == [1] * 6
 
 
 def test_a_frustum_is_what_the_camera_sees():
     camera = Pinhole((320, 240), np.array([280.0, 281.0, 160.2, 119.1, -0.3, 0.05, 1e-3, 0, 0]))
     T_base_camera = perturb(np.eye(4), np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
-    border, *rays = photographed.frustum(camera, T_base_camera, 0.5)
+    border, *rays = frustum(camera, T_base_camera, 0.5)
     inside = apply(inverse(T_base_camera), border)
     np.testing.assert_allclose(inside[:, 2], 0.5)
     pixel = camera.project(inside)
@@ -91,7 +88,7 @@ def test_a_frustum_is_what_the_camera_sees():
 
 def test_a_mirrors_field_has_no_plane():
     camera = Unified((640, 480), np.array([200.0, 200.0, 319.5, 239.5, 1.0, 0, 0, 0, 0]))
-    border, *_ = photographed.frustum(camera, np.eye(4), 0.5)
+    border, *_ = frustum(camera, np.eye(4), 0.5)
     np.testing.assert_allclose(np.linalg.norm(border, axis=1), 0.5)
 
 

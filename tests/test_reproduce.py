@@ -14,8 +14,8 @@ from conftest import run
 from pkmcal.commands.reproduce import Paper
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check
+from pkmcal.pages.page import page_html
 from pkmcal.papers.axis_measurements import AxisNoise
-from pkmcal.report.page import page_html
 from pkmcal.studies import engine, reproduction
 from pkmcal.studies import paper_a_expected as expected
 from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes

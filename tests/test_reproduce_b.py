@@ -12,7 +12,7 @@ import pytest
 from pkmcal.control.simulation import End
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.report.page import page_html
+from pkmcal.pages.page import page_html
 from pkmcal.studies import engine, paper_b
 from pkmcal.studies import paper_b_expected as expected
 from pkmcal.studies.paper_b import (

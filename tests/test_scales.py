@@ -12,11 +12,11 @@ import pytest
 
 from export_sources import built, source_of, with_scales
 from pkmcal.calibration.doubts import scales_told
+from pkmcal.calibration.same_machine import _check_machine
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.export.contract import export
 from pkmcal.judge.causes import single_causes
-from pkmcal.judge.new_data import _check_machine
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import inverse_result, on_manifold

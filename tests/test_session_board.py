@@ -6,8 +6,9 @@ import json
 
 import pytest
 
+from faults import fault, replaced
 from pkmcal.session.load import load_session
-from test_session import change, fault, folder, image
+from test_session import folder, image
 
 __all__ = ["folder"]
 
@@ -19,8 +20,8 @@ def joined(folder):
     for name in ("0000", "0001", "0002"):
         image(folder / f"images/left/{name}.png")
     board = "pkmcal: 1\nboard: {file: board.yaml, fixed_to: base}"
-    change(folder, "session.yaml", "pkmcal: 1", board)
-    change(folder, "session.yaml", "observe: legs", "observe: [legs, board]")
+    replaced(folder / "session.yaml", "pkmcal: 1", board)
+    replaced(folder / "session.yaml", "observe: legs", "observe: [legs, board]")
     left = "  left: {camera: cameras/front.yaml, images: 'images/left/{configuration}.png', "
     with (folder / "session.yaml").open("a") as stream:
         stream.write(left + "observe: [board, legs]}\n")
@@ -37,7 +38,7 @@ def test_legs_and_board_in_the_same_photographs(joined):
 
 
 def test_a_board_on_the_base_joins_two(joined):
-    change(joined, "session.yaml", "observe: [board, legs]", "observe: legs")
+    replaced(joined / "session.yaml", "observe: [board, legs]", "observe: legs")
     assert load_session(joined).warnings == (
         "session.yaml, line 2, board: only station front observes the board on the base;"
         " it takes two for a board to join them.",
@@ -72,13 +73,13 @@ def test_a_board_on_the_base_joins_two(joined):
     ],
 )  # fmt: skip
 def test_a_wrong_board(joined, old, new, parts):
-    change(joined, "session.yaml", old, new)
-    message = fault(joined)
+    replaced(joined / "session.yaml", old, new)
+    message = fault(load_session, joined)
     for part in parts:
         assert part in message
 
 
 def test_a_board_on_the_base_and_no_legs(joined):
-    change(joined, "session.yaml", "observe: [legs, board]", "observe: board")
-    change(joined, "session.yaml", "observe: [board, legs]", "observe: board")
-    assert "which does not move, and no station observes legs" in fault(joined)
+    replaced(joined / "session.yaml", "observe: [legs, board]", "observe: board")
+    replaced(joined / "session.yaml", "observe: [board, legs]", "observe: board")
+    assert "which does not move, and no station observes legs" in fault(load_session, joined)

@@ -5,28 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from faults import fault, written
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, documents, read_csv, write_text
 
 HEADER = "configuration,leg1,leg2\n"
 
 
-def write(tmp_path, content):
-    path = tmp_path / "t.csv"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-def fault(function, *arguments, **keywords):
-    """The message of the InputError that a call raises."""
-    with pytest.raises(InputError) as caught:
-        function(*arguments, **keywords)
-    return str(caught.value)
-
-
 def test_a_table(tmp_path):
-    path = write(
-        tmp_path, b"\xef\xbb\xbfconfiguration, leg1 ,leg2\r\n\r\n001,1e-3,-.5\r\n02,2,3.\r\n"
+    path = written(
+        tmp_path / "t.csv",
+        b"\xef\xbb\xbfconfiguration, leg1 ,leg2\r\n\r\n001,1e-3,-.5\r\n02,2,3.\r\n",
     )
     table = read_csv(path)
     assert table.columns == ("leg1", "leg2")
@@ -37,7 +26,7 @@ def test_a_table(tmp_path):
 
 
 def test_lines_count_through_quoted_cells(tmp_path):
-    table = read_csv(write(tmp_path, 'configuration,x\n"a\nb",1\nc,2\n'))
+    table = read_csv(written(tmp_path / "t.csv", 'configuration,x\n"a\nb",1\nc,2\n'))
     assert table.names == ("a\nb", "c")
     assert table.lines == (2, 4)
 
@@ -73,13 +62,13 @@ def test_lines_count_through_quoted_cells(tmp_path):
     ],
 )
 def test_csv_faults(tmp_path, content, parts):
-    message = fault(read_csv, write(tmp_path, content))
+    message = fault(read_csv, written(tmp_path / "t.csv", content))
     for part in parts:
         assert part in message
 
 
 def test_csv_columns_that_are_asked_for(tmp_path):
-    path = write(tmp_path, HEADER + "1,2,3\n")
+    path = written(tmp_path / "t.csv", HEADER + "1,2,3\n")
     assert read_csv(path, columns=["leg2", "leg1"]).columns == ("leg1", "leg2")
     message = fault(read_csv, path, columns=["leg1", "leg2", "leg3"])
     assert "column leg3 is missing; found leg1, leg2" in message.replace(" and ", ", ")
@@ -119,7 +108,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
     path.write_bytes(text.encode())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(documents, "BLOCK", block)
-        found = list(documents.text_blocks(path))
+        found = list(documents.text_blocks(path, "t.csv"))
     whole = text[1:].replace("\r\n", "\n").replace("\r", "\n")
     assert "".join(found) == whole
     assert all(part.endswith("\n") for part in found[:-1])
@@ -142,7 +131,7 @@ def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said):
     """Of one that is read in many blocks."""
     rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(150_000)]
     rows.insert(120_000, line)
-    path = write(tmp_path, HEADER.encode() + b"".join(rows))
+    path = written(tmp_path / "t.csv", HEADER.encode() + b"".join(rows))
     assert path.stat().st_size > 2 * documents.BLOCK
     assert fault(read_csv, path).startswith("t.csv, " + said.format(120_002))
 
@@ -150,7 +139,7 @@ def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said):
 def test_a_large_table(tmp_path):
     names = [f"{k:06d}" for k in range(100_000)]
     values = np.random.default_rng(0).normal(size=(len(names), 2))
-    path = write(tmp_path, csv_text(["leg1", "leg2"], names, values))
+    path = written(tmp_path / "t.csv", csv_text(["leg1", "leg2"], names, values))
     assert path.stat().st_size > 2 * documents.BLOCK
     table = read_csv(path)
     assert (table.names, table.lines) == (tuple(names), tuple(range(2, len(names) + 2)))
@@ -159,6 +148,6 @@ def test_a_large_table(tmp_path):
 
 @pytest.mark.parametrize("cell", ["1e308", "-1.5e308", "2e15"])
 def test_a_number_beyond_any_quantity_is_named_however_plain(tmp_path, cell):
-    path = write(tmp_path, HEADER + f"1,1,2\n2,1,{cell}\n")
+    path = written(tmp_path / "t.csv", HEADER + f"1,1,2\n2,1,{cell}\n")
     with pytest.raises(InputError, match=r"line 3, column .*: this number is too large"):
         read_csv(path)

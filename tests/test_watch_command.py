@@ -168,14 +168,6 @@ def test_another_machine(demo, again):
     assert "the calibration is of another machine than the session" in done.err
 
 
-def test_other_joints(demo, again):
-    text = (again / "joints.csv").read_text()
-    (again / "joints.csv").write_text(text.replace("leg", "axis"))
-    done = run("watch", demo.calibration, again)
-    assert done.code == 2
-    assert "have no joint in common" in done.err
-
-
 @pytest.mark.parametrize("alpha", ["0", "0.5", "nan"])
 def test_a_share_of_false_alarms_that_makes_no_sense(demo, again, alpha):
     done = run("watch", demo.calibration, again, "--alpha", alpha)

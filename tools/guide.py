@@ -24,7 +24,8 @@ from pkmcal.check import pictures
 from pkmcal.check.check import check_session
 from pkmcal.judge.validate import validate
 from pkmcal.outcome import Outcome
-from pkmcal.report import calibration, page, validation
+from pkmcal.pages import page
+from pkmcal.report import calibration, validation
 
 HERE = Path(__file__).resolve().parents[1]
 HELD_OUT = 6

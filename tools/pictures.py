@@ -28,9 +28,10 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
+from pkmcal.pages import page
 from pkmcal.planning.plan import plan as make_plan
 from pkmcal.planning.subject import of_machine
-from pkmcal.report import page, pictures, scene
+from pkmcal.report import pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
@@ -90,7 +91,7 @@ def result(case: Case) -> Shot:
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
     drawn = scene.scene_of(session, estimate, centres)
-    taken = pictures.album(session, case.result.observation, estimate, outward(case), centres)
+    taken = pictures.album(case.result, outward(case), centres)
     shots = {(p.station, p.configuration): p for p in taken.pictures}
     shot = shots.get(("station2", "0011")) or taken.pictures[0]
     shot = replace(shot, jpeg=shot.large)

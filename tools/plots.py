@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.report.charts import ticks_between
+from pkmcal.pages.charts import ticks_between
 
 INK, MUTED, RULE = "#1a1e24", "#58626d", "#dde2e7"
 DRAWING, CALIBRATED, GOOD = "#0068a8", "#c2480c", "#00664b"

@@ -14,7 +14,7 @@ from typing import Any
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
-SCROLL = ROOT / "src/pkmcal/report/templates/scroll.js"
+SCROLL = ROOT / "src/pkmcal/pages/templates/scroll.js"
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!README\.md)[^)]+\)")
 
 

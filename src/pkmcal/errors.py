@@ -8,6 +8,7 @@ and leaves with `exit_code`. Anything else that escapes is a defect of pkmcal.
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Any, ClassVar, Self
 
 LONGEST_NAME = 255
@@ -63,7 +64,7 @@ class PkmcalError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Keyword arguments do not survive Exception's own pickling, and worker processes pickle.
-        return _rebuild, (type(self), self._fields())
+        return partial(type(self), **self._fields()), ()
 
     def located(self, where: str) -> Self:
         """Return the same error with `where` added, for callers that know the file and line."""
@@ -114,10 +115,6 @@ def _brief(text: str, most: int | None = None) -> str:
     text = _UNWRITTEN.sub(lambda sign: repr(sign[0])[1:-1], text)
     text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", text)
     return text if most is None or len(text) <= most else f"{text[: most - 1]}…"
-
-
-def _rebuild(kind: type[PkmcalError], fields: dict[str, Any]) -> PkmcalError:
-    return kind(**fields)
 
 
 def _capitalised(sentence: str) -> str:

@@ -43,33 +43,6 @@ class Level(StrEnum):
 
 Mark = Literal["good"] | Level
 """What to think of something: that all is well, or how bad it is."""
-CLEAR = "rgba(0,0,0,0)"
-LOOKS: dict[str, Any] = {
-    "paper_bgcolor": "--card",
-    "plot_bgcolor": CLEAR,
-    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
-    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
-}
-"""What the layouts of all plots have in common."""
-AXIS: dict[str, Any] = {
-    "color": "--muted",
-    "gridcolor": "--rule",
-    "zerolinecolor": "--rule",
-    "linecolor": "--rule",
-}
-"""And their axes."""
-
-
-def plane(x: str, y: str) -> dict[str, Any]:
-    """Layout of a plot of y against x, which are named by the axes' titles; the legend above."""
-    return {
-        **LOOKS,
-        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        # see-through, for the highest tick's number stands half behind it
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "bgcolor": CLEAR},
-        "xaxis": {**AXIS, "title": {"text": x}},
-        "yaxis": {**AXIS, "title": {"text": y}},
-    }
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,16 @@ from typing import Literal
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.calibration.results import EVERYTHING
-from pkmcal.calibration.saved import SavedCalibration, load
+from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.judge.new_data import read
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.planning.plan import CAPTURE, MeasurementPlan
 from pkmcal.planning.plan import plan as run
-from pkmcal.planning.subject import CORNER, EDGE, Subject, of_machine, of_session
+from pkmcal.planning.subject import as_it_stands, of_machine
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import demo_camera
-
-LAST = "calibration"
-"""Where calibrate writes, inside a session."""
 
 
 def plan(
@@ -81,7 +76,8 @@ def plan(
                 )
             session = subject if isinstance(subject, Session) else None
             session = session or load_session(folder or "", measured=False)
-            wanted, region = as_it_stands(session, after, anywhere=places is not None, seed=seed)
+            wanted = as_it_stands(session, after, anywhere=places is not None, seed=seed)
+            region = session.workspace
             free = places
         else:
             if after is not None:
@@ -98,51 +94,3 @@ def plan(
             wanted, count=count, index=index, region=region, free_places=free, seed=seed,
             told=progress,
         )  # fmt: skip
-
-
-def as_it_stands(
-    session: Session,
-    after: SavedCalibration | Path | str | None = None,
-    *,
-    from_drawing: bool = False,
-    same_place: bool = False,
-    anywhere: bool = False,
-    edge: float = EDGE,
-    corner: float = CORNER,
-    seed: int = 0,
-) -> tuple[Subject, Region | None]:
-    """A session to be planned for, as far as it was measured, and its workspace.
-
-    after : what is known already, the usable calibration in its folder unless given or
-    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.of_session`.
-    """
-    saved: SavedCalibration | None = None
-    if after is None and not from_drawing and (session.folder / LAST / EVERYTHING).is_file():
-        after = load(session.folder / LAST)
-        if not after.verdict.usable:  # it says of itself not to be used
-            after = None
-    if after is not None:
-        saved, session = read(after, session)
-        if not saved.verdict.usable:
-            raise InputError(
-                "this calibration should not be used, so no plan is made from it",
-                where=str(saved.path),
-                found=saved.verdict.headline,
-                next_step="Plan without it: --from-drawing",
-            )
-    if same_place and saved is None:
-        raise InputError(
-            "there is no calibration in which the cameras stood anywhere",
-            where="--same-place",
-            expected="--after CALIBRATION, or a session with its calibration",
-        )
-    found = of_session(
-        session,
-        saved,
-        same_place=same_place,
-        anywhere=anywhere,
-        edge=edge,
-        corner=corner,
-        seed=seed,
-    )
-    return found, session.workspace

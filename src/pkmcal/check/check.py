@@ -49,13 +49,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.images import KEPT, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
-from pkmcal.outcome import (
-    Finding,
-    Level,
-    doubtful,
-    note,
-    wrong,
-)
+from pkmcal.outcome import Finding, Level, doubtful, note, wrong
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
@@ -297,28 +291,25 @@ def _station(
     session: Session, photographs: legs.Photographs, pose: FoundStation, poses: Array
 ) -> tuple[StationCheck, StationLook]:
     """One station in which the machine was looked for."""
-    number = photographs.station
-    station, machine = session.stations[number], session.machine
-    by_hand = station.T_camera_base
-    look = StationLook(station.name, photographs, by_hand, pose.T_camera_base, None)
-    if not pose.good:
-        what = unrecognised_quality(photographs.images, machine.n_legs)
-        summary = _summary(station, what, recognised=False)
-        return replace(summary, mismatch=pose.score, by_chance=pose.by_chance), look
-    what = quality(photographs, machine, pose.T_camera_base, poses[photographs.configuration])
-    summary = _summary(station, what, recognised=True)
-    summary = replace(summary, mismatch=pose.score, by_chance=pose.by_chance)
-    look = replace(look, quality=what)
-    if by_hand is None:
-        return summary, look
-    T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(by_hand)
-    change = pose_difference(T_base_camera, by_hand)
-    summary = replace(
-        summary,
-        moved=float(np.linalg.norm(change[3:])),
-        turned=float(np.linalg.norm(change[:3])),
+    station, machine = session.stations[photographs.station], session.machine
+    found, by_hand = pose.T_camera_base, station.T_camera_base
+    what = (
+        quality(photographs, machine, found, poses[photographs.configuration])
+        if pose.good
+        else unrecognised_quality(photographs.images, machine.n_legs)
     )
-    return summary, look
+    summary = replace(
+        _summary(station, what, recognised=pose.good),
+        mismatch=pose.score,
+        by_chance=pose.by_chance,
+    )
+    if pose.good and by_hand is not None:
+        change = pose_difference(inverse(found), inverse(by_hand))
+        moved, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
+        summary = replace(summary, moved=moved, turned=turned)
+    return summary, StationLook(
+        station.name, photographs, by_hand, found, what if pose.good else None
+    )
 
 
 def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:

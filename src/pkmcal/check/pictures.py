@@ -9,7 +9,7 @@ import re
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +17,10 @@ from pkmcal.arrays import Array
 from pkmcal.check.look import Look, StationLook
 from pkmcal.files import staged_folder
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.drawn import Drawn, Spot, laid_over
-from pkmcal.report.jpegs import jpeg
-from pkmcal.report.page import N_COLOURS
-from pkmcal.report.pictures import Picture
+from pkmcal.pages import page
+from pkmcal.pages.drawn import Drawn, Picture, Spot, laid_over
+from pkmcal.pages.jpegs import jpeg
+from pkmcal.pages.page import N_COLOURS
 
 SHIFT = 4
 """Binary digits of a pixel to which cv2 draws."""
@@ -29,13 +28,6 @@ BAR = 26
 """Height (px) of the line above each picture that says what it shows."""
 GAP = 6
 """Pixels between the two."""
-
-
-class Laid(NamedTuple):
-    """The drawing over a station's photographs by one pose. said : which pose, in words."""
-
-    said: str
-    T_camera_base: Array
 
 
 def with_pictures(look: Look) -> Part:
@@ -48,13 +40,13 @@ def with_pictures(look: Look) -> Part:
             width, height = station.photographs.camera.image_size
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
-            for laid in poses_of(station):
-                edges, spots = overlay(look, station, laid, int(k))
+            for said, T_camera_base in poses_of(station):
+                edges, spots = overlay(look, station, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
                         configuration=look.session.configurations[configuration],
-                        why=laid.said,
+                        why=said,
                         width=width,
                         height=height,
                         jpeg=shot,
@@ -68,17 +60,17 @@ def with_pictures(look: Look) -> Part:
     return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
 
 
-def poses_of(station: StationLook) -> tuple[Laid, ...]:
-    """The poses by which the drawing is laid over, first that by hand."""
+def poses_of(station: StationLook) -> tuple[tuple[str, Array], ...]:
+    """The poses, T_camera_base, by which the drawing is laid over, each with its name; first that
+    by hand.
+    """
     after = "pose found" if station.recognised else "best pose found, not recognised"
-    found = Laid(after, station.found)
-    if station.by_hand is None:
-        return (found,)
-    return Laid("pose by hand", station.by_hand), found
+    by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
+    return *by_hand, (after, station.found)
 
 
 def overlay(
-    look: Look, station: StationLook, laid: Laid, k: int
+    look: Look, station: StationLook, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
     joint centres.
@@ -87,7 +79,7 @@ def overlay(
     return laid_over(
         look.session.machine,
         station.photographs.camera,
-        laid.T_camera_base,
+        T_camera_base,
         look.session.joints[configuration],
         look.poses[configuration],
     )
@@ -124,12 +116,12 @@ def picture(look: Look, station: StationLook, k: int) -> Any:
 
     name = look.session.configurations[int(station.photographs.configuration[k])]
     panes: list[Any] = []
-    for laid in poses_of(station):
+    for said, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(station.photographs.images[k]), cv2.COLOR_GRAY2BGR)
-        edges, spots = overlay(look, station, laid, k)
+        edges, spots = overlay(look, station, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((BAR, pane.shape[1], 3), 32, dtype=np.uint8)
-        text = f"{station.name} / {name}: {laid.said}"
+        text = f"{station.name} / {name}: {said}"
         cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
         panes.append(np.concatenate([bar, pane]))
     gap = np.full((len(panes[0]), GAP, 3), 32, dtype=np.uint8)
@@ -172,7 +164,7 @@ def _colour(leg: int) -> tuple[int, int, int]:
 @cache
 def leg_colours() -> tuple[tuple[int, int, int], ...]:
     """What the page's style sheet gives legs on photographs: it stands once, there."""
-    style = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+    style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
     (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)\}", style, flags=re.MULTILINE)
     found = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
     numbers = [int(found[str(k + 1)], 16) for k in range(N_COLOURS)]

@@ -11,18 +11,7 @@ import numpy as np
 from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
-from pkmcal.outcome import (
-    Finding,
-    Level,
-    Mark,
-    Outcome,
-    Part,
-    Row,
-    Table,
-    Verdict,
-    doubtful,
-    note,
-)
+from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import listed
@@ -88,26 +77,25 @@ def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
 def board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
     """What is doubtful about the board in a station's photographs; number : from 0."""
     name = session.stations[number].name
-    found: list[Finding] = []
+    bad: list[str] = []
     if check.rms > POOR_CORNERS:
-        text = (
-            f"{name}: The board's corners lie {check.rms:.2g} px off their places, rms; a flat"
-            " board, a sharp photograph and the right camera file leave a tenth of a pixel."
+        bad.append(
+            f"The board's corners lie {check.rms:.2g} px off their places, rms; a flat board, a"
+            " sharp photograph and the right camera file leave a tenth of a pixel."
         )
-        found.append(doubtful(text, name))
     if check.unseen:
-        text = (
-            f"{name}: {check.unseen.capitalize()} of the board's corners is in no photograph: does"
-            " the board have as many squares as its file says?"
+        bad.append(
+            f"{check.unseen.capitalize()} of the board's corners is in no photograph: does the"
+            " board have as many squares as its file says?"
         )
-        found.append(doubtful(text, name))
+    found = [doubtful(f"{name}: {text}", name) for text in bad]
     photographs = len(session.stations[number].photographs)
     if session.board_body == "base" and check.found == 1 and photographs > 1:
-        text = (
+        alone = (
             f"{name}: Only one photograph shows the board on the base, so nobody can tell whether"
             " it, or the camera, stood still."
         )
-        found.append(note(text, name))
+        found.append(note(alone, name))
     return found
 
 

@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import PAGE, finish
-
-
-class Method(StrEnum):
-    """How to identify."""
-
-    BUNDLE = "bundle"
-    FOUR_STEP = "four-step"
-    LINEAR = "linear"
-    INVERSE_KINEMATIC = "inverse-kinematic"
-
-
-Model = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="A model that the mechanism file names, such as design."),
-]
+from pkmcal.commands.finish import PAGE, answer, write
 
 FILES = {
     "report.html": PAGE,
@@ -35,18 +19,18 @@ FILES = {
 
 def calibrate(
     session: console.SessionFolder,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="SESSION/calibration unless given."),
-    ] = None,
+    out: Annotated[Path | None, console.folder("SESSION/calibration unless given.")] = None,
     method: Annotated[
-        Method,
+        Literal["bundle", "four-step", "linear", "inverse-kinematic"],
         typer.Option(
             metavar="NAME",
             help="bundle, or the papers' own: four-step, linear, inverse-kinematic.",
         ),
-    ] = Method.BUNDLE,
-    model: Model = None,
+    ] = "bundle",
+    model: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="A model that the mechanism file names, such as design."),
+    ] = None,
     seed: console.Seed = 0,
     refine_camera: Annotated[
         bool,
@@ -86,7 +70,7 @@ def calibrate(
     with console.progress(quiet or as_json) as told:
         found = run(
             loaded,
-            method=method.value,
+            method=method,
             seed=seed,
             refine_camera=refine_camera,
             holdout=holdout,
@@ -94,14 +78,10 @@ def calibrate(
         )
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
-    kept = None if force else keep_earlier(folder, outcome.texts)
-
-    def recording() -> dict[str, str]:
-        if rrd is None:
-            return {}
-        write_rrd(found, rrd)
-        return {str(rrd.absolute()): "rerun opens it"}
-
-    return finish(
-        outcome, folder, FILES, over=over, kept=kept, more=recording, as_json=as_json, quiet=quiet
-    )
+        kept = None if force else keep_earlier(folder, outcome.texts)
+        write(outcome, folder, FILES, over)
+        files = dict(FILES)
+        if rrd is not None:
+            write_rrd(found, rrd)
+            files[str(rrd.absolute())] = "rerun opens it"
+    return answer(outcome, folder, files, kept=kept, as_json=as_json, quiet=quiet)

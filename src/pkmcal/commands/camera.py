@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,15 +18,6 @@ FILES = {
     "camera.json": "everything, with covariances",
 }
 OTHERS = {"opencv": "camera.opencv.yaml", "ros": "camera.ros.yaml", "kalibr": "camera.kalibr.yaml"}
-
-
-class CameraModel(StrEnum):
-    """Which camera model."""
-
-    AUTO = "auto"
-    PINHOLE = "pinhole"
-    FISHEYE = "fisheye"
-    UNIFIED = "unified"
 
 
 class Form(StrEnum):
@@ -50,12 +41,10 @@ def camera(
         typer.Option(metavar="FILE", help="The board's file; board.yaml beside them unless given."),
     ] = None,
     model: Annotated[
-        CameraModel,
+        Literal["auto", "pinhole", "fisheye", "unified"],
         typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors)."),
-    ] = CameraModel.AUTO,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Where the results go.")
-    ] = Path("camera"),
+    ] = "auto",
+    out: Annotated[Path, console.folder("Where the results go.")] = Path("camera"),
     to: Annotated[
         list[Form] | None,
         typer.Option(metavar="NAME", help="Write it for opencv, ros or kalibr as well."),
@@ -79,7 +68,7 @@ def camera(
     others = [(OTHERS[form.value], form.value) for form in to or []]
     with console.progress(as_json) as told:
         told(f"Looking for the board in {len(paths)} photographs", 0.1)
-        found = calibrate_photographs(paths, described, model.value)
+        found = calibrate_photographs(paths, described, model)
         told("Writing the report", 0.9)
         outcome = outcome_of(found, paths, others)
     files = {**FILES, **{name: "for that program" for name, _ in others}}

@@ -17,15 +17,10 @@ DRAWN = "the drawing over each photograph"
 
 def check(
     session: console.SessionFolder,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Write a page with photographs there."),
-    ] = None,
+    out: Annotated[Path | None, console.folder("Write a page with photographs there.")] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(
-            "--pictures", metavar="DIR", help="Write the drawing over each photograph, as PNG."
-        ),
+        typer.Option(metavar="DIR", help="Write the drawing over each photograph, as PNG."),
     ] = None,
     repeat: Annotated[
         bool,

@@ -51,6 +51,11 @@ WIDEST_NAME = 32
 """Letters of a row's name up to which it stays on one line."""
 
 
+def folder(given: str) -> Any:
+    """The option of the folder in which results go; given : its help."""
+    return typer.Option("-o", "--out", metavar="DIR", help=given)
+
+
 def check_positive(option: str, value: float, most: float) -> None:
     """Raise `InputError` where an option's number is not above zero, or above ``most``."""
     if not 0 < value <= most:

@@ -27,7 +27,7 @@ SIMULATING = 0.85
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Output folder.")] = HERE,
+    out: Annotated[Path, console.folder("Output folder.")] = HERE,
     no_open: Annotated[
         bool, typer.Option("--no-open", help="Do not open the report in a browser.")
     ] = False,

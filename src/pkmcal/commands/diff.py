@@ -23,10 +23,7 @@ def diff(
     ],
     b: Annotated[str, typer.Argument(metavar="B", help="Another of the same machine.")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="DIR", help="diff beside the calibration B unless given."
-        ),
+        Path | None, console.folder("diff beside the calibration B unless given.")
     ] = None,
     force: Annotated[
         bool,

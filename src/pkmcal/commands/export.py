@@ -28,15 +28,11 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            "--to",
             metavar="FORMAT",
             help="c, json, klipper, linuxcnc, mujoco, reprap, ros, sdf, urdf or yaml.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="export-FORMAT unless given."),
-    ] = None,
+    out: Annotated[Path | None, console.folder("export-FORMAT unless given.")] = None,
     session: console.CamerasOf = None,
     force: Annotated[
         bool, typer.Option("--force", help="Export a calibration that was refused.")

@@ -7,7 +7,7 @@ outcome holds no text of that name itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,21 +31,16 @@ def finish(
     *,
     over: Collection[str] = (),
     kept: Path | None = None,
-    more: Callable[[], Mapping[str, str]] | None = None,
     as_json: bool = False,
-    quiet: bool = False,
 ) -> int:
     """Write the files, tell what was found, and return the exit code.
 
     over : files of an earlier result, of which none is to stay. kept : where a copy of it is.
-    more : makes further files once these stand, and returns their paths with what they are.
-    quiet : say nothing of a result that may be used, and one sentence of another.
     """
-    with console.progress(as_json or quiet) as told:
+    with console.progress(as_json) as told:
         told("Writing the report", 0.97)
         write(outcome, folder, files, over)
-        others = more() if more else {}
-    return answer(outcome, folder, {**files, **others}, kept=kept, as_json=as_json, quiet=quiet)
+    return answer(outcome, folder, files, kept=kept, as_json=as_json)
 
 
 def write(
@@ -66,7 +61,10 @@ def answer(
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Tell what was found and where it stands, and return the exit code."""
+    """Tell what was found and where it stands, and return the exit code.
+
+    quiet : say nothing of a result that may be used, and one sentence of another.
+    """
     if as_json:
         earlier = {"kept": str(kept)} if kept else {}
         console.print_json({**printed(outcome, folder, files), **earlier})
@@ -90,7 +88,7 @@ def answer(
 def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | bytes]:
     """The content of each of the files."""
     from pkmcal.files import json_text
-    from pkmcal.report.page import page_html
+    from pkmcal.pages.page import page_html
 
     texts, made = dict(outcome.texts), datetime.now()
     for name in files:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,16 +13,7 @@ from pkmcal.commands.finish import NUMBERS, PAGE, finish
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
-    from pkmcal.planning.subject import Subject
-
-
-class Wanted(StrEnum):
-    """What is to be small."""
-
-    tool = "tool"
-    D = "D"
-    E = "E"
-    O1 = "O1"
+    pass
 
 
 FILES = {
@@ -41,24 +31,21 @@ def plan(
             metavar="SESSION|MACHINE", help="A session, or a built-in machine or its file."
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="SESSION/plan, or plan, unless given."),
-    ] = None,
+    out: Annotated[Path | None, console.folder("SESSION/plan, or plan, unless given.")] = None,
     configurations: Annotated[
         int,
         typer.Option("-n", "--configurations", metavar="N", help="Configurations from each place."),
     ] = 15,
     index: Annotated[
-        Wanted, typer.Option(help="What is to be small: the tool's variance, or D, E, O1.")
-    ] = Wanted.tool,
+        Literal["tool", "D", "E", "O1"],
+        typer.Option(help="What is to be small: the tool's variance, or D, E, O1."),
+    ] = "tool",
     places: Annotated[
         int | None,
         typer.Option(metavar="N", min=1, max=12, help="Choose N places of the camera as well."),
     ] = None,
     best_of: Annotated[
-        int | None,
-        typer.Option("--best-of", metavar="N", min=1, help="Choose N of the session's stations."),
+        int | None, typer.Option(metavar="N", min=1, help="Choose N of the session's stations.")
     ] = None,
     after: Annotated[
         Path | None,
@@ -107,11 +94,17 @@ def plan(
     """The next configurations worth measuring."""
     from threadpoolctl import threadpool_limits
 
-    from pkmcal.api.plan import as_it_stands
+    from pkmcal.cameras import load_camera
+    from pkmcal.commands.simulate import parsed_size
     from pkmcal.files import check_own_folder
+    from pkmcal.mechanisms import load_mechanism
     from pkmcal.planning.plan import plan as run
+    from pkmcal.planning.subject import as_it_stands, of_machine
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import load_session, session_folder
+    from pkmcal.simulation import board_for
+    from pkmcal.simulation.demo import camera_of_size
+    from pkmcal.simulation.placement import PANORAMIC, view_angle
 
     console.check_positive("--edge-noise", edge_noise, 100)
     console.check_positive("--corner-noise", corner_noise, 100)
@@ -125,8 +118,10 @@ def plan(
         region = None
         if session is not None:
             _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
-            source, region = as_it_stands(
-                load_session(session, measured=False),
+            measured = load_session(session, measured=False)
+            region = measured.workspace
+            source = as_it_stands(
+                measured,
                 after,
                 from_drawing=from_drawing,
                 same_place=same_place,
@@ -138,23 +133,29 @@ def plan(
         else:
             given = {"--after": after, "--same-place": same_place, "--best-of": best_of}
             _only_of("a session", given)
-            source = _of_machine(
-                subject,
-                camera,
-                size,
-                board,
-                tracker,
-                places,
-                joint_noise,
-                edge_noise,
-                corner_noise,
-                seed,
-            )
+            machine = load_mechanism(subject, label=None)
+            eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
+            number = 1 if board or places or view_angle(eye) > PANORAMIC else 3
+            noise = None if tracker is None else _tracker(tracker)
+            try:
+                source = of_machine(
+                    machine,
+                    [eye] * number,
+                    machine.joint_names,
+                    board=board_for(machine, "platform") if board else None,
+                    tracker=noise,
+                    joint_noise=joint_noise,
+                    edge=edge_noise,
+                    corner=corner_noise,
+                    seed=seed,
+                )
+            except InputError as error:
+                raise error.located(subject) from None
         try:
             found = run(
                 source,
                 count=configurations,
-                index=index.value,
+                index=index,
                 region=region,
                 together=together,
                 free_places=places,
@@ -174,47 +175,6 @@ def _only_of(owner: str, given: Mapping[str, object]) -> None:
     for name, value in given.items():
         if value:
             raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
-
-
-def _of_machine(
-    name: str,
-    camera: Path | None,
-    size: str,
-    board: bool,
-    tracker: str | None,
-    places: int | None,
-    joint_noise: float,
-    edge_noise: float,
-    corner_noise: float,
-    seed: int,
-) -> Subject:
-    """A machine, and the camera that somebody thinks of."""
-    from pkmcal.cameras import load_camera
-    from pkmcal.commands.simulate import parsed_size
-    from pkmcal.mechanisms import load_mechanism
-    from pkmcal.planning.subject import of_machine
-    from pkmcal.simulation import board_for
-    from pkmcal.simulation.demo import camera_of_size
-    from pkmcal.simulation.placement import PANORAMIC, view_angle
-
-    machine = load_mechanism(name, label=None)
-    eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-    number = 1 if board or places or view_angle(eye) > PANORAMIC else 3
-    noise = None if tracker is None else _tracker(tracker)
-    try:
-        return of_machine(
-            machine,
-            [eye] * number,
-            machine.joint_names,
-            board=board_for(machine, "platform") if board else None,
-            tracker=noise,
-            joint_noise=joint_noise,
-            edge=edge_noise,
-            corner=corner_noise,
-            seed=seed,
-        )
-    except InputError as error:
-        raise error.located(name) from None
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

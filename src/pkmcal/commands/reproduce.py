@@ -34,9 +34,7 @@ def reproduce(
     photographs: Annotated[
         bool, typer.Option("--photographs", help="Measure Table 1 on rendered photographs.")
     ] = False,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Where the pages go.")
-    ] = Path("reproduction"),
+    out: Annotated[Path, console.folder("Where the pages go.")] = Path("reproduction"),
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""

@@ -71,9 +71,7 @@ def servo(
     goal: Annotated[
         str | None, typer.Option(metavar="POSE", help="The same of every run's goal.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="servo unless given.")
-    ] = None,
+    out: Annotated[Path | None, console.folder("servo unless given.")] = None,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:

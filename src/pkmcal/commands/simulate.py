@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -19,23 +18,6 @@ if TYPE_CHECKING:
 
 SMALLEST, LARGEST = 64, 8192
 """Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
-
-
-class LegStyle(StrEnum):
-    """Surfaces of the legs."""
-
-    mixed = "mixed"
-    matte = "matte"
-    dark = "dark"
-    metal = "metal"
-
-
-class RoomLight(StrEnum):
-    """Kinds of light."""
-
-    usual = "usual"
-    soft = "soft"
-    hard = "hard"
 
 
 def simulate(
@@ -79,9 +61,12 @@ def simulate(
         bool, typer.Option("--on-platform", help="The board on the platform instead.")
     ] = False,
     finish: Annotated[
-        LegStyle, typer.Option(help="Surface of the legs; metal is polished.")
-    ] = LegStyle.mixed,
-    light: Annotated[RoomLight, typer.Option(help="From all sides, or hard.")] = RoomLight.usual,
+        Literal["mixed", "matte", "dark", "metal"],
+        typer.Option(help="Surface of the legs; metal is polished."),
+    ] = "mixed",
+    light: Annotated[
+        Literal["usual", "soft", "hard"], typer.Option(help="From all sides, or hard.")
+    ] = "usual",
     as_built: Annotated[
         bool, typer.Option("--as-built", help="Motors, rings and cables on the legs.")
     ] = False,
@@ -121,8 +106,8 @@ def simulate(
         board=board_for(machine, place) if board or on_platform else None,
         board_on=place,
         repeats=repeats,
-        finish=finish.value,
-        light=light.value,
+        finish=finish,
+        light=light,
         as_built=as_built,
         handheld=handheld,
     )

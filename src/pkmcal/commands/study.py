@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,13 +12,6 @@ from pkmcal.commands.finish import NUMBERS, PAGE, finish
 from pkmcal.errors import InputError
 
 ROWS = "one row a run"
-
-
-class TableFormat(StrEnum):
-    """Formats of the table of runs."""
-
-    csv = "csv"
-    parquet = "parquet"
 
 
 def study(
@@ -41,10 +33,8 @@ def study(
         typer.Option(metavar="N", min=2, max=1_000_000, help="Simulations of each combination."),
     ] = 100,
     seed: console.Seed = 0,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Results, and what is finished.")
-    ] = Path("study"),
-    table: Annotated[TableFormat, typer.Option(help="Of the table of runs.")] = TableFormat.csv,
+    out: Annotated[Path, console.folder("Results, and what is finished.")] = Path("study"),
+    table: Annotated[Literal["csv", "parquet"], typer.Option(help="Of the table of runs.")] = "csv",
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster's, to work there.")
     ] = None,
@@ -58,15 +48,15 @@ def study(
     from pkmcal.studies.store import FOLDER
     from pkmcal.studies.study_report import outcome_of
 
-    if table is TableFormat.parquet and find_spec("pyarrow") is None:
+    if table == "parquet" and find_spec("pyarrow") is None:
         raise InputError(
             "a Parquet table needs pyarrow, which is not installed",
             where="--table",
             next_step="Install it with: pip install 'pkmcal[parquet]', or leave the option out",
         )
-    name = f"study.{table.value}"
+    name = f"study.{table}"
     files = {"study.html": PAGE, "study.json": NUMBERS, name: ROWS}
-    ours = {"study.html", "study.json", *(f"study.{kind.value}" for kind in TableFormat), FOLDER}
+    ours = {"study.html", "study.json", "study.csv", "study.parquet", FOLDER}
     over = check_own_folder(out, ours, "a study", "an earlier study")
     try:
         with console.progress(as_json) as told:

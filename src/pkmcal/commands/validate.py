@@ -19,13 +19,9 @@ def validate(
         Path,
         typer.Argument(metavar="SESSION", help="A session with photographs that it never saw."),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="SESSION/validation unless given."),
-    ] = None,
+    out: Annotated[Path | None, console.folder("SESSION/validation unless given.")] = None,
     regions: Annotated[
-        int,
-        typer.Option("--regions", metavar="N", min=0, help="Leave out N regions in turn as well."),
+        int, typer.Option(metavar="N", min=0, help="Leave out N regions in turn as well.")
     ] = 0,
     seed: console.Seed = 0,
     as_json: console.Json = False,

@@ -15,12 +15,10 @@ def view(
     session: console.SessionFolder,
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            "--calibration", metavar="DIR", help="SESSION/calibration, where it is, unless given."
-        ),
+        typer.Option(metavar="DIR", help="SESSION/calibration, where it is, unless given."),
     ] = None,
     port: Annotated[
-        int, typer.Option("--port", metavar="N", min=0, max=65535, help="A free one unless given.")
+        int, typer.Option(metavar="N", min=0, max=65535, help="A free one unless given.")
     ] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address, and open nothing.")

@@ -19,18 +19,11 @@ def watch(
         Path,
         typer.Argument(metavar="SESSION", help="New photographs with readings, a few are enough."),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="SESSION/watch unless given."),
-    ] = None,
-    alpha: Annotated[
-        float,
-        typer.Option("--alpha", metavar="P", help="Share of false alarms."),
-    ] = 0.01,
+    out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
+    alpha: Annotated[float, typer.Option(metavar="P", help="Share of false alarms.")] = 0.01,
     same_place: Annotated[
         list[str] | None,
         typer.Option(
-            "--same-place",
             metavar="STATION",
             help="A station whose camera was not touched since the calibration; repeat for more.",
         ),

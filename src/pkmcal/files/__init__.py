@@ -5,6 +5,7 @@ from pkmcal.files.documents import (
     Document,
     Keys,
     closest,
+    field_path,
     json_text,
     parse_yaml,
     plain,
@@ -30,7 +31,7 @@ from pkmcal.files.quantities import (
     with_unit,
 )
 from pkmcal.files.regular import check_regular
-from pkmcal.files.schema import Schema, field_path, validate
+from pkmcal.files.schema import Schema, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
     alone_in,

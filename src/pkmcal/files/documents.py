@@ -32,14 +32,14 @@ def read_text(path: Path, label: str | None = None) -> str:
 
     label : the file's name in messages; the path's last part unless told.
     """
-    return "".join(text_blocks(path, label))
+    return "".join(text_blocks(path, label or path.name))
 
 
-def text_blocks(path: Path, label: str | None = None) -> Iterator[str]:
+def text_blocks(path: Path, label: str) -> Iterator[str]:
     """The same in blocks of whole lines, some BLOCK bytes each: of a table of many megabytes no
     more has to be in memory.
     """
-    label, lines, mark = label or path.name, 0, "\ufeff"
+    lines, mark = 0, "\ufeff"
     for raw in _raw_blocks(path, label):
         yield _decoded(raw, label, lines).removeprefix(mark)
         lines, mark = lines + raw.count(b"\n"), ""

@@ -11,10 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
-from pkmcal.files.documents import LARGEST, Document, Keys, closest, field_path, shown
+from pkmcal.files.documents import LARGEST, Document, Keys, closest, shown
 from pkmcal.wording import listed
-
-__all__ = ["Schema", "field_path", "validate"]
 
 JsonSchema = Mapping[str, Any]
 LONGEST_REPR = 200

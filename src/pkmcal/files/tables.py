@@ -7,6 +7,7 @@ import io
 import math
 import re
 from array import array
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,8 @@ def read_csv(
     """
     path = Path(path)
     label = label or path.name
-    rows = _rows(_lines(path, label), label)
+    text = (line for block in text_blocks(path, label) for line in io.StringIO(block))
+    rows = _rows(text, label)
     header_line, header = next(rows, (0, None))
     if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {KEY},…")
@@ -119,12 +121,6 @@ def csv_text(columns: Sequence[str], names: Sequence[str], values: Array) -> str
     rows = np.asarray(values, dtype=float).reshape(len(names), len(columns)).tolist()
     writer.writerows([name, *map(repr, row)] for name, row in zip(names, rows, strict=True))
     return stream.getvalue()
-
-
-def _lines(path: Path, label: str) -> Iterator[str]:
-    """The file's lines, with their ends."""
-    for block in text_blocks(path, label):
-        yield from io.StringIO(block)
 
 
 def _rows(lines: Iterable[str], label: str) -> Iterator[tuple[int, list[str]]]:
@@ -168,7 +164,7 @@ def _check_header(header: list[str], columns: Sequence[str] | None, where: str) 
     if "" in header:
         number = header.index("") + 1
         raise InputError(f"column {number} of the header has no name", where=where)
-    twice = _repeated(header)
+    twice = [name for name, times in Counter(header).items() if times > 1]
     if twice:
         raise InputError(f"the header names {listed(twice)} twice", where=where)
     if len(header) == 1:
@@ -253,9 +249,3 @@ def _check_length(names: Sequence[str], where: str) -> None:
                 found=f"{shown(name)} of {len(name)} characters",
                 expected=f"at most {LONGEST_NAME}, as file systems take",
             )
-
-
-def _repeated(names: Iterable[str]) -> list[str]:
-    seen: set[str] = set()
-    # set.add returns None: the name is noted and kept only where it was there before.
-    return [name for name in names if name in seen or seen.add(name)]

@@ -15,12 +15,13 @@ import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import Progress
+from pkmcal.calibration.same_machine import read
 from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import ResultError
 from pkmcal.files import plain
 from pkmcal.judge.comparison import BesideDrawing, compare
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import check_new, known_rows, look, read, repeated_rows
+from pkmcal.judge.new_data import check_new, known_rows, look, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict

@@ -18,6 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.aside import select
 from pkmcal.calibration.calibrate import Calibration, Progress
+from pkmcal.calibration.same_machine import read
 from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
@@ -27,7 +28,7 @@ from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
 from pkmcal.judge.held import Held, KeptStations, Trust, evidence, hold
-from pkmcal.judge.new_data import check_new, known_rows, look, read
+from pkmcal.judge.new_data import check_new, known_rows, look
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session

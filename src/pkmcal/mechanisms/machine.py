@@ -20,7 +20,7 @@ from pkmcal.mechanisms.carriers.contract import (
     of_part,
     platform_carriers,
 )
-from pkmcal.mechanisms.closure import LimbEnds, limb_ends
+from pkmcal.mechanisms.closure import LimbEnds, joint_values, limb_ends, skeletons
 from pkmcal.mechanisms.document import (
     CONSTANT,
     OFFSET,
@@ -362,6 +362,13 @@ class Machine:
             turns = kinematics.inverse_result(self.layout, self.values, T_base_platform)[1]
             internal = np.nan_to_num(turns)
         return limb_ends(self.layout, self.values, joints, T_base_platform, internal)
+
+    def arms_at(self, joints: Array) -> tuple[Array, ...]:
+        """What carries each leg's end on the base at readings (..., m), for pictures; as
+        :func:`~pkmcal.mechanisms.closure.skeletons`.
+        """
+        moved = joint_values(self.layout, self.values, joints)
+        return skeletons(self.layout, self.values, moved)
 
     def _ends(self) -> tuple[Array, Array]:
         ends = limb_ends(self.layout, self.values, self.middle_readings(), np.eye(4))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,9 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.results import EVERYTHING
+from pkmcal.calibration.same_machine import read
+from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse
@@ -49,6 +52,8 @@ and a few edges tell shading badly."""
 READING = 3e-6
 """m or rad; noise of a reading where nobody tells: of a good encoder."""
 BOARD = "board"
+LAST = "calibration"
+"""Where calibrate writes, inside a session."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,53 @@ class Subject:
     board: dict[str, Any] | None = None
 
     __repr__ = short_repr
+
+
+def as_it_stands(
+    session: Session,
+    after: SavedCalibration | Path | str | None = None,
+    *,
+    from_drawing: bool = False,
+    same_place: bool = False,
+    anywhere: bool = False,
+    edge: float = EDGE,
+    corner: float = CORNER,
+    seed: int = 0,
+) -> Subject:
+    """A session to be planned for, as far as it was measured.
+
+    after : what is known already, the usable calibration in its folder unless given or
+    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.of_session`.
+    """
+    saved: SavedCalibration | None = None
+    if after is None and not from_drawing and (session.folder / LAST / EVERYTHING).is_file():
+        after = load(session.folder / LAST)
+        if not after.verdict.usable:  # it says of itself not to be used
+            after = None
+    if after is not None:
+        saved, session = read(after, session)
+        if not saved.verdict.usable:
+            raise InputError(
+                "this calibration should not be used, so no plan is made from it",
+                where=str(saved.path),
+                found=saved.verdict.headline,
+                next_step="Plan without it: --from-drawing",
+            )
+    if same_place and saved is None:
+        raise InputError(
+            "there is no calibration in which the cameras stood anywhere",
+            where="--same-place",
+            expected="--after CALIBRATION, or a session with its calibration",
+        )
+    return of_session(
+        session,
+        saved,
+        same_place=same_place,
+        anywhere=anywhere,
+        edge=edge,
+        corner=corner,
+        seed=seed,
+    )
 
 
 def of_machine(

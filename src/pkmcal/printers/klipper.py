@@ -11,10 +11,9 @@ _find_autosave_data). ``heightN_pos`` are steps of the three motors since their 
 from __future__ import annotations
 
 import re
-from collections.abc import Container
 from configparser import ConfigParser
 from functools import partial
-from itertools import count
+from itertools import count, takewhile
 from math import prod
 
 import numpy as np
@@ -74,7 +73,7 @@ def printer(text: str, label: str) -> Printer:
             },
         }
     )
-    rod = np.array(each["arm_length"])
+    stepped = {"rotation_distance", "microsteps"} <= found.get("stepper_a", {}).keys()
     with np.errstate(invalid="ignore"):
         ends = homed(config)
     return Printer(
@@ -83,15 +82,13 @@ def printer(text: str, label: str) -> Printer:
         motors=("stepper_a", "stepper_b", "stepper_c"),
         radius=radius,
         angle=np.array(each["angle"]),
-        rod=rod,
+        rod=np.array(each["arm_length"]),
         homed=ends,
         reach=_number(found, label, "printer", "print_radius", radius),
         carriages=partial(linear_motors, config),
         offset=_probe(found, label),
         touches=_touches(found, label, ends),
-        step=max(_step(found, label, f"stepper_{s}") for s in STEPPERS)
-        if _stepped(found)
-        else STEP,
+        step=max(_step(found, label, f"stepper_{s}") for s in STEPPERS) if stepped else STEP,
     )
 
 
@@ -116,11 +113,6 @@ def _check_saved(text: str, label: str) -> None:
             else f"Put '{SAVED} ' before it, remove it if it is empty, or move it above the header;"
             " then restart Klipper",
         )
-
-
-def _stepped(found: Sections) -> bool:
-    """Whether the motors' steps are told."""
-    return {"rotation_distance", "microsteps"} <= found.get("stepper_a", {}).keys()
 
 
 def sections(text: str, label: str) -> Sections:
@@ -190,7 +182,7 @@ def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
     names = [
         f"{kind}{k}"
         for kind in ("height", "manual_height")
-        for k in _while_there(kind, entries.keys())
+        for k in takewhile(lambda k, kind=kind: f"{kind}{k}" in entries, count())
     ]
     if not names:
         return None
@@ -199,16 +191,6 @@ def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
     steps = [_three(entries, label, f"{name}_pos") for name in names]
     origin = f"{label}, [{section}]"
     return Touches(ends - np.array(steps) * way, np.array(heights), origin)
-
-
-def _while_there(kind: str, names: Container[str]) -> list[int]:
-    """Numbers from 0 on, as far as there are entries of them."""
-    out: list[int] = []
-    for k in count():
-        if f"{kind}{k}" not in names:
-            return out
-        out.append(k)
-    return out
 
 
 def _step(found: Sections, label: str, section: str) -> float:

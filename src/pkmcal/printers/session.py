@@ -15,13 +15,7 @@ from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.printers.printer import STEP, Printer, Touches
 from pkmcal.printers.probed import FEWEST, read_touches
 from pkmcal.printers.read import read_printer
-from pkmcal.session.starter import (
-    SQUARES,
-    board_text,
-    example_readings,
-    session_texts,
-    write_texts,
-)
+from pkmcal.session.starter import SQUARES, board_text, example_readings, session_texts, write_texts
 from pkmcal.wording import count
 
 MM = 1e3

@@ -1,1 +1,1 @@
-"""What commands found, as pages for people; :mod:`pkmcal.report.page` is the one of all of them."""
+"""What commands found, as outcomes: sentences, figures, tables, and the parts of their pages."""

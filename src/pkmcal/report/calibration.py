@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.kept import keep_earlier
 from pkmcal.calibration.results import REPORT, check_output, texts_of
@@ -23,11 +22,12 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
-from pkmcal.outcome import Figure, Outcome, Verdict, doubtful
+from pkmcal.outcome import Figure, Outcome, doubtful
+from pkmcal.pages import page
+from pkmcal.pages.drawn import KEPT
 from pkmcal.report import (
     field,
     identifiability,
-    page,
     parameters,
     photographed,
     pictures,
@@ -38,14 +38,11 @@ from pkmcal.report import (
     validation,
     workspace,
 )
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
-    from pkmcal.boards.views import Boards
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
 
 
@@ -53,19 +50,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
     c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
     seen = digests(c.session)
-    told = report_of(
-        c.session,
-        c.observation,
-        c.estimate,
-        c.verdict,
-        c.findings,
-        timings=c.timings,
-        holdout=held_out,
-        over=over,
-        digest=session_digest(c.session, seen),
-        boards=c.boards,
-        photographs=c.photographs,
-    )
+    told = report_of(c, held_out, over, session_digest(c.session, seen))
     open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
@@ -104,36 +89,26 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
 
 
 def report_of(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    verdict: Verdict,
-    findings: Findings,
-    *,
-    timings: Mapping[str, float] | None = None,
+    calibration: Calibration,
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
     digest: str = "",
-    boards: Boards | None = None,
-    photographs: Mapping[int, Sequence[Integers]] | None = None,
 ) -> Outcome:
     """The verdict, cards and parts.
 
-    timings : seconds by step. holdout : what the estimate predicts of configurations that it did
-    not see. over : the tool over the workspace, or why there is no map of it. digest : of the
-    session. boards : the board as it was seen, to draw its corners.
-    photographs : of stations by their number, where they are at hand.
+    holdout : what the estimate predicts of configurations that it did not see. over : the tool over
+    the workspace, or why there is no map of it. digest : of the session.
     """
-    edges = observation.edges
-    camera = session.camera_of_station
-    shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
+    c, session, observation = calibration, calibration.session, calibration.observation
+    estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
+    shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)
+    album = pictures.album(c, shifts, centres)
     links = album.links
     space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
-        provenance.stations(session, observation, estimate, camera, space),
+        provenance.stations(session, observation, estimate, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
@@ -146,16 +121,16 @@ def report_of(
         ),
         field.section(session, observation, estimate, album.corners, links),
         provenance.left_out(session, observation.rejected, estimate),
-        provenance.how(session, estimate, timings or {}),
+        provenance.how(session, estimate, c.timings),
     )
     return Outcome(
         command="calibrate",
         title=f"Calibration of {session.machine.name}",
-        verdict=verdict,
+        verdict=c.verdict,
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(session, observation, estimate, centres, tool, findings.bed),
+        figures=cards(c, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(doubtful(text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
@@ -166,16 +141,11 @@ def report_of(
 
 
 def cards(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    centres: tuple[Centres, ...],
-    tool: ToolError,
-    bed: Bed | None = None,
+    calibration: Calibration, centres: tuple[Centres, ...], tool: ToolError
 ) -> tuple[Figure, ...]:
-    """The cards in their order; those that have nothing to tell are left out. bed : where nothing
-    but heights was measured.
-    """
+    """The cards in their order; those that have nothing to tell are left out."""
+    session, observation = calibration.session, calibration.observation
+    estimate, bed = calibration.estimate, calibration.findings.bed  # where only heights were felt
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(

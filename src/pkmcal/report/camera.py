@@ -13,11 +13,10 @@ from markupsafe import Markup
 from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
-from pkmcal.report import charts, page
-from pkmcal.report.charts import enlargement
-from pkmcal.report.field import CellShift, ImageField
-from pkmcal.report.jpegs import THREADS, jpeg
-from pkmcal.report.pictures import Corner, Picture
+from pkmcal.pages import charts, page
+from pkmcal.pages.drawn import Arrow, Picture
+from pkmcal.pages.jpegs import THREADS, jpeg
+from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
 ARROW = 0.05
@@ -58,7 +57,7 @@ def outcome_of(
     """
     c = calibration
     wanted = ARROW * c.camera.image_size[0]
-    factor = enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
+    factor = charts.enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
     # with its covariance, so that `calibrate --refine-camera` knows how far to move it
@@ -205,7 +204,7 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
 def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
     """One view with the corners found in it."""
     seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
-    corners: list[Corner] = []
+    corners: list[Arrow] = []
     for i in seen.tolist():
         (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
         places = decimals(max(c.rms, 1e-6)) + 1
@@ -214,7 +213,7 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
             f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
         )
         dx, dy = (off * factor).tolist()
-        corners.append(Corner(x, y, dx, dy, not c.kept[v, i], tip))
+        corners.append(Arrow(x, y, dx, dy, not c.kept[v, i], tip))
     aside = sum(corner.quiet for corner in corners)
     caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
@@ -226,8 +225,6 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
         width=width,
         height=height,
         jpeg=jpeg,
-        edges=(),
-        spots=(),
         caption=caption,
         corners=tuple(corners),
     )
@@ -254,11 +251,11 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
+    factor = charts.enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     drawn = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
-        tuple(CellShift(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
+        tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
     return page.render("field.html.j2", field=drawn, cells=cells, factor=factor)
 

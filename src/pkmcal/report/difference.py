@@ -10,8 +10,8 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
-from pkmcal.outcome import AXIS, LOOKS, Figure, Level, Outcome, Part, Plot, Row, Table
-from pkmcal.report.scene import coloured, space_layout
+from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
+from pkmcal.pages.plots import AXIS, LOOKS, coloured, space_layout
 from pkmcal.report.watch import chance_text
 from pkmcal.report.workspace import middle_and_worst
 from pkmcal.wording import SCALES, brief, count, decimals, number

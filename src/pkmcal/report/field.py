@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,12 +18,11 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.charts import enlargement
+from pkmcal.pages import page
+from pkmcal.pages.charts import enlargement
+from pkmcal.pages.drawn import KEPT, Arrow, across, measured_curves, own_edges
 from pkmcal.report.corners import BoardCorners
-from pkmcal.report.drawn import across, measured_curves, own_edges
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
@@ -51,27 +49,16 @@ HOW = (
 
 
 @dataclass(frozen=True)
-class CellShift:
-    """A cell's mean residual: from (x, y), px, by (dx, dy), enlarged. loud : beyond chance."""
-
-    x: float
-    y: float
-    dx: float
-    dy: float
-    loud: bool = True
-    tip: str = ""
-    lead: str = ""
-
-
-@dataclass(frozen=True)
 class ImageField:
-    """The mean residuals over one camera's picture. middle : its centre, px."""
+    """The mean residuals over one camera's picture, those within chance quiet. middle : its centre,
+    px.
+    """
 
     title: str
     width: int
     height: int
     middle: tuple[float, float]
-    cells: tuple[CellShift, ...]
+    cells: tuple[Arrow, ...]
 
 
 @dataclass(frozen=True)
@@ -172,20 +159,17 @@ def fields(
     all arrows are enlarged, and the longest of them, px. None without any cell.
     """
     entries = [station.entry or station.name for station in session.stations]
-    shown: list[tuple[str, int, list[_Cell]]] = []
+    shown: list[tuple[str, int, list[Arrow]]] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
         mine = np.isin(found.station, of_entry)
-        cells = _cells(
-            found.select(mine),
-            session.stations[of_entry[0]].camera.image_size,
-            links,
-        )
+        size = session.stations[of_entry[0]].camera.image_size
+        cells = _cells(found.select(mine), size, links)
         if cells:
             shown.append((entry, of_entry[0], cells))
     if not shown:
         return None
-    lengths = np.array([np.hypot(*cell.shift) for _, _, cells in shown for cell in cells])
+    lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in shown for cell in cells])
     width = max(session.stations[s].camera.image_size[0] for _, s, _ in shown)
     factor = enlargement(lengths, ARROW * width)
     return (
@@ -196,7 +180,7 @@ def fields(
 
 
 def _field(
-    session: Session, entry: str, s: int, cells: Sequence[_Cell], factor: float
+    session: Session, entry: str, s: int, cells: Sequence[Arrow], factor: float
 ) -> ImageField:
     camera = session.stations[s].camera
     values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
@@ -204,24 +188,12 @@ def _field(
         entry,
         *camera.image_size,
         (values["center.x"], values["center.y"]),
-        tuple(
-            CellShift(x, y, dx * factor, dy * factor, cell.loud, cell.tip, cell.lead)
-            for cell in cells
-            for (x, y), (dx, dy) in [(cell.place.tolist(), cell.shift.tolist())]
-        ),
+        tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells),
     )
 
 
-class _Cell(NamedTuple):
-    place: Array
-    shift: Array
-    loud: bool
-    tip: str
-    lead: str
-
-
-def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[_Cell]:
-    """The mean shifts of the cells of one picture that hold enough."""
+def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
+    """The mean shifts of the cells of one picture that hold enough, px."""
     from scipy.special import fdtrc
 
     side = size[0] / COLUMNS
@@ -254,10 +226,10 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[_Cell]:
     left = np.maximum(total(value**2) - explained, 1e-300)
     loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CHANCE
     places = (np.stack([cells % COLUMNS, cells // COLUMNS], axis=-1) + 0.5) * side - 0.5
-    out: list[_Cell] = []
+    out: list[Arrow] = []
     for c in np.flatnonzero(n >= FEWEST).tolist():
         here = first[number_of == c]
-        right, down = shift[c].tolist()
+        (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
         tip = (
             f"{number(right, 3, signed=True)} px to the right,"
             f" {number(-down, 3, signed=True)} px upwards, of"
@@ -265,5 +237,5 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[_Cell]:
         )
         size_of = np.abs(value[number_of == c])
         lead = links.to_largest(some.station[here], some.configuration[here], size_of)
-        out.append(_Cell(places[c], shift[c], bool(loud[c]), tip, lead))
+        out.append(Arrow(x, y, right, down, not loud[c], tip, lead))
     return out

@@ -9,8 +9,8 @@ import numpy as np
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.charts import BarChart, UprightBar
+from pkmcal.pages import page
+from pkmcal.pages.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
 

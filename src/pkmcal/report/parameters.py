@@ -13,23 +13,15 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
-from pkmcal.identify.decided import EXACT, Decider, decided_by
+from pkmcal.identify.decided import EXACT
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.found import FoundParameters, found_parameters
+from pkmcal.identify.found import FoundParameter, FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.outcome import AXIS, LOOKS, Part, Plot
-from pkmcal.report import page
-from pkmcal.wording import (
-    SCALES,
-    capital,
-    decimals,
-    joined,
-    named,
-    number,
-    percent,
-    split_name,
-)
+from pkmcal.outcome import Part, Plot
+from pkmcal.pages import page
+from pkmcal.pages.plots import AXIS, LOOKS
+from pkmcal.wording import SCALES, capital, decimals, joined, named, number, percent, split_name
 
 TIGHT = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
@@ -99,10 +91,10 @@ class ParameterGroup:
 def section(drawing: Machine, estimate: Estimate) -> Part:
     """The table."""
     seen = estimate.edge_weights.size or estimate.pose_weights.size
-    groups = parameter_groups(drawing, estimate)
     found = found_parameters(
         drawing.values, estimate.machine, estimate.covariance, estimate.data_share
     )
+    groups = parameter_groups(found)
     html = page.render(
         "parameters.html.j2",
         groups=groups,
@@ -152,30 +144,22 @@ def _as_link(kind: str, text: str) -> str:
     return f"data:{kind};charset=utf-8;base64,{packed}"
 
 
-def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[ParameterGroup, ...]:
+def parameter_groups(found: FoundParameters) -> tuple[ParameterGroup, ...]:
     """All parameters, grouped by leg in the order of the file."""
-    table = estimate.machine.parameters
-    before = drawing.values
-    source = decided_by(table, estimate.covariance, estimate.data_share)
-    rows = [_row(table, k, float(before[k]), estimate, source[k]) for k in range(len(table))]
+    rows = [_row(found.table, k, one) for k, one in enumerate(found)]
     legs = list(dict.fromkeys(row.leg for row in rows))
     return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
-def _row(
-    table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider
-) -> ParameterRow:
-    factor, unit = SCALES.get(table.units[k], (1.0, table.units[k].replace("1", "")))
-    after = float(estimate.machine.values[k])
-    variance = float(estimate.covariance[k, k])
-    sigma = np.sqrt(variance) if variance > EXACT**2 else 0.0
-    numbers = (before * factor, after * factor, (after - before) * factor, sigma * factor)
+def _row(table: ParameterTable, k: int, one: FoundParameter) -> ParameterRow:
+    factor, unit = SCALES.get(one.unit, (1.0, one.unit.replace("1", "")))
+    sigma = one.sigma if one.sigma > EXACT else 0.0
+    numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
     places = decimals(numbers[3])
-    name = table.names[k]
-    others = [n for group in table.tied if name in group for n in group if n != name]
+    others = [n for group in table.tied if one.name in group for n in group if n != one.name]
     return ParameterRow(
-        name=name,
-        leg=split_name(name)[0],
+        name=one.name,
+        leg=split_name(one.name)[0],
         label=table.labels[k],
         unit=unit,
         drawing=number(numbers[0], places),
@@ -183,8 +167,8 @@ def _row(
         change=number(numbers[2], places, signed=True),
         sigma=number(numbers[3], places) if sigma else "–",
         numbers=numbers,
-        source=source,
-        share=float(estimate.data_share[k]) if sigma else float("nan"),
+        source=one.decided_by,
+        share=one.data_share if sigma else float("nan"),
         note=f"changes together with {joined(others)}" if others else "",
     )
 

@@ -11,15 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.outcome import Plot
+from pkmcal.pages.page import N_COLOURS
+from pkmcal.pages.plots import beside, frustum, line, markers, ring, seen_whole
 from pkmcal.report.links import Links
-from pkmcal.report.page import N_COLOURS
-from pkmcal.report.scene import beside, line, markers, ring, seen_whole
 from pkmcal.session.load import Session
 from pkmcal.wording import count
 
@@ -30,8 +28,6 @@ AROUND = 10
 DEPTH, LEAST_DEPTH = 0.18, 0.1
 """Depth of a camera's frustum, in distances of the camera from the machine's middle, and at least,
 in sizes of the machine."""
-BORDER = 6
-"""Points of each side of a picture's border that a frustum is drawn through."""
 NAMED = 12
 """Cameras up to which each has its name beside it."""
 
@@ -49,9 +45,7 @@ class PosedLimbs(NamedTuple):
 def limbs_of(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
     """At readings (K, m) and poses (K, 4, 4)."""
     ends = machine.ends_at(joints, T_base_platform)
-    moved = joint_values(machine.layout, machine.values, joints)
-    arms = skeletons(machine.layout, machine.values, moved)
-    shape = (len(joints), machine.n_legs, 3)
+    arms, shape = machine.arms_at(joints), (len(joints), machine.n_legs, 3)
     a, b = (np.broadcast_to(x, shape) for x in (ends.a, ends.b))
     return PosedLimbs(a, b, tuple(np.broadcast_to(x, (len(joints), *x.shape[-2:])) for x in arms))
 
@@ -234,30 +228,6 @@ def _poses(
         hovertext=[f"configuration {session.configurations[k]}" for k in configuration],
         customdata=[links.to_configuration(int(k)) for k in configuration],
     )
-
-
-def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
-    """Lines (n, 3), m, base frame: the picture's border at some depth, and the rays to its corners.
-
-    Where the lens or mirror sees nothing at the border, its field's, as far as it goes; of a field
-    that is wider than a plane can hold, at a distance instead of a depth.
-    """
-    right, bottom = camera.image_size[0] - 0.5, camera.image_size[1] - 0.5
-    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
-    at = np.arange(4 * BORDER + 1) / BORDER
-    border = np.stack([np.interp(at, np.arange(5), corners[:, c]) for c in (0, 1)], axis=-1)
-    centre = (border.max(axis=0) + border.min(axis=0)) / 2
-    share = np.linspace(1, 0, 41)[:, None, None]
-    rays = camera.ray(centre + share * (border - centre))
-    first = np.argmax(np.isfinite(rays).all(axis=-1), axis=0)
-    rays = rays[first, np.arange(len(border))]
-    if not np.isfinite(rays).all():
-        return []
-    deep = rays[:, 2].min()
-    points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
-    seen = apply(T_base_camera, points)
-    eye = T_base_camera[:3, 3]
-    return [seen, *(np.stack([eye, seen[k * BORDER]]) for k in range(4))]
 
 
 # ------------------------------------------------------------------ how it is shown

@@ -3,38 +3,43 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.boards.views import Boards
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.observe.images import Pictures
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
+from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
-from pkmcal.report import page
-from pkmcal.report.charts import enlargement
-from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.drawn import (
+from pkmcal.pages import page
+from pkmcal.pages.charts import enlargement
+from pkmcal.pages.drawn import (
     CURVE,
+    KEPT,
+    Arrow,
     Drawn,
+    Picture,
     Spot,
     edge_name,
     measured_curves,
     polyline,
     residual_words,
 )
-from pkmcal.report.jpegs import small_and_large
+from pkmcal.pages.jpegs import small_and_large
+from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Links, Place
-from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
 from pkmcal.wording import brief, count, number
+
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
 
 MOST = 400
 """Photographs on a page: browsers take a second to lay out as many."""
@@ -42,42 +47,6 @@ ROOM = 8_000_000
 """Characters of all their JPEGs."""
 ARROW = 0.03
 """Length of a large corner's residual as drawn, in picture widths."""
-
-
-@dataclass(frozen=True)
-class Corner:
-    """A board's corner in pixels: where found, and the way to where it is expected, enlarged."""
-
-    x: float
-    y: float
-    dx: float
-    dy: float
-    quiet: bool
-    tip: str
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
-    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
-    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
-    the page.
-    """
-
-    station: str
-    configuration: str
-    width: int
-    height: int
-    jpeg: str
-    edges: tuple[Drawn, ...]
-    spots: tuple[Spot, ...]
-    why: str = ""
-    caption: str = ""
-    kind: str = "measured"
-    anchor: str = ""
-    large: str = ""
-    missed: tuple[Drawn, ...] = ()
-    corners: tuple[Corner, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,20 +76,11 @@ def section(session: Session, shown: Album) -> Part:
     return Part("photographs", "Photographs", html=html)
 
 
-def album(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    shifts: Array,
-    centres: tuple[Centres, ...],
-    boards: Boards | None = None,
-    photographs: Mapping[int, Sequence[Integers]] | None = None,
-) -> Album:
+def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...]) -> Album:
     """The photographs, those in which nothing is in use first, then by their residuals, the largest
-    first, as many as there is room for. shifts : (N,) px of the edges, for tooltips. photographs :
-    of stations by their number, where they are at hand.
+    first, as many as there is room for. shifts : (N,) px of the edges, for tooltips.
     """
-    level = levels(observation, estimate)
+    session, level = calibration.session, levels(calibration.observation, calibration.estimate)
     every = [
         (s, photo)
         for s, station in enumerate(session.stations)
@@ -128,7 +88,7 @@ def album(
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
     images = {s: _images(session, s) for s in range(len(session.stations))} | {
-        **(photographs or {})
+        **calibration.photographs
     }
     files = [
         (images[s], session.stations[s].photographs.index(photo)) for s, photo in ordered[:MOST]
@@ -136,7 +96,7 @@ def album(
     shots = list(small_and_large(files, ROOM))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
-    found = _Found(session, observation, estimate, shifts, centres, boards or Boards(), chosen)
+    found = _Found(calibration, shifts, centres, chosen)
     return Album(
         tuple(
             found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
@@ -182,24 +142,22 @@ class _Found:
 
     def __init__(
         self,
-        session: Session,
-        observation: Observation,
-        estimate: Estimate,
+        calibration: Calibration,
         shifts: Array,
         centres: tuple[Centres, ...],
-        boards: Boards,
         chosen: Iterable[tuple[int, Photograph]],
     ) -> None:
-        self.session = session
+        self.calibration = calibration
+        session, estimate = calibration.session, calibration.estimate
         self.edges: dict[Place, list[Drawn]] = defaultdict(list)
         self.missed: dict[Place, list[Drawn]] = defaultdict(list)
         self.spots: dict[Place, list[Spot]] = defaultdict(list)
         self.reasons: dict[Place, list[str]] = defaultdict(list)
-        self.corners = board_corners(session, boards, estimate)
+        self.corners = board_corners(session, calibration.boards, estimate)
         width = max((s.camera.image_size[0] for s in session.stations), default=0)
         self.factor = enlargement(np.linalg.norm(self.corners.off, axis=1), ARROW * width)
         rejected: dict[int, list[Rejection]] = defaultdict(list)
-        for one in observation.rejected:
+        for one in calibration.observation.rejected:
             rejected[one.station].append(one)
             if one.leg < 0:
                 self.reasons[one.station, one.configuration].append(one.reason)
@@ -210,15 +168,16 @@ class _Found:
         for s, some in rows.items():
             if "legs" in session.stations[s].observe:
                 configurations = np.array(sorted(some))
-                self._edges(observation, estimate, shifts, s, configurations)
-                self._missed(estimate, rejected[s], s, configurations)
-                self._spots(estimate, centres, s, configurations)
+                self._edges(shifts, s, configurations)
+                self._missed(rejected[s], s, configurations)
+                self._spots(centres, s, configurations)
 
     def picture(
         self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
     ) -> Picture:
         """One photograph with what was found in it."""
-        k, station = photo.configuration, self.session.stations[s]
+        session = self.calibration.session
+        k, station = photo.configuration, session.stations[s]
         p, c = station.photographs.index(photo), self.corners
         mine = c.select((c.station == s) & (c.photograph == p))
         width, height = station.camera.image_size
@@ -233,7 +192,7 @@ class _Found:
         ]
         return Picture(
             station=station.name,
-            configuration=self.session.configurations[k],
+            configuration=session.configurations[k],
             width=width,
             height=height,
             jpeg=shot[0],
@@ -246,26 +205,19 @@ class _Found:
             anchor=anchor,
         )
 
-    def _corner(self, corners: BoardCorners, n: int) -> Corner:
+    def _corner(self, corners: BoardCorners, n: int) -> Arrow:
         (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
         tip = (
             f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
             f" {number(-dy, 2, signed=True)} px from where it is expected"
         )
-        return Corner(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
+        return Arrow(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
 
-    def _edges(
-        self,
-        observation: Observation,
-        estimate: Estimate,
-        shifts: Array,
-        s: int,
-        configurations: Integers,
-    ) -> None:
+    def _edges(self, shifts: Array, s: int, configurations: Integers) -> None:
         """The fitted edges of a station."""
-        edges = observation.edges
+        edges, estimate = self.calibration.observation.edges, self.calibration.estimate
         mine = np.flatnonzero((edges.station == s) & np.isin(edges.configuration, configurations))
-        curves = edge_curves(self.session, observation, estimate, mine, s)
+        curves = edge_curves(self.calibration, mine, s)
         for n, curve in zip(mine.tolist(), curves, strict=True):
             weight = float(estimate.edge_weights[n])
             across, tilt = estimate.edge_residuals[n].tolist()
@@ -279,22 +231,14 @@ class _Found:
             if drawn:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
-    def _missed(
-        self, estimate: Estimate, rejected: list[Rejection], s: int, configurations: Integers
-    ) -> None:
+    def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
         """Where edges should have been that were left out, each with why."""
-        machine, state, camera = estimate.machine, estimate.state, self.session.stations[s].camera
+        machine, camera = self.calibration.machine, self.calibration.session.stations[s].camera
         row = {int(k): n for n, k in enumerate(configurations)}
         some = [one for one in rejected if one.leg >= 0 and one.configuration in row]
         if not some:
             return
-        legs = legs_in_camera(
-            machine,
-            state.T_camera_base[s],
-            state.T_base_platform[configurations],
-            self.session.joints[configurations],
-        )
-        tubes = tubes_of(machine)
+        legs, tubes = _legs(self.calibration, s, configurations), tubes_of(machine)
         pixel = edge_points(machine, camera, legs, tubes, CURVE).pixel
         inside = camera.in_image(pixel)
         for one in some:
@@ -308,15 +252,13 @@ class _Found:
                 if drawn:
                     self.missed[s, one.configuration].append(drawn)
 
-    def _spots(
-        self, estimate: Estimate, centres: tuple[Centres, ...], s: int, configurations: Integers
-    ) -> None:
+    def _spots(self, centres: tuple[Centres, ...], s: int, configurations: Integers) -> None:
         """Joint centres, by the result and by the drawing laid over it."""
-        session, state = self.session, estimate.state
+        session, state = self.calibration.session, self.calibration.estimate.state
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
         base, platform = (side.T_calibrated_drawing for side in centres)
-        after = estimate.machine.ends_at(joints, pose)
+        after = self.calibration.machine.ends_at(joints, pose)
         old_pose = inverse(base) @ pose @ platform
         before = session.machine.ends_at(joints, old_pose)
         seen = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
@@ -333,20 +275,19 @@ class _Found:
                     labelled.add(j)
 
 
-def edge_curves(
-    session: Session, observation: Observation, estimate: Estimate, mine: Integers, s: int
-) -> Array:
+def edge_curves(c: Calibration, mine: Integers, s: int) -> Array:
     """Curves (n, CURVE, 2) px of the edges ``mine`` in the photographs of station s."""
-    edges, state = observation.edges.select(mine), estimate.state
+    edges, camera = c.observation.edges.select(mine), c.session.stations[s].camera
     rows, photograph = np.unique(edges.configuration, return_inverse=True)
-    legs = legs_in_camera(
-        estimate.machine,
-        state.T_camera_base[s],
-        state.T_base_platform[rows],
-        session.joints[rows],
+    return measured_curves(c.machine, camera, _legs(c, s, rows), photograph, edges)
+
+
+def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
+    """The calibrated legs before a station's camera, in some configurations."""
+    state = c.estimate.state
+    return legs_in_camera(
+        c.machine, state.T_camera_base[s], state.T_base_platform[rows], c.session.joints[rows]
     )
-    camera = session.stations[s].camera
-    return measured_curves(estimate.machine, camera, legs, photograph, edges)
 
 
 def _aside(n: int) -> str:

@@ -12,22 +12,10 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, plain, yaml_text
 from pkmcal.geometry.rigid import inverse
-from pkmcal.outcome import (
-    AXIS,
-    LOOKS,
-    Figure,
-    Outcome,
-    Part,
-    Plot,
-    Row,
-    Table,
-    Verdict,
-    note,
-)
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, note
+from pkmcal.pages.plots import AXIS, LOOKS, beside, frustum, line, markers, seen_whole
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.report.photographed import frustum
-from pkmcal.report.scene import beside, line, markers, seen_whole
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
 
@@ -121,15 +109,10 @@ def _known_to(accuracy: Accuracy) -> str:
 def _asked(found: MeasurementPlan) -> str:
     """What the plan is for, in a sentence."""
     where = ""
-    if len(_names(found)) > 1:
+    if len({name for names in found.stations for name in names}) > 1:
         where = " seen by all stations" if found.together else " from each place"
     each = count(found.promised.count, "configuration") + where
     return f"{each}, chosen for {INDEX_NAMES[found.index]}; workspace: {found.region}."
-
-
-def _names(found: MeasurementPlan) -> list[str]:
-    """Names of the stations, each once."""
-    return list(dict.fromkeys(name for names in found.stations for name in names))
 
 
 def _paying(found: MeasurementPlan) -> str:
@@ -370,7 +353,6 @@ def stations_document(found: MeasurementPlan) -> dict[str, Any]:
     """The chosen places as entries of session.yaml."""
     rig, out = found.subject.rig, dict[str, Any]()
     for name, _, T_camera_base in _cameras(found):
-        place = StationPlace.of(T_camera_base)
         observe = [
             word
             for word, kind in (("legs", LegsFrom), ("board", BoardFrom))
@@ -380,11 +362,7 @@ def stations_document(found: MeasurementPlan) -> dict[str, Any]:
             "camera": "cameras/camera.yaml",
             "images": f"images/{name}/{{configuration}}.png",
             "observe": observe[0] if len(observe) == 1 else observe,
-            "pose": {
-                "position": [round(x, 3) + 0.0 for x in place.position],
-                "look_at": [round(x, 3) + 0.0 for x in place.look_at],
-                "up": [round(x, 3) + 0.0 for x in place.up],
-            },
+            "pose": StationPlace.of(T_camera_base).rounded(3),
         }
     return {"stations": out}
 

@@ -10,18 +10,10 @@ from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.report import charts
-from pkmcal.report.charts import (
-    NORMAL_90,
-    BarChart,
-    RowChart,
-    UprightBar,
-    bar_chart,
-    box,
-    row_chart,
-)
+from pkmcal.pages import charts
+from pkmcal.pages.drawn import KEPT
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import KEPT, SIGMAS, level_bar
+from pkmcal.report.residuals import SIGMAS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
@@ -128,7 +120,7 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
 
 def _by_configuration(
     session: Session, poses: PoseSet, estimate: Estimate, links: Links
-) -> BarChart | None:
+) -> charts.BarChart | None:
     """Root mean square of each configuration's poses in standard deviations."""
     number = np.bincount(poses.configuration, weights=poses.rows)
     square = np.bincount(
@@ -146,48 +138,45 @@ def _by_configuration(
     ]
     alt = "Bars of the poses' residuals by configuration"
     title, unit = "Poses, by configuration", f"configurations; root mean square, {SIGMAS}"
-    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+    return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
 def _bars(
     session: Session, poses: PoseSet, error: Array, unit: str, title: str, links: Links
-) -> BarChart | None:
+) -> charts.BarChart | None:
     """Length of each configuration's error, largest of its poses."""
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
         return None
     largest = np.zeros(len(session.configurations))
     np.maximum.at(largest, poses.configuration, size)
-    bars: list[UprightBar] = []
-    for k in np.unique(poses.configuration).tolist():
-        value, name = float(largest[k]), session.configurations[k]
-        bars.append(
-            UprightBar(
-                name,
-                f"configuration {name}: {brief(value)} {unit}",
-                value,
-                None,
-                True,
-                links.to_configuration(k),
-            )
+    bars = [
+        charts.UprightBar(
+            session.configurations[k],
+            f"configuration {session.configurations[k]}: {brief(float(largest[k]))} {unit}",
+            float(largest[k]),
+            quiet=True,
+            lead=links.to_configuration(k),
         )
+        for k in np.unique(poses.configuration).tolist()
+    ]
     alt = f"Bars of the poses' errors in {unit}"
     under = f"configurations; largest of each, {unit}"
-    return bar_chart(title, under, bars, charts.six_labels(bars), alt)
+    return charts.bar_chart(title, under, bars, charts.six_labels(bars), alt)
 
 
-def axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
+def axes(poses: PoseSet, estimate: Estimate) -> charts.RowChart | None:
     """Boxes of the poses' six numbers, whitened residuals; for the section on residuals."""
     names = ("turn 1", "turn 2", "turn 3", "place 1", "place 2", "place 3")
     measured = np.any(poses.whiten != 0, axis=-1)
     boxes = [
-        box(name, estimate.pose_residuals[measured[:, k], k], "σ", 2)
+        charts.box(name, estimate.pose_residuals[measured[:, k], k], "σ", 2)
         for k, name in enumerate(names)
     ]
     alt = "Boxes of the poses' residuals by their six numbers"
     title = "Poses, by the six numbers"
     note = "about and along the station's x, y and z"
-    return row_chart(title, SIGMAS, boxes, NORMAL_90, alt, note)
+    return charts.row_chart(title, SIGMAS, boxes, charts.NORMAL_90, alt, note)
 
 
 def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
-from pkmcal.report import page, parameters
-from pkmcal.report.drawn import SIDES
+from pkmcal.pages import page
+from pkmcal.pages.drawn import SIDES
+from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
@@ -51,16 +52,10 @@ def used_photographs(session: Session, observation: Observation) -> tuple[int, .
 
 
 def stations(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    camera: Integers,
-    space: Plot | None,
+    session: Session, observation: Observation, estimate: Estimate, space: Plot | None
 ) -> Part:
-    """The machine as it was photographed, and where the cameras stood, one row a station; camera
-    (S,) is the number of its camera file.
-    """
-    plots = (space,) if space else ()
+    """The machine as it was photographed, and where the cameras stood, one row a station."""
+    plots, camera = (space,) if space else (), session.camera_of_station
     if not session.station_names:
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0

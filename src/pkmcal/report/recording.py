@@ -17,11 +17,11 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.images import decode
+from pkmcal.pages.drawn import KEPT, edge_name, laid_over, residual_words
+from pkmcal.pages.jpegs import coded
 from pkmcal.report import poses
-from pkmcal.report.drawn import edge_name, laid_over, residual_words
-from pkmcal.report.jpegs import coded
 from pkmcal.report.pictures import edge_curves
-from pkmcal.report.residuals import KEPT, rms
+from pkmcal.report.residuals import rms
 from pkmcal.session.photographs import label_of
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     yield Logged((*path, "photograph"), "photograph", {"jpeg": coded(grey, QUALITY)}, at)
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
-    curves = edge_curves(session, c.observation, estimate, mine, s)
+    curves = edge_curves(c, mine, s)
     used = estimate.edge_weights[mine] >= KEPT
     for part, chosen in (("edges", used), ("aside", ~used)):
         rows = np.flatnonzero(chosen)

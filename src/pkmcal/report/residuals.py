@@ -13,23 +13,12 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.report import charts
-from pkmcal.report.charts import (
-    NORMAL_90,
-    BarChart,
-    RowChart,
-    UprightBar,
-    bar_chart,
-    box,
-    row_chart,
-)
-from pkmcal.report.drawn import SIDES
+from pkmcal.pages import charts
+from pkmcal.pages.drawn import KEPT, SIDES
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
-KEPT = 0.5
-"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
 STANDS_OUT = 1.5
 """A group whose residuals are this many times the middle group's is worth a sentence."""
 SHADED = 0.05
@@ -99,7 +88,9 @@ def rms(white: Array, weights: Array) -> float:
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
 
-def by_leg(session: Session, edges: EdgeSet, estimate: Estimate, links: Links) -> RowChart | None:
+def by_leg(
+    session: Session, edges: EdgeSet, estimate: Estimate, links: Links
+) -> charts.RowChart | None:
     """The edges' residuals by leg, in the legs' colours."""
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
     return _edge_boxes("leg", legs, edges.leg, edges, estimate, links)
@@ -112,7 +103,7 @@ def _edge_boxes(
     edges: EdgeSet,
     estimate: Estimate,
     links: Links,
-) -> RowChart | None:
+) -> charts.RowChart | None:
     """A box for each group that has edges; both numbers of a residual count. Each leads to the
     photograph of its largest.
     """
@@ -122,16 +113,16 @@ def _edge_boxes(
         mine = group == g
         size = np.linalg.norm(white[mine], axis=1)
         lead = links.to_largest(edges.station[mine], edges.configuration[mine], size)
-        boxes.append(box(name, white[mine], "σ", 2, g + 1 if by == "leg" else None, lead))
+        boxes.append(charts.box(name, white[mine], "σ", 2, g + 1 if by == "leg" else None, lead))
     alt = f"Boxes of the whitened edge residuals by {by}"
-    return row_chart(f"Edges, by {by}", SIGMAS, boxes, NORMAL_90, alt)
+    return charts.row_chart(f"Edges, by {by}", SIGMAS, boxes, charts.NORMAL_90, alt)
 
 
 def _configurations(
     session: Session, edges: EdgeSet, estimate: Estimate, links: Links
-) -> BarChart | None:
+) -> charts.BarChart | None:
     """Root mean square of each configuration's edges, with the range that noise alone gives."""
-    bars: list[UprightBar] = []
+    bars: list[charts.UprightBar] = []
     for k, name in enumerate(session.configurations):
         mine = edges.configuration == k
         weights = estimate.edge_weights[mine]
@@ -143,17 +134,17 @@ def _configurations(
         bars.append(level_bar(name, level, 2 * float(weights.sum()), of, lead))
     title, unit = "Edges, by configuration", f"configurations; root mean square, {SIGMAS}"
     alt = "Bars of the residuals by configuration"
-    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+    return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
-def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -> UprightBar:
+def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -> charts.UprightBar:
     """A configuration's root mean square, in σ, beside where that of n numbers of noise lies."""
     low, high = expected_rms(n)
     tip = (
         f"configuration {name}: {number(level, 2)} σ{of}, {number(low, 2)} to {number(high, 2)}"
         " expected of noise alone"
     )
-    return UprightBar(name, tip, level, (low, high), level <= high, lead)
+    return charts.UprightBar(name, tip, level, (low, high), level <= high, lead)
 
 
 def expected_rms(n: float) -> tuple[float, float]:
@@ -164,33 +155,35 @@ def expected_rms(n: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def histogram(white: Array) -> BarChart | None:
+def histogram(white: Array) -> charts.BarChart | None:
     """Counts of all residuals beside the normal density; the outermost bars hold the rest."""
     values = white[np.isfinite(white)]
     if not values.size:
         return None
     borders = np.arange(-HISTOGRAM, HISTOGRAM + 0.25, 0.5)
     counts = np.histogram(np.clip(values, -HISTOGRAM, HISTOGRAM), borders)[0]
-    bars: list[UprightBar] = []
+    bars: list[charts.UprightBar] = []
     for low, high, n in zip(borders[:-1], borders[1:], counts.tolist(), strict=True):
         where = f"{number(low, 1)} to {number(high, 1)} σ"
         if low == -HISTOGRAM or high == HISTOGRAM:
             where += " or beyond"
-        bars.append(UprightBar(where, f"{where}: {count(n, 'residual')}", float(n), None, True))
+        bars.append(
+            charts.UprightBar(where, f"{where}: {count(n, 'residual')}", float(n), None, True)
+        )
     x = np.linspace(-HISTOGRAM, HISTOGRAM, 81)
     density = np.exp(-x * x / 2) / np.sqrt(2 * np.pi) * values.size * 0.5
     curve = tuple(zip(((x + HISTOGRAM) * 2).tolist(), density.tolist(), strict=True))
     labels = tuple(((v + HISTOGRAM) * 2, number(v, 0)) for v in (-4.0, -2.0, 0.0, 2.0, 4.0))
     alt = "Histogram of the residuals with the normal density over it"
-    return bar_chart(
+    return charts.bar_chart(
         "All edge residuals", f"{SIGMAS}; number of residuals", bars, labels, alt, curve
     )
 
 
-def _outward(edges: EdgeSet, shifts: Array, links: Links) -> RowChart | None:
+def _outward(edges: EdgeSet, shifts: Array, links: Links) -> charts.RowChart | None:
     """Outward shift of every leg's edges: shading and wrong radii show here."""
     boxes = [
-        box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1, lead)
+        charts.box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1, lead)
         for (j, t, s), mine in _edge_kinds(edges)
         for lead in [
             links.to_largest(edges.station[mine], edges.configuration[mine], np.abs(shifts[mine]))
@@ -199,7 +192,7 @@ def _outward(edges: EdgeSet, shifts: Array, links: Links) -> RowChart | None:
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
     note = "looking along the leg from base to platform"
-    return row_chart(title, "pixels", boxes, None, alt, note)
+    return charts.row_chart(title, "pixels", boxes, None, alt, note)
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
@@ -211,7 +204,7 @@ def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
     ]
 
 
-def _joints(session: Session, estimate: Estimate, links: Links) -> RowChart | None:
+def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowChart | None:
     """Residuals of the readings by joint, each leading to the photograph of its largest."""
     motor = session.machine.layout.actuated
     used = np.flatnonzero(estimate.configurations)
@@ -219,14 +212,16 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> RowChart | No
     moved = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
     worst = used[np.abs(white).argmax(axis=0)] if len(white) else np.zeros(len(moved), dtype=int)
     boxes = [
-        box(named(legs), white[:, column], "σ", 2, legs[0] + 1, links.to_configuration(int(k)))
+        charts.box(
+            named(legs), white[:, column], "σ", 2, legs[0] + 1, links.to_configuration(int(k))
+        )
         for column, (legs, k) in enumerate(zip(moved, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
     # readings that poses follow are near zero whatever their noise: few freedoms say so
     s = estimate.statistics
     note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
-    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt, note)
+    return charts.row_chart("Joint readings, by leg", SIGMAS, boxes, charts.NORMAL_90, alt, note)
 
 
 def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:

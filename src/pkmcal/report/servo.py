@@ -12,21 +12,9 @@ from pkmcal.control.source import Controlled
 from pkmcal.control.study import Study, Trials
 from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
-from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.outcome import (
-    Figure,
-    Outcome,
-    Part,
-    Plot,
-    Row,
-    Table,
-    Verdict,
-    doubtful,
-    plane,
-)
-from pkmcal.report.page import N_COLOURS
-from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, doubtful
+from pkmcal.pages.page import N_COLOURS
+from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_layout
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
@@ -144,18 +132,17 @@ def stillness(s: Study) -> str:
     )
 
 
-def document_of(subject: Controlled, found: Study, verdict: Verdict) -> dict[str, Any]:
+def document_of(subject: Controlled, s: Study, verdict: Verdict) -> dict[str, Any]:
     """Plain data for JSON: m, rad, s; legs count from 1."""
-    s, j = found, verdict
     return {
         "machine": subject.name,
         "origin": subject.origin,
         "station": subject.station,
-        "usable": j.usable,
-        "headline": j.headline,
-        "reasons": j.reasons,
-        "warnings": (*subject.warnings, *j.warnings),
-        "advice": j.advice,
+        "usable": verdict.usable,
+        "headline": verdict.headline,
+        "reasons": verdict.reasons,
+        "warnings": (*subject.warnings, *verdict.warnings),
+        "advice": verdict.advice,
         "settings": _settings(s),
         "estimates": {o.estimate.name: _outcome_document(o) for o in s.outcomes},
         "stillness": {
@@ -195,9 +182,8 @@ def shown_run(found: Study) -> int:
     return int(np.argmax(np.where(everywhere, found.outcome("hand").astray, -1.0)))
 
 
-def cards(found: Study) -> tuple[Figure, ...]:
+def cards(s: Study) -> tuple[Figure, ...]:
     """The main numbers."""
-    s = found
     good, hand = s.outcome("identified"), s.outcome("hand")
     n = s.plan.runs
     return (
@@ -283,9 +269,8 @@ def ends_table(found: Study) -> Table | None:
     return Table("Runs that did not reach their goal", columns, tuple(rows), brief=False)
 
 
-def choices_table(found: Study) -> Table:
+def choices_table(s: Study) -> Table:
     """Which legs must be seen."""
-    s = found
     useful = [c for c in s.choices if not c.blind]
     sizes = sorted({len(c.legs) for c in useful})
     shown = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
@@ -492,9 +477,7 @@ def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
 def _limbs(s: Study, poses: Array) -> tuple[Array, Array]:
     """Ends A and B (n, L, 3) of the true limbs at poses (n, 4, 4), m."""
     machine = s.eye.true.machine
-    layout, theta = machine.layout, machine.values
-    readings, internal = inverse_result(layout, theta, poses)
-    ends = limb_ends(layout, theta, np.nan_to_num(readings), poses, internal)
+    ends = machine.ends_at(np.nan_to_num(machine.inverse(poses)), poses)
     return np.broadcast_to(ends.a, ends.b.shape), ends.b
 
 

@@ -10,7 +10,7 @@ from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
 from pkmcal.judge.words import against, better, factor
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, doubtful
-from pkmcal.report import charts
+from pkmcal.pages import charts
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import SCALES, amount, brief, count, decimals, number

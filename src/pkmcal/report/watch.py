@@ -8,7 +8,7 @@ from pkmcal.judge.changes import POWER, ChiSquare, LegTest
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, doubtful
-from pkmcal.report import charts
+from pkmcal.pages import charts
 from pkmcal.wording import SCALES, amount, brief, count, listed, named, number
 
 NONE = "–"

@@ -11,9 +11,9 @@ from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN
-from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
+from pkmcal.outcome import Part, Plot, Row, Table
+from pkmcal.pages.plots import AXIS, COLOURS, LOOKS, coloured, markers, space_layout
 from pkmcal.report.links import Links
-from pkmcal.report.scene import COLOURS, coloured, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 
@@ -134,7 +134,8 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
     for row, (name, values) in enumerate(quantities):
         for column, cut in enumerate(found.slices):
             place = (row, 0) if single else (column, row)
-            panel = _panel(place[1] * across + place[0])
+            nth = place[1] * across + place[0]
+            panel = str(nth + 1) if nth else ""  # Plotly calls axes x, x2, x3
             axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
             data.append(_heat(cut, values * 1e3, name, axes))
             data.append(_crosses(session, estimate, found, cut, axes, links))
@@ -157,11 +158,6 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
         height=height,
         width=640 if single else 150 * across + LEFT + RIGHT,
     )
-
-
-def _panel(count_from_0: int) -> str:
-    """What Plotly calls the axes of a panel, counted from 0: x, x2, x3."""
-    return str(count_from_0 + 1) if count_from_0 else ""
 
 
 def _extent(found: ToolMap) -> Array:

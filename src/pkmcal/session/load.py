@@ -43,23 +43,8 @@ from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
-from pkmcal.session.schema import (
-    Body,
-    SessionDocument,
-    StationDocument,
-    Vector,
-)
+from pkmcal.session.schema import Body, SessionDocument, StationDocument, Vector
 from pkmcal.wording import count, listed
-
-__all__ = [
-    "Photograph",
-    "Session",
-    "SessionDocument",
-    "Station",
-    "load_session",
-    "look_at_pose",
-    "photograph_header",
-]
 
 FILE = "session.yaml"
 VERSION = 1
@@ -453,8 +438,6 @@ def _stations(
         _, inside = camera_path(folder / camera_file)
         _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
-    for photo in photographs:
-        _check_size(folder, photo, camera, camera_file)
     T_camera_base = None
     if station.handheld:
         _check_handheld(document, name, station)
@@ -479,14 +462,10 @@ def _stations(
     if not station.handheld:
         return [whole]
     return [
-        replace(whole, name=_name_of(name, names[photo.configuration], photo), photographs=(photo,))
+        replace(whole, name="-".join(filter(None, called)), photographs=(photo,))
         for photo in photographs
+        for called in [(name, names[photo.configuration], photo.repeat)]
     ]
-
-
-def _name_of(entry: str, configuration: str, photo: Photograph) -> str:
-    """What a hand-held photograph is called as a station."""
-    return "-".join([entry, configuration] + ([photo.repeat] if photo.repeat else []))
 
 
 def _check_handheld(document: Document, name: str, station: StationDocument) -> None:
@@ -509,28 +488,25 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
 
 
-def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
-    label = label_of(folder, photo.path)
-    width, height = size = photograph_header(photo.path, label)
-    if tuple(camera.image_size) in (size, (height, width)):
-        return
-    raise InputError(
-        "the photograph has another size than its camera",
-        where=label,
-        found=f"{width}x{height}",
-        expected=f"{camera.image_size[0]}x{camera.image_size[1]} ({camera_file})",
-        next_step="Use unscaled, uncropped photographs, or the camera file of this resolution",
-    )
-
-
 def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
-    """Photographs that were turned by a quarter after they were taken."""
-    turned = [
-        label_of(folder, photo.path)
-        for station in stations
-        for photo in station.photographs
-        if photograph_header(photo.path) != tuple(station.camera.image_size)
-    ]
+    """Photographs that were turned by a quarter after they were taken; raises `InputError` for one
+    of another size than its camera.
+    """
+    turned: list[str] = []
+    for station, photo in ((s, photo) for s in stations for photo in s.photographs):
+        label, wanted = label_of(folder, photo.path), tuple(station.camera.image_size)
+        width, height = size = photograph_header(photo.path, label)
+        if wanted not in (size, (height, width)):
+            raise InputError(
+                "the photograph has another size than its camera",
+                where=label,
+                found=f"{width}x{height}",
+                expected=f"{wanted[0]}x{wanted[1]} ({station.camera_file})",
+                next_step="Use unscaled, uncropped photographs, or the camera file of this"
+                " resolution",
+            )
+        if wanted != size:
+            turned.append(label)
     if not turned:
         return []
     return [

@@ -216,6 +216,10 @@ class StationPlace:
         position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
         return cls(*(tuple(v.tolist()) for v in (position, position + forward, up)))
 
+    def rounded(self, digits: int) -> dict[str, list[float]]:
+        """Its fields with so many decimals, never -0.0."""
+        return {name: [round(x, digits) + 0.0 for x in part] for name, part in vars(self).items()}
+
     def T_camera_base(self) -> Array:
         """(4, 4), base to camera coordinates."""
         return look_at(np.array(self.position), np.array(self.look_at), np.array(self.up))

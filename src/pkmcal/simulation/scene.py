@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR
-from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.render import Scene, ScenePart
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
@@ -148,8 +148,7 @@ def machine_parts(
     ends = machine.ends_at(joints, T_base_platform)
     balls = _ball_radii(machine)
     bars = side_bars(machine)
-    moved = joint_values(machine.layout, machine.values, joints)
-    chains = skeletons(machine.layout, machine.values, moved)
+    chains = machine.arms_at(joints)
     parts = _base(discs, balls[:, 0], finish)
     parts += _platform(discs, bars, np.array(ends.b), balls[:, 1], T_base_platform, finish)
     for j in range(machine.n_legs):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import AXIS, LOOKS, Outcome, Part, Row, Table
+from pkmcal.outcome import Outcome, Part, Row, Table
+from pkmcal.pages.plots import AXIS, LOOKS
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_a import (

@@ -9,7 +9,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
-from pkmcal.outcome import Outcome, Part, Row, Table, plane
+from pkmcal.outcome import Outcome, Part, Row, Table
+from pkmcal.pages.plots import plane
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_b import (
     CASES,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Outcome, Row, Table, plane
+from pkmcal.outcome import Outcome, Row, Table
+from pkmcal.pages.plots import plane
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
     AXIS,

@@ -13,18 +13,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import (
-    Figure,
-    Level,
-    Outcome,
-    Part,
-    Plot,
-    Row,
-    Table,
-    Verdict,
-    note,
-    plane,
-)
+from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict, note
+from pkmcal.pages.plots import plane
 from pkmcal.studies.calibrations import ESTIMATE
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.findings import HELD, PROMISE, SHARES, CellFindings, Gain, SweepResult

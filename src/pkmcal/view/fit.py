@@ -13,7 +13,7 @@ from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT, find_station
 from pkmcal.observe.tables import distance_tables
-from pkmcal.view.overlay import moved, overlay, pane_of
+from pkmcal.view.overlay import overlay, placed
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Viewed
 from pkmcal.wording import brief, count
@@ -39,7 +39,7 @@ def fitted(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
-    start = moved(viewed, pane_of(viewed, look), look)
+    start = placed(viewed, look).T_camera_base
     view = _view(viewed, look.station)
     many = len(view.configuration) >= FEWEST
     if many:

@@ -15,9 +15,10 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.report.drawn import (
+from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
+from pkmcal.pages.drawn import (
     CURVE,
+    KEPT,
     across,
     edge_name,
     measured_curves,
@@ -25,8 +26,7 @@ from pkmcal.report.drawn import (
     polyline,
     residual_words,
 )
-from pkmcal.report.residuals import KEPT
-from pkmcal.view.overlay import moved, pane_of
+from pkmcal.view.overlay import placed
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Pane, Viewed
 from pkmcal.wording import count, number
@@ -47,7 +47,7 @@ def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
     board's corners, and all that in words.
     """
-    pane = pane_of(viewed, look)
+    pane = placed(viewed, look)
     said: list[str] = []
     out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": said, "median": None}
     if "legs" in viewed.station(look.station).observe and len(tubes_of(pane.machine)):
@@ -63,7 +63,6 @@ def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
 
 def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
     """What is found of the legs, put into the answer."""
-    T_camera_base = moved(viewed, pane, look)
     row = viewed.photograph(look.station, look.photograph).configuration
     taken = legs.Photographs(
         look.station,
@@ -73,9 +72,9 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         [viewed.image(look.station, look.photograph)],
     )
     take = legs.measure if look.shown == "calibration" else legs.search
-    seen = take(taken, pane.machine, T_camera_base, pane.T_base_platform[None])
+    seen = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
     judged, reasons = _judged(viewed, look)
-    curves, away = _off(pane, T_camera_base, seen.edges)
+    curves, away = _off(pane, seen.edges)
     for n, curve in enumerate(curves):
         place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
         shift = number(float(away[n]), 2, signed=True)
@@ -89,10 +88,10 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         drawn = polyline(place[0], curve, quiet, tip)
         if drawn:
             out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
-    missed = _missed(pane, T_camera_base, seen.edges, seen.rejected, reasons)
+    missed = _missed(pane, seen.edges, seen.rejected, reasons)
     out["missed"] = missed
     out["median"] = float(np.median(np.abs(away))) if len(away) else None
-    out["told"] += _words(pane, T_camera_base, look, len(curves), len(missed), out["median"])
+    out["told"] += _words(pane, look, len(curves), len(missed), out["median"])
 
 
 def _judged(
@@ -121,14 +120,15 @@ def _judged(
     return judged, reasons
 
 
-def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array]:
+def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
     """Measured edges as curves (n, CURVE, 2) px, and how far outward (n,) px of the machine's own
     they lie in the middle.
     """
     if not len(edges):
         return np.zeros((0, CURVE, 2)), np.zeros(0)
     machine, one = pane.machine, np.zeros(len(edges), dtype=int)
-    axes = legs_in_camera(machine, T_camera_base, pane.T_base_platform[None], pane.joints[None])
+    pose, joints = pane.T_base_platform[None], pane.joints[None]
+    axes = legs_in_camera(machine, pane.T_camera_base, pose, joints)
     measured, drawn = (
         measured_curves(machine, pane.camera, axes, one, part)
         for part in (edges, own_edges(machine, axes, one, edges))
@@ -144,7 +144,6 @@ def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array
 
 def _missed(
     pane: Pane,
-    T_camera_base: Array,
     edges: EdgeSet,
     rejected: tuple[Rejection, ...],
     reasons: dict[tuple[int, int, int], str],
@@ -153,8 +152,7 @@ def _missed(
     those of which a part would be in the picture.
     """
     tubes = tubes_of(pane.machine)
-    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
-    pixel = edge_points(pane.machine, pane.camera, axes, tubes, CURVE).pixel
+    pixel = _contours(pane, CURVE).pixel
     seen = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
     now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
     out: list[dict[str, Any]] = []
@@ -172,13 +170,14 @@ def _missed(
     return out
 
 
+def _contours(pane: Pane, samples: int) -> EdgePoints:
+    """Points of the machine's own edges."""
+    legs = legs_in_camera(pane.machine, pane.T_camera_base, pane.T_base_platform, pane.joints)
+    return edge_points(pane.machine, pane.camera, legs, tubes_of(pane.machine), samples)
+
+
 def _words(
-    pane: Pane,
-    T_camera_base: Array,
-    look: LookRequest,
-    seen: int,
-    missed: int,
-    median: float | None,
+    pane: Pane, look: LookRequest, seen: int, missed: int, median: float | None
 ) -> list[str]:
     """How well the machine lies on what is seen."""
     if seen + missed == 0:
@@ -188,9 +187,8 @@ def _words(
         return [f"It does not fit: {said}."]
     if look.shown == "calibration":
         return [f"{said}; the middle one lies {number(median, 2)} px from the calibrated machine."]
-    tubes, tolerance = tubes_of(pane.machine), pane.machine.document.tolerance.center
-    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
-    gain = edge_points(pane.machine, pane.camera, axes, tubes, 3).gain
+    tolerance = pane.machine.document.tolerance.center
+    gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
     near = median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     # other things' edges lie near by chance, too, though not most of them

@@ -46,7 +46,7 @@ class PoseFile:
                     next_step="Nothing was written. Start pkmcal view again, and put the machine"
                     " there once more",
                 )
-            entry = {name: list(part) for name, part in vars(place_of(T_camera_base)).items()}
+            entry = place_of(T_camera_base)
             changed = with_numbers(now.decode("utf-8"), FILE, keys, entry).encode("utf-8")
             if changed != now:
                 write_bytes(self._path, changed)

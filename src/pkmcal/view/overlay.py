@@ -5,21 +5,18 @@ Here and in the modules beside, what the first picture can do without is importe
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
-from pkmcal.session.schema import Vector
+from pkmcal.pages.drawn import CURVE, Drawn, laid_over, polyline
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of
 from pkmcal.view.viewed import Pane, Viewed
-
-if TYPE_CHECKING:
-    from pkmcal.simulation.placement import StationPlace
 
 DIGITS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
@@ -33,12 +30,11 @@ def pane_of(viewed: Viewed, look: LookRequest) -> Pane:
 
 def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose after the gesture, and what it lays over the photograph, in pixels."""
-    pane = pane_of(viewed, look)
-    T_camera_base = moved(viewed, pane, look)
+    pane = placed(viewed, look)
     edges, spots = laid_over(
-        pane.machine, pane.camera, T_camera_base, pane.joints, pane.T_base_platform
+        pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
     )
-    lines = [*edges, *_bare_limbs(pane, T_camera_base)]
+    lines = [*edges, *_bare_limbs(pane)]
     legs = sorted({edge.leg for edge in lines})
     paths = [
         {
@@ -59,30 +55,18 @@ def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
         for s in spots
     ]
     return {
-        "pose": T_camera_base,
-        "place": vars(place_of(T_camera_base)),
+        "pose": pane.T_camera_base,
+        "place": place_of(pane.T_camera_base),
         "legs": paths,
         "joints": joints,
     }
 
 
-def start_of(pane: Pane) -> Array:
-    """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it: before
-    the machine, far enough to have all of it in the picture.
-    """
-    if pane.T_camera_base is not None:
-        return pane.T_camera_base
-    from pkmcal.simulation.placement import default_stations
-
-    rng = np.random.default_rng(0)
-    return default_stations(pane.machine, (pane.camera,), rng)[0].T_camera_base()
-
-
-def moved(viewed: Viewed, pane: Pane, look: LookRequest) -> Array:
-    """T_camera_base (4, 4) after what the hand did."""
-    T_camera_base = pose_of(look)
+def placed(viewed: Viewed, look: LookRequest) -> Pane:
+    """The same, before the camera as the hand put it there."""
+    pane, T_camera_base = pane_of(viewed, look), pose_of(look)
     if T_camera_base is None:
-        T_camera_base = start_of(pane)
+        T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
     if look.pins:
         pins = np.stack([_joint(viewed, look, k) for k in range(len(look.pins))])
@@ -100,19 +84,14 @@ def moved(viewed: Viewed, pane: Pane, look: LookRequest) -> Array:
             case "distance":
                 factor = float(look.gesture.factor)
                 T_camera_base = farther(camera, T_camera_base, points, start, factor)
-    return T_camera_base
+    return replace(pane, T_camera_base=T_camera_base)
 
 
-def place_of(T_camera_base: Array) -> StationPlace:
+def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """A pose as session.yaml has it, with as many digits as are written there."""
     from pkmcal.simulation.placement import StationPlace
 
-    def rounded(part: Vector) -> Vector:
-        x, y, z = (round(value, DIGITS) + 0.0 for value in part)  # never -0.0
-        return x, y, z
-
-    place = StationPlace.of(T_camera_base)
-    return StationPlace(rounded(place.position), rounded(place.look_at), rounded(place.up))
+    return StationPlace.of(T_camera_base).rounded(DIGITS)
 
 
 def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
@@ -125,18 +104,15 @@ def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
     return points[pin.leg - 1]
 
 
-def _bare_limbs(pane: Pane, T_camera_base: Array) -> list[Drawn]:
+def _bare_limbs(pane: Pane) -> list[Drawn]:
     """Axes of the legs that show no tube."""
     bare = [j for j, leg in enumerate(pane.machine.document.legs) if not leg.tubes]
     if not bare:
         return []
     a, b = (part[bare, None] for part in pane.points)
     pixel = pane.camera.project(
-        apply(T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
+        apply(pane.T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
     )
-    out: list[Drawn] = []
-    for j, curve in zip(bare, pixel, strict=True):
-        if np.isfinite(curve).all():
-            line = straightened(curve)
-            out.append(Drawn(j + 1, tuple((float(x), float(y)) for x, y in line), True, ""))
-    return out
+    whole = [(j, curve) for j, curve in zip(bare, pixel, strict=True) if np.isfinite(curve).all()]
+    lines = (polyline(j, curve, True, "") for j, curve in whole)
+    return [line for line in lines if line]

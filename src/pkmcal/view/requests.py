@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -50,14 +51,15 @@ class LookRequest(Schema):
     anywhere: bool = False
 
 
-Model = TypeVar("Model", bound=Schema)
-
-
-def checked(data: Any, model: type[Model]) -> Model:
+def checked(body: bytes) -> LookRequest:
     """A request of the page. Raises InputError for anything else."""
+    try:
+        data = json.loads(body)
+    except ValueError:
+        raise InputError("the request is not valid JSON", where="the page") from None
     if not isinstance(data, dict):
         raise InputError("the request is no JSON object", where="the page")
-    return validate(Document(Path("the page"), "the page", data, {}), model)
+    return validate(Document(Path("the page"), "the page", data, {}), LookRequest)
 
 
 def pose_of(look: LookRequest) -> Array | None:

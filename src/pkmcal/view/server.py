@@ -12,7 +12,7 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import plain
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
-from pkmcal.view.overlay import moved, overlay, pane_of
+from pkmcal.view.overlay import overlay, placed
 from pkmcal.view.requests import LookRequest, checked
 from pkmcal.view.viewed import Viewed
 
@@ -72,17 +72,14 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return fitted(viewed, look)
 
     def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        pose = moved(viewed, pane_of(viewed, look), look)
+        pose = placed(viewed, look).T_camera_base
         return {"said": kept.write(viewed.station(look.station), pose)}
 
     def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
-            def work() -> dict[str, Any]:
-                return answer(viewed, checked(_json(body), LookRequest))
-
-            return await _answered(work)
+            return await _answered(lambda: answer(viewed, checked(body)))
 
         return endpoint
 
@@ -97,7 +94,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return Response(_template("view.js"), media_type="text/javascript")
 
     async def style(_request: Request) -> Response:
-        report = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+        report = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
         return Response(report + _template("view.css"), media_type="text/css")
 
     routes = [
@@ -153,7 +150,7 @@ def serve(app: Guard, found: socket.socket) -> None:
 
 def page_html(viewed: Viewed) -> str:
     """The page itself; photographs and overlays are asked for by it."""
-    from pkmcal.report.page import environment
+    from pkmcal.pages.page import environment
 
     session = viewed.session
     stations = [
@@ -183,12 +180,3 @@ def page_html(viewed: Viewed) -> str:
 
 def _template(name: str) -> str:
     return (resources.files("pkmcal.view") / "templates" / name).read_text("utf-8")
-
-
-def _json(body: bytes) -> Any:
-    import json
-
-    try:
-        return json.loads(body)
-    except ValueError:
-        raise InputError("the request is not valid JSON", where="the page") from None

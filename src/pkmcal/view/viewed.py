@@ -6,7 +6,7 @@ Nothing is read or worked out of a photograph before somebody looks at it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,15 +37,14 @@ QUALITY = 88
 class Pane:
     """A machine before a camera: what is laid over one photograph.
 
-    joints : (m,) readings. T_base_platform : (4, 4). T_camera_base : (4, 4) where the camera stands
-    as far as files tell, None where they do not.
+    joints : (m,) readings. T_base_platform, T_camera_base : (4, 4).
     """
 
     machine: Machine
     camera: Camera
     joints: Array
     T_base_platform: Array
-    T_camera_base: Array | None
+    T_camera_base: Array
 
     @property
     def points(self) -> Array:
@@ -66,6 +65,7 @@ class Viewed:
         self.calibration = calibration
         self.image = lru_cache(KEPT)(self._image)
         self.corners = lru_cache(KEPT)(self._corners)
+        self.start = cache(self._start)
         self.views: dict[int, StationView] = {}
 
     def station(self, s: int) -> Station:
@@ -88,7 +88,7 @@ class Viewed:
 
     def jpeg(self, s: int, k: int) -> bytes:
         """A photograph at a size for the screen."""
-        from pkmcal.report.jpegs import coded, narrowed
+        from pkmcal.pages.jpegs import coded, narrowed
 
         return coded(narrowed(self.image(s, k), WIDEST), QUALITY)
 
@@ -96,8 +96,19 @@ class Viewed:
         """The drawing's machine before a station's camera."""
         row, station = self.photograph(s, k).configuration, self.station(s)
         machine, joints = self.session.machine, self.session.joints[row]
-        pose = self.poses[row]
-        return Pane(machine, station.camera, joints, pose, station.T_camera_base)
+        there = station.T_camera_base
+        there = self.start(s) if there is None else there
+        return Pane(machine, station.camera, joints, self.poses[row], there)
+
+    def _start(self, s: int) -> Array:
+        """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it:
+        before the machine, far enough to have all of it in the picture.
+        """
+        from pkmcal.simulation.placement import default_stations
+
+        machine, camera = self.session.machine, self.station(s).camera
+        (place,) = default_stations(machine, (camera,), np.random.default_rng(0))
+        return place.T_camera_base()
 
     @cached_property
     def poses(self) -> Array:

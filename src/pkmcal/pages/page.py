@@ -69,7 +69,7 @@ def environment() -> jinja2.Environment:
             remember(f"template-{bucket.key}", bucket.bytecode_to_string())
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pkmcal.report"),
+        loader=jinja2.PackageLoader("pkmcal.pages"),
         bytecode_cache=Compiled(),
         autoescape=True,
         undefined=jinja2.StrictUndefined,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.report import page
+from pkmcal.pages import page
 from pkmcal.wording import count, number
 
 if TYPE_CHECKING:

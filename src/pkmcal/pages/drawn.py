@@ -35,6 +35,8 @@ FINE = 65
 """Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
 NUMBER = 0.04
 """Width of a leg's number with its joint, in picture widths."""
+KEPT = 0.5
+"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,45 @@ class Spot:
         return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
 
 
+@dataclass(frozen=True)
+class Arrow:
+    """From a place in a picture, px, as far as it is drawn: from a board's corner, where it was
+    found, to where it is expected, or a cell's mean residual. lead : a link to what it is of.
+    """
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+    quiet: bool = False
+    tip: str = ""
+    lead: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
+    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
+    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
+    the page.
+    """
+
+    station: str
+    configuration: str
+    width: int
+    height: int
+    jpeg: str
+    edges: tuple[Drawn, ...] = ()
+    spots: tuple[Spot, ...] = ()
+    why: str = ""
+    caption: str = ""
+    kind: str = "measured"
+    anchor: str = ""
+    large: str = ""
+    missed: tuple[Drawn, ...] = ()
+    corners: tuple[Arrow, ...] = ()
+
+
 def laid_over(
     machine: Machine,
     camera: Camera,
@@ -102,10 +143,9 @@ def laid_over(
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
     edges: list[Drawn] = []
     for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
-        leg, tip = int(tubes.leg[e]) + 1, f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        for start, stop in _runs(seen):
-            line = straightened(curve[start:stop])
-            edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
+        leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
+        lines = (polyline(leg, curve[start:stop], False, tip) for start, stop in _runs(seen))
+        edges += [line for line in lines if line]
     ends = machine.ends_at(joints, T_base_platform)
     both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
     return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])

@@ -1,0 +1,1 @@
+"""What pages are made of: the page of all commands, charts, plots, photographs drawn over."""

@@ -1,0 +1,25 @@
+"""Files spoilt in one place, and the sentence that is told of it."""
+
+import pytest
+
+from pkmcal.errors import InputError
+
+
+def written(path, content):
+    """A file with this content, text or bytes; returns its path."""
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def replaced(path, old, new, count=-1):
+    """A file with a part of its text replaced, which has to be there."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def fault(function, *arguments, **keywords):
+    """The message of the InputError that a call raises."""
+    with pytest.raises(InputError) as caught:
+        function(*arguments, **keywords)
+    return str(caught.value)
