@@ -155,7 +155,7 @@ def information_of(
 
     work : T_base_platform (M, 4, 4) where the tool counts. known : what an earlier calibration
     knows of the machine, in place of its drawing. rng : as for
-    :meth:`~pkmcal.planning.rig.Instrument.measure`. wanted : how many of each group are to be
+    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : how many of each group are to be
     measured in the end, all by default: edges that are shaded alike count together. Raises
     InputError where a group of stations measures nothing at any configuration.
     """

@@ -18,7 +18,8 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse, look_at, perturb, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
-from pkmcal.mechanisms.kinematics import on_manifold, singularity
+from pkmcal.mechanisms.kinematics import on_manifold, scaled_rows, singularity_of
+from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
 from pkmcal.simulation.drives import drives_of, reaches
@@ -109,16 +110,15 @@ def draw_configurations(
 def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     """(n,) True where closed, in the home's assembly, not tilted far, legs clear of each other."""
     layout, values, home = machine.layout, machine.values, machine.home()
-    at_home = closure(layout, values, machine.inverse(home[None])[0], home)
     c = closure(layout, values, joints, T_base_platform)
-    jac, home_jac = (x.rows.by_pose @ layout.motion for x in (c, at_home))
+    at_home = closure(layout, values, machine.inverse(home[None])[0], home)
+    rows, home_rows = scaled_rows(c), scaled_rows(at_home)
     good = np.abs(c.rows.value).max(axis=-1) < 1e-9
     # a machine that is weak at home is weak everywhere; it is not refused for that
-    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.rows.by_pose)))
-    good &= singularity(layout, values, c.rows.by_pose) > least
-    if jac.shape[-1] == jac.shape[-2]:
-        with np.errstate(invalid="ignore"):  # where there is no Jacobian, nothing is usable
-            good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
+    good &= singularity_of(layout, rows) > min(
+        LEAST_SINGULAR, 0.4 * float(singularity_of(layout, home_rows))
+    )
+    good &= sign_of(rows) == sign_of(home_rows)
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
     good &= unfolded(machine, T_base_platform)
     return good & _legs_apart(machine, T_base_platform, joints)
