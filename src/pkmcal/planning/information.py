@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.saved import Known
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
@@ -41,17 +42,6 @@ PLACE = 1.0
 measurement, so that every choice has a covariance. A photograph tells a thousand times more."""
 FLOOR = 1e-12
 """Variance, in tolerances squared, of what a calibration holds exactly: an axis' own length."""
-
-
-@dataclass(frozen=True)
-class Known:
-    """What an earlier calibration knows. covariance : (P + 6 S', P + 6 S') of the machine's
-    parameters and of T_camera_base (left perturbation) of the ``stations`` (S') that stand where
-    they stood; all others have to be found anew.
-    """
-
-    covariance: Array
-    stations: Integers
 
 
 @dataclass(frozen=True)
@@ -226,7 +216,7 @@ def _told_by(
     tolerance's variance: they move the kept stations with the machine, and no measurement minds.
     """
     u, n = problem.unknowns, len(machine.values)
-    kept = known.stations
+    kept = np.array(known.stations, dtype=int)
     to_free = np.zeros((u.n_free + 6 * len(kept), n + 6 * len(kept)))
     to_free[: u.n_free, :n] = problem.to_free
     to_free[u.n_free :, n:] = np.eye(6 * len(kept))

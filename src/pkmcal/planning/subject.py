@@ -18,7 +18,7 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.saved import Known, SavedCalibration
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse
@@ -27,7 +27,6 @@ from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import Pools, first_edges, spread_over
-from pkmcal.planning.information import Known
 from pkmcal.planning.rig import (
     CORNER,
     EDGE,
@@ -206,7 +205,10 @@ def of_session(
         found.T_mount,
         found.shading,
     )
-    known = None if saved is None else _known(saved, session, same_place)
+    known = None
+    if saved is not None:
+        kept = [name for name in session.station_names if same_place and name in saved.placed]
+        known = saved.known(kept, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = found.board.document if found.board else None
@@ -415,12 +417,3 @@ def _board_place(
         return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
     except GeometryError as error:
         raise error.as_input("session.yaml, stations") from None
-
-
-def _known(saved: SavedCalibration, session: Session, same_place: bool) -> Known:
-    """What a calibration knows: of the machine, and of the stations that stand as they stood."""
-    if not same_place:
-        return Known(saved.covariance, np.zeros(0, dtype=int))
-    kept = [k for k, name in enumerate(session.station_names) if name in saved.placed]
-    names = [session.station_names[k] for k in kept]
-    return Known(saved.with_stations(names), np.array(kept, dtype=int))
