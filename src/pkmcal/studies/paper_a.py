@@ -34,7 +34,7 @@ from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, wi
 from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
-from pkmcal.papers.four_step import Form, FourSteps, solve
+from pkmcal.papers.four_step import Form, parameters_of, solve
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.studies.calibrations import ESTIMATE, judged
 from pkmcal.studies.calibrations import QUANTITIES as CALIBRATED
@@ -346,15 +346,6 @@ def measured_axes(data: SimulatedRuns) -> Axes:
     full_u, full_point = np.zeros((2, n_runs, n_photos, n_legs, 3))
     full_u[:, k, legs], full_point[:, k, legs] = u, point
     return Axes(station, np.arange(n_photos), seen, full_u, full_point, data.joints)
-
-
-def parameters_of(machine: Machine, steps: FourSteps) -> Array:
-    """All parameters (B, P) with those that the steps found."""
-    base, platform = centre_index(machine.layout)
-    theta = np.tile(machine.parameters.drawing, (len(steps.base), 1))
-    theta[:, base], theta[:, platform] = steps.base, steps.platform
-    theta[:, machine.layout.rod] = steps.offsets
-    return theta
 
 
 class Start(NamedTuple):
