@@ -76,7 +76,7 @@ EFFECTOR = ("displacement", "orientation", "displacement_registered", "orientati
 """Mean error of the end-effector at random poses, [A] eq. 20, in frames by the centres 1, 3 and 5;
 then with frames registered on all centres, so that the error of the frames' own definition by three
 joints is left out."""
-QUANTITIES = {
+QUANTITIES: Mapping[str, Quantity] = {
     **{name: Quantity("rms", 1e3, "mm") for name in (*GROUPS, "parameters")},
     **{
         name: Quantity("mean", *((1e3, "mm") if "displacement" in name else (DEGREE, "°")))
@@ -212,30 +212,18 @@ def _sample(
 
 
 @dataclass(frozen=True)
-class JointByAxes:
-    """The joint estimate from the corrected four steps. axes : [A] 4.3."""
-
-    axes: HexapodByAxes = field(default_factory=HexapodByAxes)
+class JointByAxes(HexapodByAxes):
+    """The joint estimate of the same machines from the corrected four steps, judged as all
+    simulated calibrations are.
+    """
 
     doing = "Joint calibrations of [A] 4.3"
-
-    @property
-    def quantities(self) -> Mapping[str, Quantity]:
-        """As of all simulated calibrations."""
-        return CALIBRATED
+    quantities = CALIBRATED
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """Names and units of the thirty parameters."""
         return tuple((name, "m") for name in thirty(study_machine()).names)
-
-    def populations(self, runs: int) -> list[Population]:
-        """As of all methods."""
-        return self.axes.populations(runs)
-
-    def draw(self, batch: Batch) -> SimulatedRuns:
-        """As for all methods."""
-        return self.axes.draw(batch)
 
     def solve(
         self,
