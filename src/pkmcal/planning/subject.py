@@ -193,44 +193,18 @@ def of_session(
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
-    found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
-    rig = Rig(
-        session.machine,
-        session.station_names,
-        T_camera_base,
-        session.camera_of_station,
-        session.joint_noise,
-        found.instruments,
-        found.mounts,
-        found.T_mount,
-        found.shading,
-    )
+    rig, board, told = _rig(session, saved, seen, T_camera_base, edge, corner, seed)
     known = None
     if saved is not None:
         kept = [name for name in session.station_names if same_place and name in saved.placed]
         known = saved.known(kept, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
-    fields = found.board.document if found.board else None
-    return Subject(rig, known, columns, names, (*words, *found.words), fields)
+    fields = board.document if board else None
+    return Subject(rig, known, columns, names, (*words, *told), fields)
 
 
-class _Instruments(NamedTuple):
-    """What a session's stations and trackers measure with.
-
-    T_mount : (M, 4, 4) of what is measured on the platform. shading : of a leg's edges, in a
-    station. board : on the platform. words : where the noise is known from.
-    """
-
-    instruments: tuple[Instrument, ...]
-    mounts: tuple[Mount, ...]
-    T_mount: Array
-    shading: float
-    board: Board | None
-    words: tuple[str, ...]
-
-
-def _instruments(
+def _rig(
     session: Session,
     saved: SavedCalibration | None,
     seen: _Photographed,
@@ -238,8 +212,10 @@ def _instruments(
     edge: float,
     corner: float,
     seed: int,
-) -> _Instruments:
-    """As :func:`of_session`; T_camera_base : (S, 4, 4) of stations and trackers."""
+) -> tuple[Rig, Board | None, list[str]]:
+    """What a session's stations and trackers measure with, the board on the platform, and where the
+    noise is known from, in words. As :func:`of_session`; T_camera_base : (S, 4, 4).
+    """
     words: list[str] = []
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
@@ -272,8 +248,18 @@ def _instruments(
         T_mount.append(np.eye(4) if place is None else place)
         target = TargetFrom(s, T_camera_base[s], T_mount[-1], table.whiten, len(mounts) - 1)
         instruments.append(target)
-    poses = np.array(T_mount).reshape(-1, 4, 4)
-    return _Instruments(tuple(instruments), tuple(mounts), poses, shading, board, tuple(words))
+    rig = Rig(
+        session.machine,
+        session.station_names,
+        T_camera_base,
+        session.camera_of_station,
+        session.joint_noise,
+        tuple(instruments),
+        tuple(mounts),
+        np.array(T_mount).reshape(-1, 4, 4),
+        shading,
+    )
+    return rig, board, words
 
 
 def _one_camera(session: Session) -> Session:
