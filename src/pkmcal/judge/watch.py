@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -77,10 +78,8 @@ class Watch:
                 "pkmcal_watch": FORMAT,
                 "verdict": asdict(self.verdict),
                 **self.judged.document(self.calibration.machine),
-                "configurations": [n for n, flag in zip(names, self.seen, strict=True) if flag],
-                "known_configurations": [
-                    n for n, flag in zip(names, self.known, strict=True) if flag
-                ],
+                "configurations": [*compress(names, self.seen)],
+                "known_configurations": [*compress(names, self.known)],
                 "noise_scale": self.noise_scale,
                 "pose_scale": self.pose_scale,
                 "same_place": self.same_place,
