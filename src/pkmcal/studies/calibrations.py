@@ -250,7 +250,7 @@ def tool_difference(
     the standard deviations that the calibration states of that: (W, 6) each, (omega, tau).
 
     theta (P,), covariance (P, P) : of the result. joints (W, m). Frames of the truth are laid over
-    the result's as :func:`pkmcal.identify.tool.tool_point` has it; every : as where no legs were
+    the result's as :func:`pkmcal.identify.tool.tool_error` has it; every : as where no legs were
     seen. NaN where a machine cannot take the readings.
     """
     n = len(theta)
