@@ -12,7 +12,7 @@ so that no frame is favoured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -106,11 +106,6 @@ class CandidateRows:
     known: Array
     machine: Array
     work: Array
-
-    def only(self, chosen: Integers) -> CandidateRows:
-        """Of some candidates."""
-        parts = self.rows[chosen], self.group[chosen], self.where[chosen]
-        return replace(self, rows=parts[0], group=parts[1], where=parts[2])
 
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
         """(na, na) information of a choice of candidates, each measured ``times`` over."""
