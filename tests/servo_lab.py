@@ -9,8 +9,8 @@ from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
-from pkmcal.simulation.scene import Finish, Room, discs_of, machine_parts
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render
+from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Wall
 from pkmcal.simulation.surfaces import Clouds, Lamp, Lighting, Material, SmoothNoise
 
@@ -33,7 +33,7 @@ class Lab:
         self.discs, self.finish = discs_of(machine), Finish.from_noise(noise)
         floor = Wall(self.discs.base - 0.6 * UP, UP)
         place = np.array([0.8, -1.0, 2.5])
-        self.room = Room(
+        self.room = Scene(
             (ScenePart(floor, Material(0.2, Clouds(noise, 0.05, 0.3)), False),),
             Lighting((Lamp(place, 0.1, 1.6, 2.5, shadows=False),), sky=0.5, ground=0.35),
         )
@@ -41,7 +41,7 @@ class Lab:
 
     def photograph(self, T_base_platform, readings):
         parts = machine_parts(self.machine, self.discs, self.finish, T_base_platform, readings)
-        light = render(self.room.with_machine(parts), self.view, self.T_camera_base, self.rng)
+        light = render(self.room.having(parts), self.view, self.T_camera_base, self.rng)
         return photograph(light, Sensor(), self.rng)
 
     def painted(self, image, T_base_platform, readings, legs):

@@ -15,7 +15,7 @@ from pkmcal.files import parse_yaml, validate
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.mechanisms.carriers.bars import Bar, HingedBar
-from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import base_carriers, by_pose, platform_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.carriers.slider import Slider
 
@@ -62,7 +62,7 @@ def test_a_crank_is_the_papers():
     )
     out = np.stack([np.cos(alpha), np.sin(alpha), zero], axis=-1)
     expected = (0.14 + 0.26 * np.cos(q + angle)) * out - [0, 0, 0.26 * np.sin(q + angle)]
-    found = Crank.point(parameters, np.full(3, q)).value
+    found = Crank.place(parameters, np.full(3, q))[0]
     np.testing.assert_allclose(found, expected, atol=1e-16)
 
 
@@ -75,15 +75,15 @@ def test_a_crank_is_model_31s():
         parameters = np.array([0, 0, 0, *turn[:, 2], 1, 0, 0, 0, np.nan, np.nan, np.nan])
         # v x z is Rz(psi) x for sin(beta) < 0
         expected = turn @ [np.cos(q), np.sin(q), 0]
-        np.testing.assert_allclose(Crank.point(parameters, np.array(q)).value, expected, atol=1e-15)
+        np.testing.assert_allclose(Crank.place(parameters, np.array(q))[0], expected, atol=1e-15)
 
 
 def test_a_cranks_derivatives_without_a_zero_direction():
     parameters, q = crank(1, zero=False), np.linspace(-1, 1, 5)
-    at = Crank.point(parameters, q)
-    oracle = differences(lambda d: Crank.point(parameters + np.append(d, np.zeros(3)), q).value, 10)
-    np.testing.assert_allclose(at.by_parameters[..., :10], oracle, atol=1e-10)
-    np.testing.assert_array_equal(at.by_parameters[..., 10:], 0.0)
+    by = Crank.by_parameters(parameters, q)
+    oracle = differences(lambda d: Crank.place(parameters + np.append(d, np.zeros(3)), q)[0], 10)
+    np.testing.assert_allclose(by[..., :10], oracle, atol=1e-10)
+    np.testing.assert_array_equal(by[..., 10:], 0.0)
 
 
 @pytest.mark.parametrize("zero", [True, False])
@@ -93,7 +93,7 @@ def test_readings_of_a_crank(zero):
     parameters[:, 6] = np.abs(parameters[:, 6]) + 0.1
     rng = np.random.default_rng(3)
     q, b = rng.uniform(-3, 3, 200), rng.normal(size=(200, 3))
-    length = np.linalg.norm(b - Crank.point(parameters, q).value, axis=1)
+    length = np.linalg.norm(b - Crank.place(parameters, q)[0], axis=1)
     found = Crank.reading(parameters, b, length, q)
     # a rod square to its arm's motion hides the reading: a rounding e of lengths, root of e
     np.testing.assert_allclose(found, q, atol=1e-6)
@@ -101,7 +101,7 @@ def test_readings_of_a_crank(zero):
     # both solutions, wherever one looks from
     for near in np.linspace(-3, 3, 7):
         other = Crank.reading(parameters, b, length, np.full(200, near))
-        away = np.linalg.norm(b - Crank.point(parameters, other).value, axis=1)
+        away = np.linalg.norm(b - Crank.place(parameters, other)[0], axis=1)
         np.testing.assert_allclose(away, length, atol=1e-12)
         assert np.abs(other - near).max() <= np.pi
     assert np.isnan(Crank.reading(parameters, b, length + 50, q)).all()
@@ -113,10 +113,10 @@ def test_readings_of_a_crank(zero):
 def test_readings_of_a_slider():
     rng = np.random.default_rng(4)
     parameters, q, b = rng.normal(size=(100, 6)), rng.normal(size=100), rng.normal(size=(100, 3))
-    length = np.linalg.norm(b - Slider.point(parameters, q).value, axis=1)
+    length = np.linalg.norm(b - Slider.place(parameters, q)[0], axis=1)
     for near in (q, np.full(100, -9.0), np.full(100, 9.0)):
         found = Slider.reading(parameters, b, length, near)
-        away = np.linalg.norm(b - Slider.point(parameters, found).value, axis=1)
+        away = np.linalg.norm(b - Slider.place(parameters, found)[0], axis=1)
         np.testing.assert_allclose(away, length, atol=1e-12)
     np.testing.assert_allclose(Slider.reading(parameters, b, length, q), q, atol=1e-6)
     assert np.isnan(Slider.reading(parameters, b + 9, length * 0, q)).all()
@@ -129,7 +129,7 @@ def test_a_bar_keeps_its_direction():
     """Errata: A_i = (X + s h cos theta, Y + s h sin theta + t d, Z)."""
     x, y, z, theta, h, d = 0.02, -0.03, -0.4, 0.3, 0.06, 0.05
     T = perturb(np.eye(4), np.array([0, 0, theta, x, y, z]))
-    found = Bar.point(np.array([0, -d, 0, -h, 0, 0]), T).value
+    found = Bar.place(np.array([0, -d, 0, -h, 0, 0]), T)[0]
     expected = [x - h * np.cos(theta), y - h * np.sin(theta) - d, z]
     np.testing.assert_allclose(found, expected, atol=1e-16)
 
@@ -138,25 +138,24 @@ def test_a_hinged_bar_turned_back_is_a_bar():
     """By minus the platform's turn, the hinged bar stands as one that keeps its direction."""
     T = perturb(np.eye(4), np.array([0, 0, 0.3, 0.02, -0.03, -0.4]))
     center, hinge = np.array([0.01, -0.05, 0.02]), np.array([-0.06, 0.01, 0.0])
-    turned = HingedBar.point(np.concatenate([center, hinge, [0, 0, 2.0]]), T, np.array(-0.3))
-    plain = Bar.point(np.concatenate([center, hinge]), T)
-    np.testing.assert_allclose(turned.value, plain.value, atol=1e-16)
+    turned = HingedBar.place(np.concatenate([center, hinge, [0, 0, 2.0]]), T, np.array(-0.3))[0]
+    plain = Bar.place(np.concatenate([center, hinge]), T)[0]
+    np.testing.assert_allclose(turned, plain, atol=1e-16)
 
 
 def test_a_hinged_bars_derivatives_where_it_is_turned():
     rng = np.random.default_rng(5)
     parameters, phi = rng.normal(size=(4, 9)), rng.normal(size=4)
     T = perturb(np.eye(4), rng.normal(size=(4, 6)))
-    at = HingedBar.point(parameters, T, phi)
     found = (
-        at.by_parameters,
-        at.by_motion,
+        HingedBar.by_parameters(parameters, T, phi),
+        by_pose(HingedBar.place(parameters, T, phi)[1]),
         HingedBar.by_internal(parameters, T, phi)[..., None],
     )
     oracles = (
-        differences(lambda d: HingedBar.point(parameters + d, T, phi).value, 9),
-        differences(lambda d: HingedBar.point(parameters, perturb(T, d), phi).value, 6),
-        differences(lambda d: HingedBar.point(parameters, T, phi + d).value, 1),
+        differences(lambda d: HingedBar.place(parameters + d, T, phi)[0], 9),
+        differences(lambda d: HingedBar.place(parameters, perturb(T, d), phi)[0], 6),
+        differences(lambda d: HingedBar.place(parameters, T, phi + d)[0], 1),
     )
     for got, oracle in zip(found, oracles, strict=True):
         np.testing.assert_allclose(got, oracle, atol=1e-10)
@@ -166,8 +165,8 @@ def test_where_a_hinge_begins_changes_no_point():
     rng = np.random.default_rng(6)
     parameters, phi, shift, turn = (rng.normal(size=s) for s in ((4, 9), 4, 4, 4))
     T = perturb(np.eye(4), rng.normal(size=(4, 6)))
-    before = HingedBar.point(parameters, T, phi).value
-    after = HingedBar.point(HingedBar.slid(parameters, shift, turn), T, phi - turn).value
+    before = HingedBar.place(parameters, T, phi)[0]
+    after = HingedBar.place(HingedBar.slid(parameters, shift, turn), T, phi - turn)[0]
     np.testing.assert_allclose(after, before, atol=1e-14)
     oracle = differences(
         lambda d: HingedBar.slid(parameters, np.full(4, d[0]), np.full(4, d[1])), 2
@@ -194,8 +193,8 @@ def test_base_points_move_with_the_base_frame(carrier, zero):
     if not zero and carrier is Crank:
         parameters = crank(7, zero=False, n=4)
     e, f = changes(8)
-    after = carrier.point(carrier.moved(parameters, e, f), q).value
-    np.testing.assert_allclose(after, apply(e, carrier.point(parameters, q).value), atol=1e-14)
+    after = carrier.place(carrier.moved(parameters, e, f), q)[0]
+    np.testing.assert_allclose(after, apply(e, carrier.place(parameters, q)[0]), atol=1e-14)
 
 
 @pytest.mark.parametrize("carrier", PLATFORM)
@@ -203,8 +202,8 @@ def test_platform_points_move_with_both_frames(carrier):
     parameters, phi = example(carrier, 9), np.linspace(-1, 1, 4)
     T = perturb(np.eye(4), np.random.default_rng(10).normal(size=(4, 6)))
     e, f = changes(11)
-    after = carrier.point(carrier.moved(parameters, e, f), e @ T @ inverse(f), phi).value
-    np.testing.assert_allclose(after, apply(e, carrier.point(parameters, T, phi).value), atol=1e-14)
+    after = carrier.place(carrier.moved(parameters, e, f), e @ T @ inverse(f), phi)[0]
+    np.testing.assert_allclose(after, apply(e, carrier.place(parameters, T, phi)[0]), atol=1e-14)
 
 
 @pytest.mark.parametrize("carrier", [*BASE, *PLATFORM])

@@ -18,7 +18,7 @@ from pkmcal.mechanisms import (
     machine_from_document,
     mechanism_text,
 )
-from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import base_carriers, by_pose, platform_carriers
 from pkmcal.mechanisms.document import MOTIONS, ActuatedLength, ConstantLength
 
 
@@ -275,24 +275,23 @@ def test_carriers_have_exact_derivatives(side, carrier):
     rng = np.random.default_rng(0)
     parameters = rng.normal(size=(5, len(carrier.parameters)))
     motion = rng.normal(size=(4, 1)) if side == "base" else perturb(np.eye(4), rng.normal(size=6))
-    at = carrier.point(parameters, motion)
-    lead = at.value.shape[:-1]
-    assert at.by_parameters.shape == (*lead, 3, len(carrier.parameters))
+    by_parameters = carrier.by_parameters(parameters, motion)
+    moved = np.broadcast_to(carrier.place(parameters, motion)[1], by_parameters.shape[:-1])
 
     def differences(of, step=1e-3):
         weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-        return sum(w * (of(i * step).value - of(-i * step).value) for i, w in weights) / step
+        return sum(w * (of(i * step)[0] - of(-i * step)[0]) for i, w in weights) / step
 
     for k, by in enumerate(np.eye(parameters.shape[1])):
-        oracle = differences(lambda d, by=by: carrier.point(parameters + d * by, motion))
-        np.testing.assert_allclose(at.by_parameters[..., k], oracle, atol=1e-11)
+        oracle = differences(lambda d, by=by: carrier.place(parameters + d * by, motion))
+        np.testing.assert_allclose(by_parameters[..., k] - oracle, 0.0, atol=1e-11)
     if side == "base":
-        oracle = differences(lambda d: carrier.point(parameters, motion + d))
-        np.testing.assert_allclose(at.by_motion, oracle, atol=1e-11)
+        oracle = differences(lambda d: carrier.place(parameters, motion + d))
+        np.testing.assert_allclose(moved - oracle, 0.0, atol=1e-11)
         return
     for k, by in enumerate(np.eye(6)):
-        oracle = differences(lambda d, by=by: carrier.point(parameters, perturb(motion, d * by)))
-        np.testing.assert_allclose(at.by_motion[..., k], oracle, atol=1e-11)
+        oracle = differences(lambda d, by=by: carrier.place(parameters, perturb(motion, d * by)))
+        np.testing.assert_allclose(by_pose(moved)[..., k], oracle, atol=1e-11)
 
 
 @pytest.mark.parametrize(("side", "carrier"), CARRIERS)
@@ -306,11 +305,14 @@ def test_carriers_broadcast(side, carrier):
         if side == "base"
         else np.stack([perturb(np.eye(4), d) for d in rng.normal(size=(4, 6))])[:, None]
     )
-    batch = carrier.point(parameters, motion)
-    assert batch.value.shape == (2, 4, 3, 3)
+
+    def told(parameters, motion):
+        return (*carrier.place(parameters, motion), carrier.by_parameters(parameters, motion))
+
+    batch = told(parameters, motion)
     spread = np.broadcast_to(motion, (4, 3, *tail))
     for r, k, leg in np.ndindex(2, 4, 3):
-        one = carrier.point(parameters[r, 0, leg], np.asarray(spread[k, leg]))
+        one = told(parameters[r, 0, leg], np.asarray(spread[k, leg]))
         for got, single in zip(batch, one, strict=True):
             full = np.broadcast_to(got, (2, 4, 3, *got.shape[3:]))
             np.testing.assert_allclose(full[r, k, leg], single, atol=1e-15)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import run
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved import Known, load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.identify.bundle import bundle
@@ -23,7 +23,7 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.exchange import INDICES, exchanged, greedy
-from pkmcal.planning.information import CandidateRows, Candidates, Known, information_of
+from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.plan import AT_WORK, plan
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import distances, length, shortest_way
@@ -223,11 +223,11 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
     start = start_state(machine, data, rig.T_station_base)
     estimate = bundle(machine, replace(data, shaded=False), start, scale_noise=False)
     n = len(machine.values)
-    known = Known(estimate.joint_covariance[: n + 12, : n + 12], np.array([0, 1]))
+    known = Known(estimate.joint_covariance[: n + 12, : n + 12], (0, 1), np.zeros((2, 4, 4)))
     later = information_of(bare, Candidates.of_all(groups, joints, poses), work, known)
     in_turn = later.tool(later.covariance(later.of(two)))
     np.testing.assert_allclose(in_turn, direct, rtol=0.02)
-    moved = Known(known.covariance[:n, :n], np.zeros(0, int))
+    moved = known.only(())
     anew = information_of(bare, Candidates.of_all(groups, joints, poses), work, moved)
     assert anew.tool(anew.covariance(anew.of(two)))[0] > in_turn[0]
 

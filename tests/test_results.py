@@ -309,7 +309,11 @@ def test_covariances_of_stations_come_back_with_the_machine(calibrated, tmp_path
     size = np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
     assert np.all(np.abs(saved.joint_covariance - joint) <= 1e-9 * size)
     n, last = len(saved.covariance), len(saved.placed) - 1
-    one = saved.with_stations(saved.placed[-1:])
+    known = saved.known(saved.placed[-1:], saved.placed)
+    one = known.covariance
+    assert known.stations == (last,)
+    there = inverse(known.T_camera_base)[0]
+    np.testing.assert_allclose(there, saved.stations[last].T_base_camera, atol=1e-15)
     rows = np.r_[:n, n + 6 * last : n + 6 * last + 6]
     assert np.array_equal(one, saved.joint_covariance[np.ix_(rows, rows)])
     # the station is not independent of the machine that was found with it
@@ -320,7 +324,7 @@ def test_covariances_of_stations_come_back_with_the_machine(calibrated, tmp_path
     )
     assert np.allclose(found[3:], saved.stations[last].sigma_translation, rtol=1e-9)
     with pytest.raises(InputError, match=r"stood is not known .* found attic"):
-        saved.with_stations(["attic"])
+        saved.known(["attic"], ["attic"])
 
 
 def test_a_file_without_the_stations_covariance_still_loads(folder):
@@ -331,7 +335,7 @@ def test_a_file_without_the_stations_covariance_still_loads(folder):
     assert saved.placed == ()
     assert np.array_equal(saved.joint_covariance, saved.covariance)
     with pytest.raises(InputError, match="Calibrate once more"):
-        saved.with_stations([saved.stations[0].name])
+        saved.known([saved.stations[0].name], [saved.stations[0].name])
 
 
 def test_a_covariance_of_stations_that_is_none(folder):

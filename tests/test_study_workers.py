@@ -134,7 +134,7 @@ def test_workers_that_die_are_replaced(monkeypatch):
         if len(done) == 50:
             begun[0].kill()
 
-    setting = JointByAxes(replace(JointByAxes().axes, poses=4, batch=2))
+    setting = JointByAxes(poses=4, batch=2)
     # long enough for the one in its place to begin, too
     many = engine.run(Counting(takes=0.04), 750, 1, told)
     assert len(done) == 150

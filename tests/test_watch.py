@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.calibration.saved import Known
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
@@ -109,7 +110,7 @@ class Watched:
         """Of one session of ``machine``, held against a calibration of the true one."""
         calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
         start = start_state(calibrated, data, self.pool.T_camera_base)
-        return evidence(hold(calibrated, data, start, Trust.full(data)), self.covariance)
+        return evidence(hold(calibrated, data, start, Trust.full(data)), Known(self.covariance))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +151,9 @@ def by_board(estimate, machine, poses, rng):
     """Evidence of a board on a machine's platform in some poses."""
     data = measured(machine, poses, rng).measurements
     start = start_state(estimate.machine, data, T_CAMERA_BASE[None])
-    return evidence(hold(estimate.machine, data, start, Trust.full(data)), estimate.covariance)
+    return evidence(
+        hold(estimate.machine, data, start, Trust.full(data)), Known(estimate.covariance)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +205,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
         calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
         start = start_state(calibrated, data, watched.pool.T_camera_base)
         held = hold(calibrated, data, start, Trust.full(data))
-        exact = evidence(held, 0 * watched.covariance)
+        exact = evidence(held, Known(0 * watched.covariance))
         found = chi_square(exact, every)
         factor.append(found.chi2 / found.dof)
     assert np.mean(factor) > 1.4
@@ -213,9 +216,9 @@ def test_other_frames_and_cameras_change_nothing(watched):
     rng = np.random.default_rng(2)
     data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
-    first = evidence(hold(calibrated, data, start, Trust.full(data)), watched.covariance)
+    first = evidence(hold(calibrated, data, start, Trust.full(data)), Known(watched.covariance))
     away = replace(start, T_camera_base=perturb(start.T_camera_base, 0.01 * rng.normal(size=6)))
-    again = evidence(hold(calibrated, data, away, Trust.full(data)), watched.covariance)
+    again = evidence(hold(calibrated, data, away, Trust.full(data)), Known(watched.covariance))
     every = whole_machine(calibrated)
     assert chi_square(again, every).chi2 == pytest.approx(chi_square(first, every).chi2, abs=1e-4)
     frames = generators(calibrated.layout, calibrated.values) @ freedoms(calibrated)
@@ -232,7 +235,7 @@ def test_the_regression_predicts_what_a_change_does(watched, by):
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     seen = [
-        evidence(hold(machine, data, start, Trust.full(data)), watched.covariance)
+        evidence(hold(machine, data, start, Trust.full(data)), Known(watched.covariance))
         for machine in (watched.true, moved(watched.true, leg3_length__offset=-by))
     ]
     cause = whole_legs(watched.true)[2]

@@ -12,7 +12,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved import Known, load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
@@ -300,7 +300,7 @@ def test_a_cameras_magnification_is_told():
         start = start_state(drawing, data, truth.T_camera_base)
         wide = magnified(data, observed, (camera, camera))
         exact = np.diag(np.full(len(drawing.parameters), 1e-12))
-        found = evidence(hold(drawing, data, start, Trust.full(data), wide), exact)
+        found = evidence(hold(drawing, data, start, Trust.full(data), wide), Known(exact))
         assert found.by.shape[1] == len(drawing.parameters) + 1
         got.append(change(found, cause))
     assert got[1].sigma[0] < longer / 4

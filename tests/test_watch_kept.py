@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.calibration.saved import Known
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
 from pkmcal.judge.changes import change, chi_square, detectable, look_for_changes
-from pkmcal.judge.held import KeptStations, Trust, evidence, hold
+from pkmcal.judge.held import Trust, evidence, hold
 from pkmcal.judge.watch import tests_with_kept as judged_with_kept
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.measurements import Measurements
@@ -54,7 +55,7 @@ class Left:
         )
         data = Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
         held = hold(calibrated, data, start_state(calibrated, data, now), Trust.full(data))
-        return held, KeptStations((0,), there, self.joint[: self.n + 6, : self.n + 6])
+        return held, Known(self.joint[: self.n + 6, : self.n + 6], (0,), there)
 
     def evidence(self, machine, rng, **more):
         return evidence(*self.looked(machine, rng, **more))
@@ -93,7 +94,7 @@ def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
     apart[n:, :n] = apart[:n, n:] = 0.0
     sizes = [
         np.mean([detectable(found, z, z.columns[:, 0], ALPHA / 14) for z in zeros(left.true)])
-        for known in (kept, replace(kept, covariance=apart), kept.without([0]))
+        for known in (kept, replace(kept, covariance=apart), kept.only(()))
         for found in (evidence(held, known),)
     ]
     assert sizes[0] < 0.55 * sizes[2]
@@ -102,8 +103,8 @@ def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
 
 def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchanged):
     held, kept = unchanged[1]
-    alone = evidence(held, left.joint[: left.n, : left.n])
-    none = evidence(held, kept.without([0]))
+    alone = evidence(held, Known(left.joint[: left.n, : left.n]))
+    none = evidence(held, kept.only(()))
     np.testing.assert_array_equal(none.w, alone.w)
     assert none.kept == ()
 

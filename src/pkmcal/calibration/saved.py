@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,6 +25,7 @@ from pkmcal.calibration.results import (
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validate
+from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Statistics
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
@@ -56,6 +57,31 @@ class SavedStation:
     sigma_translation: Array
 
     __repr__ = short_repr
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a calibration knows of its machine, and of the cameras that stand where it had them.
+
+    covariance : (P + 6 k, P + 6 k) of the parameters and of these cameras' poses, left
+    perturbation. stations : (k,) their numbers in a session; all others have to be found anew.
+    T_camera_base : (k, 4, 4).
+    """
+
+    covariance: Array
+    stations: tuple[int, ...] = ()
+    T_camera_base: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+    def only(self, stations: Sequence[int]) -> Known:
+        """What it knows where no other stations stand as they stood."""
+        n = len(self.covariance) - 6 * len(self.stations)
+        left = np.array([k for k, s in enumerate(self.stations) if s in stations], dtype=int)
+        rows = joint_rows(n, left)
+        return Known(
+            self.covariance[np.ix_(rows, rows)],
+            tuple(self.stations[k] for k in left),
+            self.T_camera_base[left],
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,9 +161,9 @@ class SavedCalibration(ShownCalibration):
             legs_seen=bool(edges),
         )
 
-    def with_stations(self, names: Sequence[str]) -> Array:
-        """Joint covariance (P + 6 n, P + 6 n) of the parameters and of n stations in their order,
-        (omega, tau) of T_camera_base. Raises InputError for one that is not ``placed``.
+    def known(self, names: Sequence[str], of_session: Sequence[str]) -> Known:
+        """What it knows of the machine and of some stations, in their order, by their numbers among
+        those of a session. Raises InputError for one that is not ``placed``.
         """
         for name in names:
             if name in self.placed:
@@ -154,7 +180,12 @@ class SavedCalibration(ShownCalibration):
             )
         where = np.array([self.placed.index(name) for name in names], dtype=int)
         rows = joint_rows(len(self.machine.parameters), where)
-        return self.joint_covariance[np.ix_(rows, rows)]
+        places = {station.name: inverse(station.T_base_camera) for station in self.stations}
+        return Known(
+            self.joint_covariance[np.ix_(rows, rows)],
+            tuple(of_session.index(name) for name in names),
+            np.array([places[name] for name in names]).reshape(-1, 4, 4),
+        )
 
     @property
     def sigma(self) -> Array:

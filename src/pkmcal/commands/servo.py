@@ -114,12 +114,12 @@ def servo(
     folder = out or Path("servo")
     check_own_folder(folder, FILES, "a study of servoing", "an earlier study")
     numbers = None if legs is None else legs_of(legs)
-    subject = controlled(
+    scene = controlled(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
     )
     try:
         with console.progress(as_json) as told:
-            outcome = outcome_of(subject, study(subject.scene, plan, told))
+            outcome = outcome_of(study(scene, plan, told))
     except InputError as error:  # what a camera does not see is told with its file
         raise error if error.where or camera is None else error.located(str(camera)) from None
     return finish(outcome, folder, FILES, as_json=as_json)

@@ -42,13 +42,12 @@ class Rates(NamedTuple):
 
     readings : (..., m, 6) D of [B] eq. 6-7, by the twist. hinges : (..., n, 6).
     free : (..., 6, f) orthonormal twists (turns times the platform's radius) that the machine can
-    make. scale : (...,) m, that radius.
+    make.
     """
 
     readings: Array
     hinges: Array
     free: Array
-    scale: Array
 
 
 def rates(seen: SeenMachine, legs: Legs) -> Rates:
@@ -68,7 +67,7 @@ def rates(seen: SeenMachine, legs: Legs) -> Rates:
         gain = legs.drives[..., column, np.arange(m)]
         usable = np.abs(gain) > 0
         solved = -legs.rows[..., column, :] / np.where(usable, gain, np.nan)[..., None]
-    return Rates(solved[..., :m, :], solved[..., m:, :], _free(seen, legs, driving, scale), scale)
+    return Rates(solved[..., :m, :], solved[..., m:, :], _free(seen, legs, driving, scale))
 
 
 def _free(seen: SeenMachine, legs: Legs, driving: Array, scale: Array) -> Array:

@@ -297,7 +297,7 @@ class VisualServo:
         return None
 
     def _least(self, sample: _Sample, rows: Array) -> float:
-        """Distance from a singular pose, as :func:`pkmcal.mechanisms.kinematics.singularity`."""
+        """Distance from a singular pose, as :func:`pkmcal.mechanisms.kinematics.singularity_of`."""
         if not self.machine.layout.n_internal:
             return float(np.linalg.svd(rows, compute_uv=False)[-1])
         return float(self.machine.forward_result(sample.readings, self._pose).singularity)

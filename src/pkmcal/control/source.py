@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,20 +26,6 @@ CAMERA_POSITION = 2e-4
 """rad and m, standard deviations of a camera's place by the same demonstration."""
 
 
-@dataclass(frozen=True)
-class Controlled:
-    """A scene and what the user should know of it.
-
-    name : of the machine. origin : a sentence. station : the camera's, None for a drawing.
-    """
-
-    scene: Plant
-    name: str
-    origin: str
-    station: str | None = None
-    warnings: tuple[str, ...] = ()
-
-
 def controlled(
     what: str,
     *,
@@ -49,8 +34,8 @@ def controlled(
     camera: Path | None = None,
     legs: tuple[int, ...] | None = None,
     seed: int = 0,
-) -> Controlled:
-    """The scene of a calibration's folder, of a mechanism file, or of a built-in machine.
+) -> Plant:
+    """The plant of a calibration's folder, of a mechanism file, or of a built-in machine.
 
     legs : numbers from 0. Raises InputError for what is none of these, for a station or camera that
     is not there, and for legs that cannot be seen.
@@ -75,20 +60,12 @@ def _of_calibration(
     station: str | None,
     eye: Camera | None,
     legs: tuple[int, ...] | None,
-) -> Controlled:
+) -> Plant:
     """The calibrated machine stands for the true one; estimates differ from it as it may from the
     truth.
     """
     place = _station(saved, source, station, eye)
     eye = source.cameras[place.name] if eye is None else eye
-    scene = Plant(
-        machine=saved.machine,
-        drawing=saved.drawing,
-        uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
-        camera=eye,
-        T_camera_base=inverse(place.T_base_camera),
-        legs=legs,
-    )
     refused = () if saved.verdict.usable else (
         f"The calibration itself should not be used: {saved.verdict.headline}",
     )  # fmt: skip
@@ -96,7 +73,17 @@ def _of_calibration(
         f"The calibrated machine (folder {source.origin}), seen by the camera of {place.name};"
         " every run has its own errors, drawn from the calibration's covariance."
     )
-    return Controlled(scene, saved.machine.name, origin, place.name, refused)
+    return Plant(
+        machine=saved.machine,
+        drawing=saved.drawing,
+        uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
+        camera=eye,
+        T_camera_base=inverse(place.T_base_camera),
+        legs=legs,
+        origin=origin,
+        station=place.name,
+        warnings=refused,
+    )
 
 
 def _station(
@@ -123,7 +110,7 @@ def _station(
     return known[0]
 
 
-def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed: int) -> Controlled:
+def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed: int) -> Plant:
     """A machine built within its drawing's tolerances."""
     machine = source.machine
     seen_machine(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
@@ -132,7 +119,13 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
     table = machine.parameters
     free = table.free_matrix() * (CALIBRATED * table.tolerances_free())
     truth = true_machine(machine, 1.0, np.random.default_rng(stream(seed, "machine")))
-    scene = Plant(
+    x, y, z = place.position
+    origin = (
+        f"A {machine.name} built within its tolerances, the camera at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        " in the base frame; its calibration is taken to leave a thirtieth of the tolerances,"
+        f" {1e3 * CAMERA_POSITION:g} mm and {np.rad2deg(CAMERA_ROTATION):g}° of the camera's place."
+    )
+    return Plant(
         machine=truth,
         drawing=np.array(machine.values),
         uncertainty=Uncertainty(
@@ -141,14 +134,8 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
         camera=eye,
         T_camera_base=place.T_camera_base(),
         legs=legs,
+        origin=origin,
     )
-    x, y, z = place.position
-    origin = (
-        f"A {machine.name} built within its tolerances, the camera at ({x:.2f}, {y:.2f}, {z:.2f}) m"
-        " in the base frame; its calibration is taken to leave a thirtieth of the tolerances,"
-        f" {1e3 * CAMERA_POSITION:g} mm and {np.rad2deg(CAMERA_ROTATION):g}° of the camera's place."
-    )
-    return Controlled(scene, machine.name, origin)
 
 
 def pose_of(text: str, where: str) -> Array:

@@ -160,7 +160,8 @@ class Plan:
 @dataclass(frozen=True)
 class Plant:
     """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
-    from 0 of those seen, all with tubes unless given.
+    from 0 of those seen, all with tubes unless given. origin : a sentence, for people. station :
+    the camera's, None for a drawing. warnings : what people should know.
     """
 
     machine: Machine
@@ -169,6 +170,9 @@ class Plant:
     camera: Camera
     T_camera_base: Array
     legs: tuple[int, ...] | None = None
+    origin: str = ""
+    station: str | None = None
+    warnings: tuple[str, ...] = ()
 
     def seen(self) -> SeenMachine:
         """The true machine before the camera."""

@@ -63,11 +63,6 @@ class LegLines:
     agrees: Booleans
     found: Booleans
 
-    @property
-    def covariance(self) -> Array:
-        """Of each edge alone, (L, 2, 2, 2) rad^2."""
-        return np.stack([self.joint[:, :2, :2], self.joint[:, 2:, 2:]], axis=1)
-
     @classmethod
     def nothing(cls, count: int) -> LegLines:
         """No leg found of ``count``."""

@@ -12,6 +12,7 @@ from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
+from pkmcal.mechanisms.machine import field_of
 
 MECHANISM, MACHINE = "mechanism.yaml", "machine.json"
 FORMAT = 1
@@ -41,7 +42,7 @@ class MechanismYaml(Exporter):
         document = yaml.safe_load(files[MECHANISM])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        found = [_at(document, name) for name in table.names]
+        found = _values_in(document, table.names)
         return [Difference(f"{len(found)} values read again", largest(found, values), 0.0)]
 
 
@@ -94,7 +95,7 @@ class MachineJson(Exporter):
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
         found = [p["value"] for p in document["parameters"]]
-        again = [_at(document["mechanism"], name) for name in table.names]
+        again = _values_in(document["mechanism"], table.names)
         out = [
             Difference(f"{len(found)} values read again", largest(found, values), 0.0),
             Difference("values in the mechanism", largest(again, values), 0.0),
@@ -105,10 +106,6 @@ class MachineJson(Exporter):
         return out
 
 
-def _at(document: Any, name: str) -> float:
-    """A parameter's value at its path, which is its name: ``legs[1].base.center.x``."""
-    node = document
-    keys = name.replace("]", "").replace("[", ".").split(".")
-    for key in keys[:-1]:
-        node = node[int(key) - 1] if key.isdigit() else node[key]
-    return float(node["xyz".index(keys[-1])] if isinstance(node, list) else node[keys[-1]])
+def _values_in(document: Any, names: tuple[str, ...]) -> list[float]:
+    """Parameters' values in a mechanism file's fields."""
+    return [float(node[key]) for node, key in (field_of(document, name) for name in names)]

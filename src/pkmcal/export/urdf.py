@@ -159,7 +159,7 @@ def _joint(
         kind = "prismatic" if joint.kind == "slide" else turns
     name = f"{links[1]}_fixed" if joint is None else joint.name
     out = SubElement(root, "joint", name=name, type=kind)
-    _origin(out, T)
+    SubElement(out, "origin", xyz=numbers(T[:3, 3]), rpy=numbers(roll_pitch_yaw(T[:3, :3])))
     SubElement(out, "parent", link=links[0])
     SubElement(out, "child", link=links[1])
     if joint is not None:
@@ -191,7 +191,8 @@ def _ends(root: Element, loop: Loop, tree: BodyTree) -> None:
     """Two links that coincide where a leg is closed, with the joint's own hinges before them."""
     at = pose(np.eye(3), loop.end)
     last = loop.tip.name
-    comment(root, f"Loop: {loop.name}_tip and {loop.name}_platform coincide{_how(loop)}.")
+    how = ", axes as well" if loop.hinges else " in their origins: a ball"
+    comment(root, f"Loop: {loop.name}_tip and {loop.name}_platform coincide{how}.")
     for kind, axis in loop.hinges:
         name = f"{loop.name}_{kind}"
         _joint(root, BodyJoint(name, "hinge", axis), (last, f"{name}_link"), at, tree)
@@ -205,14 +206,6 @@ def _ends(root: Element, loop: Loop, tree: BodyTree) -> None:
         name = f"{loop.name}_{end}"
         _joint(root, None, (body, name), T, tree)
         SubElement(root, "link", name=name)
-
-
-def _how(loop: Loop) -> str:
-    return ", axes as well" if loop.hinges else " in their origins: a ball"
-
-
-def _origin(parent: Element, T: Array) -> None:
-    SubElement(parent, "origin", xyz=numbers(T[:3, 3]), rpy=numbers(roll_pitch_yaw(T[:3, :3])))
 
 
 def _visual(link: Element, shape: RoundBar) -> None:

@@ -47,13 +47,14 @@ MOST = 4
 @dataclass(frozen=True)
 class Score:
     """What one departure would gain: chi2 by dof numbers, chance of as much by chance alone in this
-    test, and ``adjusted``, in any of all tests that were made, families counting alike.
+    test, and ``adjusted``, in any of all tests that were made, families counting alike; NaN where
+    it stands alone.
     """
 
     chi2: float
     dof: int
     chance: float
-    adjusted: float = 1.0
+    adjusted: float = float("nan")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.score import Score
 from pkmcal.judge.causes import (
     SIDES,
     Cause,
@@ -52,19 +53,6 @@ class SeenCause(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ChiSquare:
-    """A statistic, its degrees of freedom and the probability of as much by chance alone.
-
-    adjusted : the same for the largest of all tests that were made; NaN where it stands alone.
-    """
-
-    chi2: float
-    dof: int
-    chance: float
-    adjusted: float = float("nan")
-
-
-@dataclass(frozen=True)
 class Change:
     """A cause's k numbers as the data tell them, if nothing else changed.
 
@@ -89,13 +77,13 @@ def directions(found: Evidence, cause: Cause) -> SeenCause:
     return SeenCause(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
 
 
-def chi_square(found: Evidence, cause: Cause) -> ChiSquare:
+def chi_square(found: Evidence, cause: Cause) -> Score:
     """Whether the data show the cause."""
     from scipy.special import chdtrc
 
     q = directions(found, cause).q
     chi2, dof = float(np.sum((q.T @ found.w) ** 2)), q.shape[1]
-    return ChiSquare(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0)
+    return Score(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0)
 
 
 def likelihood(found: Evidence, cause: Cause) -> float:
@@ -211,8 +199,8 @@ class LegTest:
     """
 
     legs: tuple[int, ...]
-    whole: ChiSquare
-    zero: ChiSquare | None
+    whole: Score
+    zero: Score | None
     change: Change | None
     unit: str
     tolerance: float
@@ -251,7 +239,7 @@ class StationTest:
     """
 
     station: int
-    test: ChiSquare
+    test: Score
     change: Change
 
 
@@ -287,7 +275,7 @@ class Explanation:
     """
 
     suspect: Suspect
-    test: ChiSquare
+    test: Score
     others: tuple[Suspect, ...]
 
 
@@ -301,11 +289,11 @@ class ChangeTests:
     """
 
     legs: tuple[LegTest, ...]
-    machine: ChiSquare
-    scale: ChiSquare
+    machine: Score
+    scale: Score
     scale_change: Change
     findings: tuple[Explanation, ...]
-    left: ChiSquare
+    left: Score
     alpha: float
     level: float
     stations: tuple[StationTest, ...] = ()
@@ -327,7 +315,7 @@ class ChangeTests:
         return tuple(s.station for s in self.stations if s.test.adjusted < self.alpha)
 
     @property
-    def tests(self) -> tuple[ChiSquare, ...]:
+    def tests(self) -> tuple[Score, ...]:
         """All tests that see anything."""
         legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
         kept = [station.test for station in self.stations]
@@ -358,7 +346,7 @@ class ChangeTests:
 
 def made_tests(
     found: Evidence, machine: Machine
-) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare | None, ...], CommonLevel]:
+) -> tuple[tuple[Score, ...], tuple[Score | None, ...], CommonLevel]:
     """Every test on new data, chances adjusted for their number, and what they are worth together.
 
     First of all legs, of all lengths by one factor, of each arm's legs, and of each camera that was
@@ -369,7 +357,7 @@ def made_tests(
     zero = zeros(machine)
     level = together(found, [*causes, *(cause for cause in zero if cause)])
 
-    def test(cause: Cause) -> ChiSquare:
+    def test(cause: Cause) -> Score:
         told = chi_square(found, cause)
         return replace(told, adjusted=level.adjusted(told.chance))
 
@@ -412,8 +400,8 @@ def _leg(
     machine: Machine,
     whole: Cause,
     zero: Cause | None,
-    test: ChiSquare,
-    test_zero: ChiSquare | None,
+    test: Score,
+    test_zero: Score | None,
     level: float,
 ) -> LegTest:
     """A leg's tests, of all of it and of its zero, and what they would have found."""

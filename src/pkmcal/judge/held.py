@@ -14,12 +14,12 @@ Two things are read from that: what all else predicts of a configuration's readi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.calibration.saved import Known
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import pose_difference, skew
 from pkmcal.identify.assembly import assemble, batch_of
@@ -213,42 +213,14 @@ class Evidence:
         return self.by[:, : len(columns)] @ columns
 
 
-@dataclass(frozen=True)
-class KeptStations:
-    """What a calibration knows, with the places of cameras that are said to stand where it had
-    them.
-
-    stations : (k,) their numbers in the session. T_camera_base : (k, 4, 4). covariance :
-    (P + 6 k, P + 6 k) of the parameters and of these poses, left perturbation.
-    """
-
-    stations: tuple[int, ...]
-    T_camera_base: Array
-    covariance: Array
-
-    def without(self, stations: Sequence[int]) -> KeptStations:
-        """What it knows where some of them do not."""
-        n = len(self.covariance) - 6 * len(self.stations)
-        left = np.array([k for k, s in enumerate(self.stations) if s not in stations], dtype=int)
-        rows = np.r_[:n, (n + 6 * left[:, None] + np.arange(6)).ravel()]
-        return KeptStations(
-            tuple(self.stations[k] for k in left),
-            self.T_camera_base[left],
-            self.covariance[np.ix_(rows, rows)],
-        )
-
-
-def evidence(held: Held, known: Array | KeptStations) -> Evidence:
+def evidence(held: Held, known: Known) -> Evidence:
     """What the data tell of a change from the held values: whitened by V = 1 + A C A^T with the
     calibration's covariance C.
 
-    known : (P, P) of the parameters, or with stations that were kept. All others are found anew and
-    take up what they can. Of the kept ones the residuals are told at the calibration's places, by
-    the derivatives at those found.
+    Stations that it does not know are found anew and take up what they can. Of the kept ones the
+    residuals are told at the calibration's places, by the derivatives at those found.
     """
     machine, n = held.machine, len(held.machine.parameters)
-    if not isinstance(known, KeptStations):
-        known = KeptStations((), np.zeros((0, 4, 4)), known)
     covariance, stations = known.covariance, known.stations
     problem, state = held.problem.opened(held.state)
     names = (*held.asked, "stations") if stations else held.asked
@@ -280,9 +252,7 @@ def evidence(held: Held, known: Array | KeptStations) -> Evidence:
     return Evidence(np.linalg.solve(lower, told), np.linalg.solve(lower, by), stations)
 
 
-def _at_kept(
-    rows: Array, left: Array, found: Array, n: int, kept: KeptStations
-) -> tuple[Array, Array]:
+def _at_kept(rows: Array, left: Array, found: Array, n: int, kept: Known) -> tuple[Array, Array]:
     """Rows by n parameters, all stations' places (S, 4, 4) and cameras, as rows by parameters,
     cameras and the kept stations; and the residuals with these at the calibration's places.
     """

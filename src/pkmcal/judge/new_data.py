@@ -7,6 +7,7 @@ the photographs; only what was measured, and where poses and stations are, is ke
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
     readings: two measurements of a pose do not agree to the last digit.
     """
     entries: list[dict[str, Any]] = saved.document["configurations"]
-    used = [entry for entry, flag in zip(entries, saved.used, strict=True) if flag]
+    used = [*compress(entries, saved.used)]
     old = {digest for entry in used for digest in entry.get("photographs", ())}
     new = digests(session) if old else {}
     same = np.any(np.all(session.joints[:, None] == saved.joints[saved.used], axis=2), axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +68,8 @@ class Validation:
             "pkmcal_validation": FORMAT,
             "verdict": asdict(self.verdict),
             "new_data": self.judged.document(names) if self.judged else None,
-            "known_configurations": [n for n, flag in zip(names, self.known, strict=True) if flag],
-            "repeated_configurations": [
-                n for n, flag in zip(names, self.repeated, strict=True) if flag
-            ],
+            "known_configurations": [*compress(names, self.known)],
+            "repeated_configurations": [*compress(names, self.repeated)],
             "regions": [item.document(names) for item in self.regions],
             "paths": [asdict(path) for path in self.paths],
             "joints": {

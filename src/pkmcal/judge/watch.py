@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,14 @@ from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.aside import select
 from pkmcal.calibration.calibrate import Calibration, Progress
 from pkmcal.calibration.same_machine import read
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.saved import Known, SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
-from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
-from pkmcal.judge.held import Held, KeptStations, Trust, evidence, hold
+from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import check_new, known_rows, look
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
@@ -79,10 +79,8 @@ class Watch:
                 "pkmcal_watch": FORMAT,
                 "verdict": asdict(self.verdict),
                 **self.judged.document(self.calibration.machine),
-                "configurations": [n for n, flag in zip(names, self.seen, strict=True) if flag],
-                "known_configurations": [
-                    n for n, flag in zip(names, self.known, strict=True) if flag
-                ],
+                "configurations": [*compress(names, self.seen)],
+                "known_configurations": [*compress(names, self.known)],
                 "noise_scale": self.noise_scale,
                 "pose_scale": self.pose_scale,
                 "same_place": self.same_place,
@@ -140,7 +138,8 @@ def watch(
         trust = Trust.of(looked.estimate, before, _readings(saved, session))
         noise = looked.estimate.statistics.noise_scale * trust.scale.edges
         held = _hold_new(saved, session, looked, trust, ~known)
-        judged, kept, moved = tests_with_kept(held, _kept(saved, session, same_place), alpha)
+        kept = saved.known(same_place, session.station_names)
+        judged, kept, moved = tests_with_kept(held, kept, alpha)
         around = LookedAt(
             session.configurations,
             known,
@@ -206,28 +205,18 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
                 expected=listed(session.station_names, 8),
                 next_step="A camera that was left in place has the same name in both sessions",
             )
-    saved.with_stations(same_place)
-    places = {s.name: inverse(s.T_base_camera) for s in saved.stations if s.name in same_place}
+    kept = saved.known(same_place, session.station_names)
+    places = dict(zip(kept.stations, kept.T_camera_base, strict=True))
     stations = tuple(
-        replace(station, T_camera_base=places.get(station.name, station.T_camera_base))
-        for station in session.stations
+        replace(station, T_camera_base=places.get(k, station.T_camera_base))
+        for k, station in enumerate(session.stations)
     )
     return replace(session, stations=stations)
 
 
-def _kept(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> KeptStations:
-    """What the calibration knows of its machine and of these stations."""
-    places = {station.name: inverse(station.T_base_camera) for station in saved.stations}
-    return KeptStations(
-        tuple(session.station_names.index(name) for name in same_place),
-        np.array([places[name] for name in same_place]).reshape(-1, 4, 4),
-        saved.with_stations(same_place),
-    )
-
-
 def tests_with_kept(
-    held: Held, kept: KeptStations, alpha: float
-) -> tuple[ChangeTests, KeptStations, tuple[StationTest, ...]]:
+    held: Held, kept: Known, alpha: float
+) -> tuple[ChangeTests, Known, tuple[StationTest, ...]]:
     """All tests, the stations that were kept for them, and those that evidently were moved.
 
     Where moved cameras explain the data better than any change of the machine, these are found anew
@@ -239,7 +228,7 @@ def tests_with_kept(
         if not judged.moved:
             return judged, kept, tuple(moved)
         moved += [s for s in judged.stations if s.station in judged.moved]
-        kept = kept.without(judged.moved)
+        kept = kept.only([s for s in kept.stations if s not in judged.moved])
 
 
 def _hold_new(

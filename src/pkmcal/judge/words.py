@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -509,7 +510,7 @@ def _warnings(around: LookedAt) -> tuple[str, ...]:
     ]
     both = around.known & around.seen
     if both.any():
-        names = [n for n, k in zip(around.configurations, both, strict=True) if k]
+        names = [*compress(around.configurations, both)]
         out.append(
             f"The calibration was made from configuration {listed(names, 4)}: nothing new, and left"
             " out of the tests."

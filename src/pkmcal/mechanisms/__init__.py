@@ -69,7 +69,8 @@ def load_mechanism(
         except InputError as error:
             raise error.located(document.label) from None
         if chosen.mechanism is not None:
-            return load_mechanism(_beside(path, chosen.mechanism))
+            beside = path.parent / chosen.mechanism
+            return load_mechanism(chosen.mechanism if chosen.mechanism in built_in else beside)
         checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
     return replace(checked_machine(checked, document), model=model)
 
@@ -139,11 +140,6 @@ def _model(document: MechanismDocument, name: str) -> Model:
         expected=closest(name, known) or (listed(known) if known else "no model at all"),
         next_step="name a model under models in the mechanism file, with what it fixes and ties",
     )
-
-
-def _beside(path: Path, mechanism: str) -> Path | str:
-    """What a model's ``mechanism`` means: a built-in machine, or a file beside this one."""
-    return mechanism if mechanism in catalogue() else path.parent / mechanism
 
 
 def mechanism_text(machine: Machine) -> str:

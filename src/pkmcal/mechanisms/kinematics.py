@@ -367,17 +367,6 @@ def _at_least(
     return Closed(poses, internal, np.where(np.isfinite(worst), worst, np.inf))
 
 
-def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
-    """Smallest singular value of the inverse Jacobian of rigid platforms, dimensionless; (...).
-
-    by_pose : the closure's, (..., E, 6). Rotations are scaled by the platform's radius, so a row is
-    about a unit direction; zero means that the platform can move with all joints locked.
-    """
-    own = by_pose[..., layout.freedoms]
-    scale = own_scale(layout, theta)[..., : own.shape[-1]]
-    return singularity_of(layout, own * scale[..., None, :])
-
-
 def scaled_rows(c: Closure) -> Array:
     """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
     hinges' are too, count as the platform's joints' ways.
@@ -386,7 +375,9 @@ def scaled_rows(c: Closure) -> Array:
 
 
 def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
-    """Smallest singular value (...) of :func:`scaled_rows`; NaN where they are not known."""
+    """Smallest singular value (...) of :func:`scaled_rows`, of which each is about a unit
+    direction: 0 where the platform can move with all joints locked; NaN where they are not known.
+    """
     if layout.n_equations < scaled.shape[-1]:  # fewer than its freedoms: it can always move
         return np.zeros(scaled.shape[:-2])
     known = np.isfinite(scaled).all(axis=(-1, -2))
@@ -405,7 +396,7 @@ def own_scale(layout: LimbLayout, theta: Array) -> Array:
 
 def platform_radius(layout: LimbLayout, theta: Array) -> Array:
     """Root mean square distance (...) of the platform's joints from their mean, m."""
-    points = [g.carrier.point(g.of(theta), np.eye(4)).value for g in layout.platform]
+    points = [g.carrier.place(g.of(theta), np.eye(4))[0] for g in layout.platform]
     centres = np.concatenate(points, axis=-2)
     spread = centres - centres.mean(axis=-2, keepdims=True)
     radius = np.sqrt(np.mean(np.sum(spread**2, axis=-1), axis=-1))

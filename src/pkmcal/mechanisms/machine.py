@@ -346,7 +346,8 @@ class Machine:
                 del leg["scale"]  # of no reading, or of one that is what it says
         values = self.parameters.unit_axes(self.values)
         for name, value in zip(self.parameters.names, values, strict=True):
-            _assign(out, name, float(value))
+            node, key = field_of(out, name)
+            node[key] = float(value)
         return out
 
     def _axes(self, index: Integers) -> Array:
@@ -444,16 +445,15 @@ def _rows_of(
             yield _Row(name, kind.unit, kind.tolerance, label, part, value, tolerance)
 
 
-def _assign(document: dict[str, Any], name: str, value: float) -> None:
-    """Write a parameter back into the file's fields at the path that is its name."""
-    keys = name.replace("]", "").replace("[", ".").split(".")
-    node: Any = document
-    for key in keys[:-1]:
+def field_of(document: Any, name: str) -> tuple[Any, Any]:
+    """Where a parameter stands among a file's fields, at the path that is its name, such as
+    ``legs[1].base.center.x``: what holds it, and its key or index there.
+    """
+    *keys, last = name.replace("]", "").replace("[", ".").split(".")
+    node = document
+    for key in keys:
         node = node[int(key) - 1] if key.isdigit() else node[key]
-    if keys[-1] in ("x", "y", "z"):
-        node["xyz".index(keys[-1])] = value
-    else:
-        node[keys[-1]] = value
+    return node, "xyz".index(last) if isinstance(node, list) else last
 
 
 def _checked(values: Array, tail: tuple[int, ...], name: str) -> Array:

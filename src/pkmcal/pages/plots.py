@@ -4,7 +4,8 @@ space, where lengths are millimetres.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,49 @@ def plane(x: str, y: str) -> dict[str, Any]:
         "xaxis": {**AXIS, "title": {"text": x}},
         "yaxis": {**AXIS, "title": {"text": y}},
     }
+
+
+def trace(
+    name: str,
+    x: Iterable[Any],
+    y: Iterable[float],
+    colour: str,
+    mode: str = "lines+markers",
+    **more: Any,
+) -> dict[str, Any]:
+    """A line, marks or both in the plane, with gaps where a value is none; more : of Plotly's
+    trace, over what stands here.
+    """
+    return {
+        "type": "scatter",
+        "mode": mode,
+        "name": name,
+        "x": _drawn(x),
+        "y": _drawn(y),
+        "line": {"color": colour, "width": 1.5},
+        "marker": {"color": colour, "size": 8},
+        **more,
+    }
+
+
+def bars(name: str, x: Iterable[Any], y: Iterable[float], **marker: Any) -> dict[str, Any]:
+    """A trace of bars that look like marker."""
+    return {
+        "type": "bar",
+        "name": name,
+        "x": _drawn(x),
+        "y": _drawn(y),
+        "marker": marker,
+        "hovertemplate": "%{x}: %{y:.3g}",
+    }
+
+
+def _drawn(values: Iterable[Any]) -> list[Any]:
+    """Names, or numbers with five digits and None for those that are not finite."""
+    return [
+        value if isinstance(value, str) else float(f"{value:.5g}") if math.isfinite(value) else None
+        for value in values
+    ]
 
 
 def line(

@@ -250,6 +250,22 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
     return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
+def parameters_of(machine: Machine, steps: FourSteps) -> Array:
+    """The machine's parameters (B, P) with what the steps found."""
+    layout, theta = machine.layout, np.tile(machine.values, (len(steps.base), 1))
+    base_index, platform_index = centre_index(layout)
+    theta[:, base_index], theta[:, platform_index] = steps.base, steps.platform
+    closing = layout.rod >= 0
+    theta[:, layout.rod[closing]] = steps.offsets[:, closing]
+    for index, axes in (
+        (layout.base_axis, steps.base_axes),
+        (layout.platform_axis, steps.platform_axes),
+    ):
+        has = index[:, 0] >= 0
+        theta[:, index[has]] = axes[:, has]
+    return theta
+
+
 # ------------------------------------------------------------------ the steps on a session
 
 
@@ -289,7 +305,7 @@ def four_step(
     stations = steps.T_camera_base[0]
     if T_camera_base_guess is not None:
         stations = np.where(usable[:, None, None], stations, T_camera_base_guess)
-    theta = _parameters(machine, steps)
+    theta = parameters_of(machine, steps)[0]
     poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
     state = with_boards(measurements, theta, stations, poses)
     if legs_of(machine).framed:
@@ -323,22 +339,6 @@ def _views(
     elif checks.free_ways(items).shape[-1]:
         return together(guess)
     return views
-
-
-def _parameters(machine: Machine, steps: FourSteps) -> Array:
-    """The machine's parameters (P,) with what the steps found (B = 1)."""
-    layout, theta = machine.layout, machine.values.copy()
-    base_index, platform_index = centre_index(layout)
-    theta[base_index], theta[platform_index] = steps.base[0], steps.platform[0]
-    closing = layout.rod >= 0
-    theta[layout.rod[closing]] = steps.offsets[0, closing]
-    for index, axes in (
-        (layout.base_axis, steps.base_axes),
-        (layout.platform_axis, steps.platform_axes),
-    ):
-        has = index[:, 0] >= 0
-        theta[index[has]] = axes[0, has]
-    return theta
 
 
 def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home: Array) -> Array:

@@ -33,7 +33,6 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver import (
@@ -241,44 +240,21 @@ class PoseFit:
     """The method's result on B runs.
 
     problem : with the weights and held unknowns of the end. solution : its state, cost, stops.
-    held : names of what was held. rank : of the Jacobian with everything free.
+    rank : of the Jacobian with everything free.
     """
 
     problem: ImplicitProblem
     solution: Solution
-    held: tuple[str, ...]
     rank: int
 
 
-def inverse_kinematic(
-    machine: Machine,
-    measurements: Measurements,
-    start: State | None = None,
-    *,
-    form: Form = "implicit",
-) -> State:
-    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 3 and 5,
+def inverse_kinematic(machine: Machine, measurements: Measurements, start: State) -> State:
+    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 5,
     whitened, beside the drawing's values with their tolerances.
 
-    start : from the drawing by default, see :mod:`pkmcal.papers.hand_eye`. Platform poses are then
-    by the readings and the new machine.
+    start : from the drawing, see :mod:`pkmcal.papers.hand_eye`. Platform poses are then by the
+    readings and the new machine.
     Raises InputError without a board on the platform, ResultError where the search fails.
-    """
-    begin = start_from_poses(machine, measurements) if start is None else start
-    fit = fit_session(machine, measurements, begin, form)
-    return _session_state(machine, measurements, begin, fit)
-
-
-def fit_session(
-    machine: Machine,
-    measurements: Measurements,
-    start: State,
-    form: Form = "implicit",
-    whitened: bool = True,
-    use_drawing: bool = True,
-) -> PoseFit:
-    """The same as a fit of one run, with what was held; use_drawing : take the drawing's values as
-    measurements.
     """
     poses = measurements.poses
     rows = np.flatnonzero(measurements.on_platform[poses.mount])
@@ -295,11 +271,11 @@ def fit_session(
         poses.T_station_target[None],
         measurements.joints[None, poses.configuration],
         start,
-        form,
+        "implicit",
     )
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)
-    return fit_poses(machine, problem, state, noise if whitened else None,
-                     measurements.joint_noise, use_drawing)  # fmt: skip
+    fit = fit_poses(machine, problem, state, noise, measurements.joint_noise, use_drawing=True)
+    return _session_state(machine, measurements, start, fit)
 
 
 def pose_problem(
@@ -320,7 +296,6 @@ def pose_problem(
         raise InputError(
             what=f"mechanism {machine.name!r} has several rods on a motor: no reading fits all",
             expected="the implicit form",
-            next_step="use form='implicit'",
         )
     runs, count = T_camera_board.shape[:2]
     z = table.to_free(start.theta)
@@ -362,9 +337,11 @@ def fit_poses(
     start: ImplicitState,
     noise: Array | None,
     joint_noise: float,
+    *,
     use_drawing: bool,
 ) -> PoseFit:
     """The estimate of B runs. noise : (N, 6, 6) of the poses to whiten by; None as printed.
+    use_drawing : take the drawing's values as measurements.
 
     As printed, the axis that the boards turn about is found first and held, [C] III.B.
     """
@@ -382,8 +359,7 @@ def fit_poses(
             problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
             solution = minimise(problem, state, MOST_STEPS)
             solution = replace(solution, steps=steps + solution.steps)
-    names = np.array(unknown_names(machine, problem), dtype=object)
-    return PoseFit(problem, solution, tuple(names[~keep]), rank)
+    return PoseFit(problem, solution, rank)
 
 
 def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
@@ -473,14 +449,6 @@ def _pivots(loose: Array) -> list[int]:
         along = rows[:, k] / np.linalg.norm(rows[:, k])
         rows = rows - along[:, None] * (along @ rows)
     return chosen
-
-
-def unknown_names(machine: Machine, problem: ImplicitProblem) -> tuple[str, ...]:
-    """Names of all unknowns, in the order of the Jacobian's columns."""
-    parts = ("turn x", "turn y", "turn z", "x", "y", "z")
-    stations = [f"station {s + 1}, {p}" for s in range(problem.n_stations) for p in parts]
-    mounts = [f"board {m + 1}, {p}" for m in range(problem.n_mounts) for p in parts]
-    return (*machine.parameters.free_names(), *stations, *mounts)
 
 
 def _session_state(

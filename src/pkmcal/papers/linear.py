@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -40,14 +40,11 @@ class LinearCentres:
     """Base centres in the camera frames, [B] 14.
 
     centres : (S, L, 3) m, NaN where a leg was not seen in enough directions.
-    covariance : (S, L, 3, 3). sigma : (S, L) robust scale of the residuals, m.
-    count : (S, L) edges in use. weights : (N,) of the edges.
+    covariance : (S, L, 3, 3). weights : (N,) of the edges.
     """
 
     centres: Array
     covariance: Array
-    sigma: Array
-    count: Integers
     weights: Array
 
 
@@ -218,13 +215,8 @@ def centres(
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
     shape = (measurements.n_stations, machine.n_legs)
-    sigma = scale_of(residuals(n, radius, a), present)
     return LinearCentres(
-        a.reshape(*shape, 3),
-        covariance.reshape(*shape, 3, 3),
-        sigma.reshape(shape),
-        np.sum(weight > 0.5, axis=-1).reshape(shape),
-        weight[group, place],
+        a.reshape(*shape, 3), covariance.reshape(*shape, 3, 3), weight[group, place]
     )
 
 

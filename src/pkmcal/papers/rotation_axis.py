@@ -45,22 +45,18 @@ MOST_PAIRS = 200_000
 class RotationAxis:
     """How the boards of one camera and mount turned.
 
-    hypothesis : how the machine should turn it. axis_camera, axis_board : (3,) unit vectors of the
-    one axis in the two frames, NaN where the hypothesis has none.
+    hypothesis : how the machine should turn it.
     tilt : (N,) rad that each pose is off the hypothesis; expected_tilt : (N,) what noise alone
     would give, root mean square. spread, expected_spread : rad, root mean square angle of the axes
     of pairs of poses to their mean, and what noise alone would give; NaN without pairs that turn.
-    pairs : their number. chi2, dof, p_value : of the hypothesis; 0 and 1 where it asks for nothing.
+    chi2, dof, p_value : of the hypothesis; 0 and 1 where it asks for nothing.
     """
 
     hypothesis: Turning
-    axis_camera: Array
-    axis_board: Array
     tilt: Array
     expected_tilt: Array
     spread: float
     expected_spread: float
-    pairs: int
     chi2: float
     dof: int
     p_value: float
@@ -100,28 +96,23 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
     hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
     rot = poses.T_station_target[:, :3, :3]
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)[:, :3, :3]
-    axis_camera = axis_board = np.full(3, np.nan)
     if hypothesis == "any":
         unknowns, off, covariance = 0, np.zeros((len(rot), 0)), np.zeros((len(rot), 0, 0))
     elif hypothesis == "one axis":
         unknowns = 4
-        off, covariance, frames = _about_one(rot, noise)
-        axis_camera, axis_board = frames.camera[:, 2], frames.board[2]
+        off, covariance = _about_one(rot, noise)
     else:
         unknowns = 3
         off, covariance = _unturned(rot, noise)
     chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
     dof = max(off.size - unknowns, 0)
-    spread, expected_spread, pairs = _pairwise(rot, noise)
+    spread, expected_spread = _pairwise(rot, noise)
     return RotationAxis(
         hypothesis=hypothesis,
-        axis_camera=axis_camera,
-        axis_board=axis_board,
         tilt=np.linalg.norm(off, axis=-1),
         expected_tilt=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)),
         spread=spread,
         expected_spread=expected_spread,
-        pairs=pairs,
         chi2=chi2,
         dof=dof,
         p_value=float(chdtrc(dof, chi2)) if dof else 1.0,
@@ -154,8 +145,8 @@ def facing(direction: Array) -> Array:
     return np.stack([x, cross(direction, x), direction], axis=-1)
 
 
-def _about_one(rot: Array, noise: Array) -> tuple[Array, Array, Frames]:
-    """Tilts (N, 2), their covariance and the frames, by maximum likelihood."""
+def _about_one(rot: Array, noise: Array) -> tuple[Array, Array]:
+    """Tilts (N, 2) from one axis and their covariance, by maximum likelihood."""
     frames = axis_frames(rot)
     for _ in range(STEPS):
         off, by, own, covariance = _tilts(rot, noise, frames)
@@ -167,7 +158,7 @@ def _about_one(rot: Array, noise: Array) -> tuple[Array, Array, Frames]:
         turns = np.concatenate([step.reshape(2, 2), np.zeros((2, 1))], axis=1)
         frames = Frames(frames.camera @ rotation(turns[0]), rotation(turns[1]) @ frames.board)
     off, _, _, covariance = _tilts(rot, noise, frames)
-    return off, covariance, frames
+    return off, covariance
 
 
 def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Array, Array]:
@@ -194,9 +185,9 @@ def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
     return off, by @ noise @ by.mT
 
 
-def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
-    """Axes of the turns between two poses, in the camera frame: how far they spread (rad), what
-    noise alone would give, and their number.
+def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
+    """Axes of the turns between two poses, in the camera frame: how far they spread (rad), and what
+    noise alone would give.
 
     A turn phi with noise n of its two poses moves the axis by n / (2 sin(phi / 2)) across.
     """
@@ -208,7 +199,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
     angle = np.sqrt(dot(turn, turn))
     used = angle > LEAST_TURN
     if used.sum() < 2:
-        return np.nan, np.nan, int(used.sum())
+        return np.nan, np.nan
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]
     axis = turn / angle[:, None]
     main = np.linalg.eigh(axis.T @ axis)[1][:, -1]
@@ -223,4 +214,4 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
     covariance = covariance + back @ noise[i] @ back.mT
     expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
     found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
-    return float(found), float(expected), len(axis)
+    return float(found), float(expected)

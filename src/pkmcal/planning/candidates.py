@@ -13,13 +13,13 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.session.schema import Body
+from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.placement import (
     INSIDE,
     PANORAMIC,
     StationPlace,
     draw_configurations,
     fitting_distance,
-    legs_space,
     usable,
     view_angle,
 )
@@ -91,25 +91,21 @@ def places(machine: Machine, camera: Camera, board: Body | None = None) -> tuple
     board : whether there has to be room for one. Raises InputError for a camera that looks all
     round: it sees the legs best from their middle.
     """
-    half = view_angle(camera)
-    if half > PANORAMIC:
+    if view_angle(camera) > PANORAMIC:
         raise InputError(
             what="a camera that looks all round sees the legs best from their middle, so no place"
             " round the machine is looked for",
             where="--places",
             next_step="give its pose in session.yaml, between the legs",
         )
-    space = legs_space(machine)
-    centre = (space.min(axis=0) + space.max(axis=0)) / 2
-    radius = float(np.linalg.norm(space - centre, axis=1).max())
+    centre, radius = ball_of(legs_space(machine))
     away = fitting_distance(machine, camera, board) * radius
     out: list[StationPlace] = []
     for k, height in enumerate(RINGS):
         for azimuth in 2 * np.pi * (np.arange(AROUND) + 0.5 * (k % 2)) / AROUND:
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             way = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
-            position, target = centre + away * way, centre
-            out.append(StationPlace(_tuple(position), _tuple(target)))
+            out.append(StationPlace(_tuple(centre + away * way), _tuple(centre)))
     return tuple(out)
 
 

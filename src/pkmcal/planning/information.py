@@ -12,12 +12,13 @@ so that no frame is favoured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.saved import Known
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
@@ -41,17 +42,6 @@ PLACE = 1.0
 measurement, so that every choice has a covariance. A photograph tells a thousand times more."""
 FLOOR = 1e-12
 """Variance, in tolerances squared, of what a calibration holds exactly: an axis' own length."""
-
-
-@dataclass(frozen=True)
-class Known:
-    """What an earlier calibration knows. covariance : (P + 6 S', P + 6 S') of the machine's
-    parameters and of T_camera_base (left perturbation) of the ``stations`` (S') that stand where
-    they stood; all others have to be found anew.
-    """
-
-    covariance: Array
-    stations: Integers
 
 
 @dataclass(frozen=True)
@@ -117,11 +107,6 @@ class CandidateRows:
     machine: Array
     work: Array
 
-    def only(self, chosen: Integers) -> CandidateRows:
-        """Of some candidates."""
-        parts = self.rows[chosen], self.group[chosen], self.where[chosen]
-        return replace(self, rows=parts[0], group=parts[1], where=parts[2])
-
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
         """(na, na) information of a choice of candidates, each measured ``times`` over."""
         rows = self.rows[chosen].reshape(-1, self.rows.shape[-1])
@@ -155,7 +140,7 @@ def information_of(
 
     work : T_base_platform (M, 4, 4) where the tool counts. known : what an earlier calibration
     knows of the machine, in place of its drawing. rng : as for
-    :meth:`~pkmcal.planning.rig.Instrument.measure`. wanted : how many of each group are to be
+    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : how many of each group are to be
     measured in the end, all by default: edges that are shaded alike count together. Raises
     InputError where a group of stations measures nothing at any configuration.
     """
@@ -226,7 +211,7 @@ def _told_by(
     tolerance's variance: they move the kept stations with the machine, and no measurement minds.
     """
     u, n = problem.unknowns, len(machine.values)
-    kept = known.stations
+    kept = np.array(known.stations, dtype=int)
     to_free = np.zeros((u.n_free + 6 * len(kept), n + 6 * len(kept)))
     to_free[: u.n_free, :n] = problem.to_free
     to_free[u.n_free :, n:] = np.eye(6 * len(kept))

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.calibration.saved import Known
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.candidates import Configurations, configurations, neighbours, places
 from pkmcal.planning.exchange import INDICES, Told, exchanged, greedy
-from pkmcal.planning.information import CandidateRows, Candidates, Known, information_of
+from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import distances, length, shortest_way
 from pkmcal.planning.subject import Subject
@@ -427,7 +428,7 @@ def _with_places(
         wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
     few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
     part = Configurations(*(x[few] for x in drawn))
-    known = _of_machine(subject.known)
+    known = subject.known and subject.known.only(())
     infos = [_seen_from(wide.only([s]), part, work, known) for s in range(len(wide.names))]
     first = next((info for info in infos if info is not None), None)
     if first is None:
@@ -458,7 +459,10 @@ def _with_places(
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
         return replace(chosen, names=names), known, tried
-    return chosen, _kept(subject.known, best), tried
+    kept = subject.known and subject.known.only(best.tolist())
+    if kept is not None:  # by their new numbers
+        kept = replace(kept, stations=tuple(np.searchsorted(best, kept.stations).tolist()))
+    return chosen, kept, tried
 
 
 def _seen_from(
@@ -475,25 +479,6 @@ def _padded_root(information: Array) -> Array:
     """(p, p) rows R with R^T R = information, whose smallest eigenvalues may be rounding."""
     values, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-
-
-def _of_machine(known: Known | None) -> Known | None:
-    """What is known without any station's place."""
-    if known is None:
-        return None
-    n = len(known.covariance) - 6 * len(known.stations)
-    return Known(known.covariance[:n, :n], np.zeros(0, dtype=int))
-
-
-def _kept(known: Known | None, best: Integers) -> Known | None:
-    """What is known, with the stations that are left, by their new numbers."""
-    if known is None or not len(known.stations):
-        return known
-    n = len(known.covariance) - 6 * len(known.stations)
-    there = [k for k, s in enumerate(known.stations) if s in best]
-    at = np.concatenate([np.arange(n), *(n + 6 * k + np.arange(6) for k in there)])
-    numbers = np.array([int(np.flatnonzero(best == known.stations[k])[0]) for k in there], int)
-    return Known(known.covariance[np.ix_(at, at)], numbers)
 
 
 def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:

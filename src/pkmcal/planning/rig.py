@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,25 +51,6 @@ class At(NamedTuple):
     T_base_platform: Array
 
 
-class Instrument(Protocol):
-    """One way in which a station measures. station : its number."""
-
-    @property
-    def station(self) -> int: ...
-
-    def at_station(self, number: int) -> Instrument:
-        """The same with another number of its station."""
-        ...
-
-    def measure(
-        self, at: At, rows: Integers, rng: np.random.Generator | None, /
-    ) -> EdgeSet | PoseSet:
-        """What is measured of configurations ``rows``. rng : draws how good each measurement turns
-        out; without it each is as good as such a one is on average.
-        """
-        ...
-
-
 def nominal_pools(machine: Machine, sigma: float = EDGE) -> Pools:
     """Edges that are all found, sigma (px) off across and as much by turning."""
     one = EdgePool(np.eye(2)[None] / sigma**2, np.ones(1), np.ones(1))
@@ -85,12 +66,10 @@ class LegsFrom:
     T_camera_base: Array
     pools: Pools
 
-    def at_station(self, number: int) -> LegsFrom:
-        """The same with another number of its station."""
-        return replace(self, station=number)
-
     def measure(self, at: At, rows: Integers, rng: np.random.Generator | None, /) -> EdgeSet:
-        """Edges of the legs."""
+        """Edges of the legs. rng : draws how good each turns out; without it each is as good as
+        such a one is on average.
+        """
         pairs = np.stack([np.zeros_like(rows), rows], axis=-1)
         edges, _ = simulate_edges(
             at.machine,
@@ -120,10 +99,6 @@ class BoardFrom:
     T_platform_board: Array
     sigma: float = CORNER
     mount: int = 0
-
-    def at_station(self, number: int) -> BoardFrom:
-        """The same with another number of its station."""
-        return replace(self, station=number)
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
         """The board's pose wherever enough corners are seen."""
@@ -169,16 +144,16 @@ class TargetFrom:
     whiten: Array
     mount: int = 0
 
-    def at_station(self, number: int) -> TargetFrom:
-        """The same with another number of its station."""
-        return replace(self, station=number)
-
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
         """The target's pose at every configuration."""
         T = self.T_tracker_base @ at.T_base_platform[rows] @ self.T_platform_target
         n = len(rows)
         whiten = np.broadcast_to(self.whiten, (n, 6, 6)).copy()
         return PoseSet(np.full(n, self.station), rows, np.full(n, self.mount), T, whiten)
+
+
+Instrument = LegsFrom | BoardFrom | TargetFrom
+"""One way in which the station of a number measures configurations ``rows`` of a machine."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +190,7 @@ class Rig:
             T_station_base=self.T_station_base[list(stations)],
             camera_of_station=np.unique(cameras, return_inverse=True)[1].reshape(-1),
             instruments=tuple(
-                one.at_station(number[one.station])
+                replace(one, station=number[one.station])
                 for one in self.instruments
                 if one.station in number
             ),
@@ -228,7 +203,7 @@ class Rig:
         """What is measured at joints (K, m), T_base_platform (K, 4, 4).
 
         pairs : (M, 2) stations and configurations that they measure. rng : as for
-        :meth:`Instrument.measure`.
+        :meth:`LegsFrom.measure`.
         """
         edges, poses = [EdgeSet.empty()], [PoseSet.empty()]
         at = At(self.machine, joints, T_base_platform)

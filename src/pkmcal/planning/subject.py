@@ -21,7 +21,7 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.results import EVERYTHING
 from pkmcal.calibration.same_machine import read
-from pkmcal.calibration.saved import SavedCalibration, load
+from pkmcal.calibration.saved import Known, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse
@@ -30,7 +30,6 @@ from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import Pools, first_edges, spread_over
-from pkmcal.planning.information import Known
 from pkmcal.planning.rig import (
     CORNER,
     EDGE,
@@ -246,41 +245,18 @@ def of_session(
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
-    found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
-    rig = Rig(
-        session.machine,
-        session.station_names,
-        T_camera_base,
-        session.camera_of_station,
-        session.joint_noise,
-        found.instruments,
-        found.mounts,
-        found.T_mount,
-        found.shading,
-    )
-    known = None if saved is None else _known(saved, session, same_place)
+    rig, board, told = _rig(session, saved, seen, T_camera_base, edge, corner, seed)
+    known = None
+    if saved is not None:
+        kept = [name for name in session.station_names if same_place and name in saved.placed]
+        known = saved.known(kept, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
-    fields = found.board.document if found.board else None
-    return Subject(rig, known, columns, names, (*words, *found.words), fields)
+    fields = board.document if board else None
+    return Subject(rig, known, columns, names, (*words, *told), fields)
 
 
-class _Instruments(NamedTuple):
-    """What a session's stations and trackers measure with.
-
-    T_mount : (M, 4, 4) of what is measured on the platform. shading : of a leg's edges, in a
-    station. board : on the platform. words : where the noise is known from.
-    """
-
-    instruments: tuple[Instrument, ...]
-    mounts: tuple[Mount, ...]
-    T_mount: Array
-    shading: float
-    board: Board | None
-    words: tuple[str, ...]
-
-
-def _instruments(
+def _rig(
     session: Session,
     saved: SavedCalibration | None,
     seen: _Photographed,
@@ -288,8 +264,10 @@ def _instruments(
     edge: float,
     corner: float,
     seed: int,
-) -> _Instruments:
-    """As :func:`of_session`; T_camera_base : (S, 4, 4) of stations and trackers."""
+) -> tuple[Rig, Board | None, list[str]]:
+    """What a session's stations and trackers measure with, the board on the platform, and where the
+    noise is known from, in words. As :func:`of_session`; T_camera_base : (S, 4, 4).
+    """
     words: list[str] = []
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
@@ -322,8 +300,18 @@ def _instruments(
         T_mount.append(np.eye(4) if place is None else place)
         target = TargetFrom(s, T_camera_base[s], T_mount[-1], table.whiten, len(mounts) - 1)
         instruments.append(target)
-    poses = np.array(T_mount).reshape(-1, 4, 4)
-    return _Instruments(tuple(instruments), tuple(mounts), poses, shading, board, tuple(words))
+    rig = Rig(
+        session.machine,
+        session.station_names,
+        T_camera_base,
+        session.camera_of_station,
+        session.joint_noise,
+        tuple(instruments),
+        tuple(mounts),
+        np.array(T_mount).reshape(-1, 4, 4),
+        shading,
+    )
+    return rig, board, words
 
 
 def _one_camera(session: Session) -> Session:
@@ -467,12 +455,3 @@ def _board_place(
         return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
     except GeometryError as error:
         raise error.as_input("session.yaml, stations") from None
-
-
-def _known(saved: SavedCalibration, session: Session, same_place: bool) -> Known:
-    """What a calibration knows: of the machine, and of the stations that stand as they stood."""
-    if not same_place:
-        return Known(saved.covariance, np.zeros(0, dtype=int))
-    kept = [k for k, name in enumerate(session.station_names) if name in saved.placed]
-    names = [session.station_names[k] for k in kept]
-    return Known(saved.with_stations(names), np.array(kept, dtype=int))

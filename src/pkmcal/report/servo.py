@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, rms
-from pkmcal.control.source import Controlled
 from pkmcal.control.study import Study, Trials
 from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
@@ -42,17 +41,17 @@ HOW = (
 )
 
 
-def outcome_of(subject: Controlled, found: Study) -> Outcome:
+def outcome_of(found: Study) -> Outcome:
     """Everything that `pkmcal servo` tells and writes."""
     verdict, run = judgement(found), shown_run(found)
-    document = document_of(subject, found, verdict)
+    document = document_of(found, verdict)
     ends = ends_table(found)
     return Outcome(
         command="servo",
-        title=f"Control by the legs of {subject.name}",
+        title=f"Control by the legs of {found.scene.machine.name}",
         verdict=verdict,
         kicker="visual servoing, simulated",
-        subject=subject.origin,
+        subject=found.scene.origin,
         stamp="It works in simulation" if verdict.usable else "Not to be used",
         figures=cards(found),
         parts=(
@@ -112,7 +111,7 @@ def outcome_of(subject: Controlled, found: Study) -> Outcome:
             Part("legs", "Legs", tables=(choices_table(found),)),
             Part("how", "How it was computed", HOW, tables=(settings_table(found),)),
         ),
-        findings=tuple(doubtful(text) for text in subject.warnings),
+        findings=tuple(doubtful(text) for text in found.scene.warnings),
         document=document,
         summary={name: value for name, value in document.items() if name != "curves"},
     )
@@ -132,16 +131,16 @@ def stillness(s: Study) -> str:
     )
 
 
-def document_of(subject: Controlled, s: Study, verdict: Verdict) -> dict[str, Any]:
+def document_of(s: Study, verdict: Verdict) -> dict[str, Any]:
     """Plain data for JSON: m, rad, s; legs count from 1."""
     return {
-        "machine": subject.name,
-        "origin": subject.origin,
-        "station": subject.station,
+        "machine": s.scene.machine.name,
+        "origin": s.scene.origin,
+        "station": s.scene.station,
         "usable": verdict.usable,
         "headline": verdict.headline,
         "reasons": verdict.reasons,
-        "warnings": (*subject.warnings, *verdict.warnings),
+        "warnings": (*s.scene.warnings, *verdict.warnings),
         "advice": verdict.advice,
         "settings": _settings(s),
         "estimates": {o.estimate.name: _outcome_document(o) for o in s.outcomes},

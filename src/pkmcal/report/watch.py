@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.judge.changes import POWER, ChiSquare, LegTest
+from pkmcal.identify.score import Score
+from pkmcal.judge.changes import POWER, LegTest
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, doubtful
@@ -216,12 +217,12 @@ def chance_text(chance: float) -> str:
     return f"{chance:.2g}" if chance < 0.995 else "1"
 
 
-def _cells(test: ChiSquare) -> tuple[str, str, str]:
+def _cells(test: Score) -> tuple[str, str, str]:
     told = (number(test.chi2, 1), chance_text(test.adjusted)) if test.dof else (NONE, NONE)
     return told[0], str(test.dof), told[1]
 
 
-def _statistic(test: ChiSquare | None) -> str:
+def _statistic(test: Score | None) -> str:
     return f"{number(test.chi2, 1)} / {test.dof}" if test is not None and test.dof else NONE
 
 
@@ -253,7 +254,7 @@ def _statistics(w: Watch) -> charts.BarChart | None:
     )
 
 
-def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.UprightBar:
+def _bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
     from scipy.special import chdtri
 
     limits = [float(chdtri(t.dof, level)) for t in tests]

@@ -21,7 +21,7 @@ from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.session.schema import Body
-from pkmcal.simulation.drives import reaches
+from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.render import ScenePart
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned
@@ -138,9 +138,7 @@ def board_for(machine: Machine, on: Body = "base") -> Board:
     discs = discs_of(machine)
     diagonal = SIZE * discs.base_radius
     if on == "platform":
-        points = np.concatenate([ends.reshape(-1, 3) for ends in reaches(machine)])
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        space = float(np.linalg.norm(points - centre, axis=1).max())
+        space = ball_of(legs_space(machine))[1]
         diagonal = max(ON_PLATFORM * discs.platform_radius, IN_PICTURE * space)
     squares = SQUARES[on]
     square = round(diagonal / float(np.hypot(squares[0] + 1, squares[1] + 1)), 3)

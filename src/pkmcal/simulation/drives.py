@@ -170,6 +170,17 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
     return np.array(ends.a), np.array(ends.b)
 
 
+def legs_space(machine: Machine) -> Array:
+    """Points (n, 3) that a picture of the machine has to hold, base frame, m."""
+    return np.concatenate([ends.reshape(-1, 3) for ends in reaches(machine)])
+
+
+def ball_of(points: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius, m, of the ball about the middle of points (n, 3) that holds them."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
 def side_bars(machine: Machine) -> tuple[Integers, ...]:
     """Legs of each body of an articulated platform, in the order of their numbers."""
     on = bodies(machine.document)

@@ -18,10 +18,11 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse, look_at, perturb, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
-from pkmcal.mechanisms.kinematics import on_manifold, singularity
+from pkmcal.mechanisms.kinematics import on_manifold, scaled_rows, singularity_of
+from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
-from pkmcal.simulation.drives import drives_of, reaches
+from pkmcal.simulation.drives import ball_of, drives_of, legs_space, reaches
 from pkmcal.wording import listed
 
 FARTHEST_TILT = np.deg2rad(35)
@@ -109,16 +110,15 @@ def draw_configurations(
 def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     """(n,) True where closed, in the home's assembly, not tilted far, legs clear of each other."""
     layout, values, home = machine.layout, machine.values, machine.home()
-    at_home = closure(layout, values, machine.inverse(home[None])[0], home)
     c = closure(layout, values, joints, T_base_platform)
-    jac, home_jac = (x.rows.by_pose @ layout.motion for x in (c, at_home))
+    at_home = closure(layout, values, machine.inverse(home[None])[0], home)
+    rows, home_rows = scaled_rows(c), scaled_rows(at_home)
     good = np.abs(c.rows.value).max(axis=-1) < 1e-9
     # a machine that is weak at home is weak everywhere; it is not refused for that
-    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.rows.by_pose)))
-    good &= singularity(layout, values, c.rows.by_pose) > least
-    if jac.shape[-1] == jac.shape[-2]:
-        with np.errstate(invalid="ignore"):  # where there is no Jacobian, nothing is usable
-            good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
+    good &= singularity_of(layout, rows) > min(
+        LEAST_SINGULAR, 0.4 * float(singularity_of(layout, home_rows))
+    )
+    good &= sign_of(rows) == sign_of(home_rows)
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
     good &= unfolded(machine, T_base_platform)
     return good & _legs_apart(machine, T_base_platform, joints)
@@ -262,9 +262,9 @@ def default_stations(
         half = view_angle(camera)
         away = fitting_distance(machine, camera, board)
         if distance is not None:
-            away = distance / _radius(space)
+            away = distance / ball_of(space)[1]
         if half > PANORAMIC:
-            poses.append(_inside(*_space(machine), rng))
+            poses.append(_inside(machine, rng))
         elif len(cameras) == 1 and board != "base" and len(tubes_of(machine)):
             poses.append(_clearest(machine, camera, away, start, rng, elevation))
         else:
@@ -280,9 +280,7 @@ def places_by_hand(
     machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
 ) -> tuple[StationPlace, ...]:
     """A place for each photograph of someone who walks round the machine, evenly but for a step."""
-    space = legs_space(machine)
-    centre = (space.min(axis=0) + space.max(axis=0)) / 2
-    radius = float(np.linalg.norm(space - centre, axis=1).max())
+    centre, radius = ball_of(legs_space(machine))
     start, out = rng.uniform(0, 2 * np.pi), list[StationPlace]()
     # three turns about the machine, so that photographs of one configuration are not side by side
     turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
@@ -306,20 +304,14 @@ def places_by_hand(
     return tuple(out)
 
 
-def legs_space(machine: Machine) -> Array:
-    """Points (n, 3) that a picture of the machine has to hold, base frame, m."""
-    return np.concatenate(_space(machine))
-
-
 def fitting_distance(machine: Machine, camera: Camera, board: Body | None = None) -> float:
     """From which the machine, and the board, fill the camera's picture, in the machine's radius."""
-    return _distance(machine, min(view_angle(camera), NEAREST), board)
-
-
-def _space(machine: Machine) -> tuple[Array, Array]:
-    """Legs' ends A and B (n, 3), base frame, m, that a picture of the machine has to hold."""
-    a, b = reaches(machine)
-    return a.reshape(-1, 3), b.reshape(-1, 3)
+    if len(reaches(machine)[0]) > 1 and board != "base":
+        share = FULL
+    else:
+        share = SPARE if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
+    half = min(view_angle(camera), NEAREST)
+    return float(share / np.sin(max(half, NARROWEST)))
 
 
 def _clearest(
@@ -349,8 +341,7 @@ def _clearest(
 
 def _is_flat(points: Array) -> bool:
     """Whether joints (n, 3) lie in about one level."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    return bool(np.ptp(points[:, 2]) < 0.25 * np.linalg.norm(points - centre, axis=1).max())
+    return bool(np.ptp(points[:, 2]) < 0.25 * ball_of(points)[1])
 
 
 def view_angle(camera: Camera) -> float:
@@ -387,18 +378,6 @@ def _rounded(v: Array) -> Vector:
     return x, y, z
 
 
-def _distance(machine: Machine, half: float, board: Body | None) -> float:
-    """From which the machine, and the board, fill the picture, in the machine's own radius.
-
-    half : of the view, rad.
-    """
-    if len(reaches(machine)[0]) > 1 and board != "base":
-        share = FULL
-    else:
-        share = SPARE if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
-    return float(share / np.sin(max(half, NARROWEST)))
-
-
 def _outside(
     points: Array,
     distance: float,
@@ -407,9 +386,8 @@ def _outside(
     elevation: float | None,
 ) -> StationPlace:
     """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
-    centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, _radius(points)
-    flat = _is_flat(points)
-    usual = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    centre, radius = ball_of(points)
+    usual = np.deg2rad(rng.uniform(42, 55) if _is_flat(points) else rng.uniform(7, 17))
     above = usual if elevation is None else elevation
     way = np.array(
         [np.cos(azimuth) * np.cos(above), np.sin(azimuth) * np.cos(above), np.sin(above)]
@@ -420,14 +398,9 @@ def _outside(
     return StationPlace(_rounded(position), _rounded(target), _rounded(up))
 
 
-def _radius(points: Array) -> float:
-    """Of the ball about the middle of points (n, 3) that holds them, m."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    return float(np.linalg.norm(points - centre, axis=1).max())
-
-
-def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPlace:
+def _inside(machine: Machine, rng: np.random.Generator) -> StationPlace:
     """Between the legs, a little above the base joints, looking at the platform."""
+    a, b = (ends.reshape(-1, 3) for ends in reaches(machine))
     middle, rise = a.mean(axis=0), b.mean(axis=0) - a.mean(axis=0)
     width = float(np.linalg.norm(a - middle, axis=1).max())
     position = middle + 0.15 * rise + np.array([*rng.uniform(-0.15, 0.15, 2), 0.0]) * width
@@ -440,19 +413,13 @@ def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPlace:
 def in_picture(
     machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> Booleans:
-    """(K,) whether a photograph of each configuration shows the machine: a leg may lose its end to
-    the border; a picture with half a machine is a bad photograph.
+    """(K,) whether a photograph of each configuration, poses (K, 4, 4) and readings (K, m), shows
+    the machine: a leg may lose its end to the border; a picture with half a machine is a bad
+    photograph.
     """
-    share = share_in_image(machine, camera, T_camera_base, T_base_platform, joints)
-    return (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)
-
-
-def share_in_image(
-    machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
-) -> Array:
-    """Part of each leg that lies in the image, (K, L), for poses (K, 4, 4) and readings (K, m)."""
     ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.96, 12)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     pixels = camera.project(apply(T_camera_base, points))
-    return camera.in_image(pixels, margin=6.0).mean(axis=-1)
+    share = camera.in_image(pixels, margin=6.0).mean(axis=-1)
+    return (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)

@@ -51,6 +51,10 @@ class Scene:
     parts: tuple[ScenePart, ...]
     lighting: Lighting
 
+    def having(self, parts: Sequence[ScenePart]) -> Scene:
+        """The same with further parts."""
+        return Scene((*parts, *self.parts), self.lighting)
+
 
 @dataclass(frozen=True)
 class Bounds:

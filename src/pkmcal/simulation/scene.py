@@ -450,18 +450,6 @@ def _rod(start: Array, stop: Array, radius: float, material: Material) -> SceneP
     return ScenePart(Cylinder(start, (stop - start) / length, radius, length), material)
 
 
-@dataclass(frozen=True)
-class Room:
-    """Everything but the machine: parts and lamps."""
-
-    parts: tuple[ScenePart, ...]
-    lighting: Lighting
-
-    def with_machine(self, parts: list[ScenePart]) -> Scene:
-        """The scene with the machine in one pose."""
-        return Scene((*parts, *self.parts), self.lighting)
-
-
 def room_of(
     discs: Discs,
     reach: float,
@@ -469,7 +457,7 @@ def room_of(
     rng: np.random.Generator,
     lit_from: float | None = None,
     light: Light = "usual",
-) -> Room:
+) -> Scene:
     """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre.
 
     lit_from : azimuth (rad) about which the key lamp stands, where a plate would shade a board.
@@ -494,7 +482,7 @@ def room_of(
         for lamp in lamps
     ]
     sky, ground = AROUND[discs.drives.any]
-    return Room((*parts, *bulbs), Lighting(lamps, around * sky, around * ground))
+    return Scene((*parts, *bulbs), Lighting(lamps, around * sky, around * ground))
 
 
 def _table(

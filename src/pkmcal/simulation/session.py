@@ -21,8 +21,8 @@ from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.mechanisms.carriers.contract import PLANAR
 from pkmcal.simulation.board import board_part, holder_part
 from pkmcal.simulation.placement import check_drawable, one_a_station
-from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
-from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render
+from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import (
     FILE,
@@ -85,7 +85,7 @@ class Studio:
     truth: Truth
     discs: Discs
     finish: Finish
-    room: Room
+    room: Scene
     cameras: tuple[Camera, ...]
     views: Mapping[int, PixelRays]
     sensor: Sensor
@@ -145,7 +145,7 @@ class Studio:
         if on_platform is not None and self.board is not None:
             parts.append(board_part(self.board, poses[k] @ on_platform))
             parts.append(holder_part(self.board, on_platform, poses[k], self.discs))
-        scene = self.room.with_machine([*parts, *self.fixed])
+        scene = self.room.having([*parts, *self.fixed])
         camera = self.cameras[station]
         view = self.views.get(id(camera)) or PixelRays.of(camera)
         return render(scene, view, T_camera_base, rng)

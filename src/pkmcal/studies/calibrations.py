@@ -89,8 +89,7 @@ class SimulatedSessions:
     """One batch of simulated sessions, ready to be calibrated.
 
     capture : their plan. theta (B, P), poses (B, K, 4, 4), internal (B, K, n) : the truth.
-    assembled : the least-squares problem of all runs. start : where it begins. drawn : (B,) times
-    that a machine was drawn.
+    assembled : the least-squares problem of all runs. start : where it begins.
     """
 
     capture: Capture
@@ -99,7 +98,6 @@ class SimulatedSessions:
     internal: Array
     assembled: Assembled
     start: BatchState
-    drawn: Integers
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class SimulatedCalibrations:
         """True machines, their poses at the plan's readings, and what is measured of them."""
         design, rng = self.design, batch.generator(0)
         capture = captured(design, batch.generator(PLAN))
-        theta, poses, internal, drawn = _machines(design, capture, batch.runs, rng)
+        theta, poses, internal = _machines(design, capture, batch.runs, rng)
         readings = capture.joints + design.reading_noise * rng.standard_normal(
             (batch.runs, *capture.joints.shape)
         )
@@ -153,7 +151,7 @@ class SimulatedCalibrations:
         there = problem.prior_values(start).mean(axis=0)  # a metre's knowledge: one for all runs
         target = np.where(mounts, there, problem.prior_target)
         assembled = replace(one, problem=replace(problem, prior_target=target))
-        return SimulatedSessions(capture, theta, poses, internal, assembled, start, drawn)
+        return SimulatedSessions(capture, theta, poses, internal, assembled, start)
 
     def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
         """The joint estimate, told in the result's frames."""
@@ -250,7 +248,7 @@ def tool_difference(
     the standard deviations that the calibration states of that: (W, 6) each, (omega, tau).
 
     theta (P,), covariance (P, P) : of the result. joints (W, m). Frames of the truth are laid over
-    the result's as :func:`pkmcal.identify.tool.tool_point` has it; every : as where no legs were
+    the result's as :func:`pkmcal.identify.tool.tool_error` has it; every : as where no legs were
     seen. NaN where a machine cannot take the readings.
     """
     n = len(theta)
@@ -311,9 +309,9 @@ def _truth(data: SimulatedSessions, run: int) -> State:
 
 def _machines(
     design: Design, capture: Capture, runs: int, rng: np.random.Generator
-) -> tuple[Array, Array, Array, Integers]:
+) -> tuple[Array, Array, Array]:
     """True machines (B, P) as they might be built, their poses (B, K, 4, 4) and hinges at the
-    plan's readings, and how often each was drawn until it could take them.
+    plan's readings.
     """
     machine, table = capture.machine, capture.machine.parameters
     tolerance, free = design.tolerance * table.tolerances_free(), table.free_matrix()
@@ -321,7 +319,7 @@ def _machines(
     theta = np.empty((runs, len(table)))
     poses = np.empty((runs, *start.T_base_platform.shape))
     internal = np.empty((runs, *start.internal.shape))
-    left, drawn = np.arange(runs), np.zeros(runs, dtype=int)
+    left = np.arange(runs)
     for _ in range(REDRAWN):
         step = tolerance * rng.standard_normal((len(left), len(tolerance)))
         theta[left] = table.unit_axes(table.drawing + step @ free.T)
@@ -329,10 +327,9 @@ def _machines(
             machine.layout, theta[left, None], capture.joints, start.T_base_platform, start.internal
         )
         poses[left], internal[left] = found.T_base_platform, found.internal
-        drawn[left] += 1
         left = left[~found.converged.all(axis=1)]
         if not left.size:
-            return theta, poses, internal, drawn
+            return theta, poses, internal
     raise ResultError(
         "machines within the drawing's tolerances cannot take the readings of the plan",
         found=f"{left.size} of {runs} machines, drawn {REDRAWN} times",

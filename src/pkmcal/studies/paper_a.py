@@ -34,7 +34,7 @@ from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, wi
 from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
-from pkmcal.papers.four_step import Form, FourSteps, solve
+from pkmcal.papers.four_step import Form, parameters_of, solve
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.studies.calibrations import ESTIMATE, judged
 from pkmcal.studies.calibrations import QUANTITIES as CALIBRATED
@@ -76,7 +76,7 @@ EFFECTOR = ("displacement", "orientation", "displacement_registered", "orientati
 """Mean error of the end-effector at random poses, [A] eq. 20, in frames by the centres 1, 3 and 5;
 then with frames registered on all centres, so that the error of the frames' own definition by three
 joints is left out."""
-QUANTITIES = {
+QUANTITIES: Mapping[str, Quantity] = {
     **{name: Quantity("rms", 1e3, "mm") for name in (*GROUPS, "parameters")},
     **{
         name: Quantity("mean", *((1e3, "mm") if "displacement" in name else (DEGREE, "°")))
@@ -212,30 +212,18 @@ def _sample(
 
 
 @dataclass(frozen=True)
-class JointByAxes:
-    """The joint estimate from the corrected four steps. axes : [A] 4.3."""
-
-    axes: HexapodByAxes = field(default_factory=HexapodByAxes)
+class JointByAxes(HexapodByAxes):
+    """The joint estimate of the same machines from the corrected four steps, judged as all
+    simulated calibrations are.
+    """
 
     doing = "Joint calibrations of [A] 4.3"
-
-    @property
-    def quantities(self) -> Mapping[str, Quantity]:
-        """As of all simulated calibrations."""
-        return CALIBRATED
+    quantities = CALIBRATED
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """Names and units of the thirty parameters."""
         return tuple((name, "m") for name in thirty(study_machine()).names)
-
-    def populations(self, runs: int) -> list[Population]:
-        """As of all methods."""
-        return self.axes.populations(runs)
-
-    def draw(self, batch: Batch) -> SimulatedRuns:
-        """As for all methods."""
-        return self.axes.draw(batch)
 
     def solve(
         self,
@@ -346,15 +334,6 @@ def measured_axes(data: SimulatedRuns) -> Axes:
     full_u, full_point = np.zeros((2, n_runs, n_photos, n_legs, 3))
     full_u[:, k, legs], full_point[:, k, legs] = u, point
     return Axes(station, np.arange(n_photos), seen, full_u, full_point, data.joints)
-
-
-def parameters_of(machine: Machine, steps: FourSteps) -> Array:
-    """All parameters (B, P) with those that the steps found."""
-    base, platform = centre_index(machine.layout)
-    theta = np.tile(machine.parameters.drawing, (len(steps.base), 1))
-    theta[:, base], theta[:, platform] = steps.base, steps.platform
-    theta[:, machine.layout.rod] = steps.offsets
-    return theta
 
 
 class Start(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Outcome, Part, Row, Table
-from pkmcal.pages.plots import AXIS, LOOKS
+from pkmcal.pages.plots import AXIS, CLEAR, LOOKS, bars, trace
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_a import (
@@ -269,23 +269,24 @@ def _figure_part(words: Words, s: Found) -> Part:
 
 def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) -> dict[str, Any]:
     """True values (30,) as a line, mean errors (30,) of each method as bars below; m."""
-    in_mm = {method: np.round(1e3 * error, 4).tolist() for method, error in errors.items()}
+    in_mm = {method: 1e3 * error for method, error in errors.items()}
     colours = {PRINTED: "--quiet", CORRECTED: "--drawing", JOINT: "--calibrated"}
     data = [
-        *(_bars(LABELS[m], names, in_mm[m], "mm", color=colour) for m, colour in colours.items()),
-        _bars(LABELS[BOUND], names, in_mm[BOUND], "mm",  # no estimate, so not filled
-             color="rgba(0,0,0,0)", line={"color": "--ink", "width": 1.2}),
-        _series(
+        *(bars(LABELS[m], names, in_mm[m], color=colour) for m, colour in colours.items()),
+        bars(LABELS[BOUND], names, in_mm[BOUND],  # no estimate, so not filled
+             color=CLEAR, line={"color": "--ink", "width": 1.2}),
+        trace(
             LABELS[DRAWING], names, in_mm[DRAWING], "--muted", "markers",
             marker={"symbol": "line-ew-open", "size": 22, "color": "--muted",
                     "line": {"width": 2, "color": "--muted"}},
-            hovertemplate="%{x}: %{y:.3f} mm",
         ),
-        _series(
-            "true value", names, (1e3 * values).tolist(), "--leg3", "lines+markers", yaxis="y2",
-            marker={"size": 5, "color": "--leg3"}, hovertemplate="%{x}: %{y:.1f} mm",
+        trace(
+            "true value", names, 1e3 * values, "--leg3", yaxis="y2",
+            marker={"size": 5, "color": "--leg3"},
         ),
     ]  # fmt: skip
+    for each in data:
+        each["hovertemplate"] = "%{x}: %{y:.4g} mm"
     low, high = (1e3 * v for v in MEAN_ERRORS)
     band = {
         "type": "rect", "layer": "below", "fillcolor": "--band", "line": {"width": 0},
@@ -311,7 +312,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
         "shapes": [band],
         "annotations": [said],
     }  # fmt: skip
-    return {"data": data, "layout": layout, "config": {}}
+    return {"data": data, "layout": layout}
 
 
 def _effector_table(s: Found) -> Table:
@@ -377,15 +378,15 @@ def _poses_part(words: Words, studies: dict[int, Found]) -> Part:
 def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict[str, Any]:
     """End-effector (mm) by poses a station, on logarithmic axes."""
     as_root = [least[-1] * (poses[-1] / n) ** 0.5 for n in poses]
-    two_sigma = [round(2 * s.error, 4) for s in found]
+    two_sigma = [2 * s.error for s in found]
     data = [
-        _series("Cramér-Rao bound", poses, least, "--ink", "lines",
+        trace("Cramér-Rao bound", poses, least, "--ink", "lines",
                line={"color": "--ink", "dash": "dot", "width": 1.5}),
-        _series("as N to the power of −½", poses, as_root, "--quiet", "lines",
+        trace("as N to the power of −½", poses, as_root, "--quiet", "lines",
                line={"color": "--quiet", "dash": "dash", "width": 1.5}),
-        _series("joint estimate", poses, [s.value for s in found], "--calibrated", "lines+markers",
+        trace("joint estimate", poses, [s.value for s in found], "--calibrated",
                error_y={"array": two_sigma, "color": "--calibrated"}),
-        _series("independent prototype", [*PROTOTYPE_POSES], [*PROTOTYPE_POSES.values()],
+        trace("independent prototype", PROTOTYPE_POSES, PROTOTYPE_POSES.values(),
                "--drawing", "markers",
                marker={"color": "--drawing", "size": 9, "symbol": "diamond-open"}),
     ]  # fmt: skip
@@ -393,39 +394,11 @@ def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict
     layout = {
         **LOOKS,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 48},
-        "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": CLEAR},
         "xaxis": {**axis, "tickvals": poses, "title": {"text": "poses a station, N"}},
         "yaxis": {**axis, "tickvals": TICKS, "title": {"text": "displacement, mm"}},
     }
-    return {"data": data, "layout": layout, "config": {}}
-
-
-def _bars(name: str, x: Sequence[str], y: Sequence[float], unit: str, **marker: Any) -> Any:
-    """One method's bars."""
-    return {
-        "type": "bar",
-        "name": name,
-        "x": list(x),
-        "y": list(y),
-        "marker": marker,
-        "hovertemplate": f"%{{x}}: %{{y:.3f}} {unit}",
-    }
-
-
-def _series(
-    name: str, x: Sequence[Any], y: Sequence[float], colour: str, mode: str, **more: Any
-) -> dict[str, Any]:
-    """A line, marks, or both. more : of Plotly's scatter trace, over what stands here."""
-    return {
-        "type": "scatter",
-        "mode": mode,
-        "name": name,
-        "x": list(x),
-        "y": [round(v, 4) for v in y],
-        "line": {"color": colour, "width": 1.5},
-        "marker": {"color": colour, "size": 8},
-        **more,
-    }
+    return {"data": data, "layout": layout}
 
 
 # ------------------------------------------------------------------ for programs

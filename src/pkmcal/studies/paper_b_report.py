@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
 from pkmcal.outcome import Outcome, Part, Row, Table
-from pkmcal.pages.plots import plane
+from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_b import (
     CASES,
@@ -209,11 +209,11 @@ def _shares(s: Found) -> dict[str, Any]:
                                 ("35 % wrong", 35))
             if method in CASES[case].methods
         }  # fmt: skip
-        trace = _trace(LABELS[method], list(cases), list(cases.values()), colour, "lines+markers")
-        data.append({**trace, "hovertemplate": "%{y:.3g} mm with %{x} %"})
+        drawn = trace(LABELS[method], cases, cases.values(), colour)
+        data.append({**drawn, "hovertemplate": "%{y:.3g} mm with %{x} %"})
     layout = plane("wrong edges, %", "error of a joint, mm")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
-    return {"data": data, "layout": layout, "config": {}}
+    return {"data": data, "layout": layout}
 
 
 def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[
     gap = np.full((1, 2), np.nan)
     legs = np.concatenate([np.concatenate([leg, gap]) for leg in pixels])
     true, estimated = (camera.project(points) for points in _joints(s, view))
-    data = [_trace("legs at home", legs[:, 0], legs[:, 1], "--quiet", "lines")]
+    data = [trace("legs at home", legs[:, 0], legs[:, 1], "--quiet", "lines")]
     if ran is None:
         data.append(_marks("true joints", true, "--ink", "x-thin", 11))
     else:
@@ -250,7 +250,7 @@ def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict
     framed = {"showline": True, "mirror": True, "constrain": "domain"}
     layout["xaxis"] |= {**framed, "range": [-0.5, width - 0.5]}
     layout["yaxis"] |= {**framed, "range": [height - 0.5, -0.5], "scaleanchor": "x"}
-    return {"figure": {"data": data, "layout": layout, "config": {}}, "height": 500}
+    return {"figure": {"data": data, "layout": layout}, "height": 500}
 
 
 def _geometry_part(words: Words, s: Found) -> Part:
@@ -273,8 +273,8 @@ def _geometry_part(words: Words, s: Found) -> Part:
         ]
         layout = plane("xyz"[axes[0]] + ", m", "xyz"[axes[1]] + ", m")
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
-        figure = {"data": data, "layout": layout, "config": dict[str, Any]()}
-        plots[name] = {"figure": figure, "height": 300 if name == "lateral" else 420}
+        height = 300 if name == "lateral" else 420
+        plots[name] = {"figure": {"data": data, "layout": layout}, "height": height}
     return words.part("figure-7", plots=plots)
 
 
@@ -289,12 +289,12 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
     for leg in np.argsort(-(base + platform)[:, 2]):
         first, second = edges[ran.eye.true.legs.tolist().index(leg)]
         outline = np.concatenate([first, second[::-1], first[:1]])
-        drawn = _trace(f"leg {leg + 1}", outline[:, 0], outline[:, 1], f"--leg{leg + 1}", "lines")
+        drawn = trace(f"leg {leg + 1}", outline[:, 0], outline[:, 1], f"--leg{leg + 1}", "lines")
         data.append({**drawn, "fill": "toself", "fillcolor": "--card", "legendrank": int(leg)})
     x, y, _ = (machine.platform_centers() - machine.platform_centers().mean(axis=0)).T
     around = np.argsort(np.arctan2(y, x))
     ring = camera.project(platform)[[*around, around[0]]]
-    data.append(_trace("platform", ring[:, 0], ring[:, 1], "--ink", "lines"))
+    data.append(trace("platform", ring[:, 0], ring[:, 1], "--ink", "lines"))
     data.append(_marks("base joints", camera.project(base), "--ink", "circle", 6))
     return _photograph(camera.image_size, data)
 
@@ -305,12 +305,11 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
     for name, (title, colour, dash) in CURVES.items():
         runs = ran.trials[name].runs
         share = np.median(runs.error / runs.error[:, :1], axis=0)
-        trace = _trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines")
-        trace["line"] |= {"dash": dash, "width": 2}
-        data.append(trace)
+        look = {"color": colour, "dash": dash, "width": 2}
+        data.append(trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines", line=look))
     layout = plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
-    return {"data": data, "layout": layout, "config": {}}
+    return {"data": data, "layout": layout}
 
 
 def _beside(ran: ControlledHexapod) -> dict[str, Any]:
@@ -322,32 +321,15 @@ def _beside(ran: ControlledHexapod) -> dict[str, Any]:
     for name, (title, colour, dash) in CURVES.items():
         here = apply(ran.trials[name].runs.T_base_platform[:, :, None], points)
         off = np.sqrt(np.mean(np.sum((here - there) ** 2, axis=-1), axis=-1))
-        trace = _trace(title, ideal.time, 1e3 * np.median(off, axis=0), colour, "lines")
-        trace["line"] |= {"dash": dash, "width": 2}
-        data.append(trace)
-    return {"data": data, "layout": plane("time, s", "mm"), "config": {}}
-
-
-def _trace(name: str, x: Any, y: Any, colour: str, mode: str) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "mode": mode,
-        "name": name,
-        "x": _plain(x),
-        "y": _plain(y),
-        "line": {"color": colour, "width": 1.5},
-        "marker": {"color": colour, "size": 7},
-        "connectgaps": False,
-    }
+        look = {"color": colour, "dash": dash, "width": 2}
+        off_mm = 1e3 * np.median(off, axis=0)
+        data.append(trace(title, ideal.time, off_mm, colour, "lines", line=look))
+    return {"data": data, "layout": plane("time, s", "mm")}
 
 
 def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> dict[str, Any]:
     look = {"color": colour, "size": size, "symbol": symbol, "line": {"color": colour, "width": 2}}
-    return {**_trace(name, points[:, 0], points[:, 1], colour, "markers"), "marker": look}
-
-
-def _plain(values: Any) -> list[float | None]:
-    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+    return trace(name, points[:, 0], points[:, 1], colour, "markers", marker=look)
 
 
 # ------------------------------------------------------------------ for programs

@@ -230,7 +230,7 @@ def at_poses(
         machine, measurements(data), seen[:, :n], data.joints[:, :n], begin, form
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
-    return fit_poses(machine, problem, state, noise, data.noise.reading, use_drawing)
+    return fit_poses(machine, problem, state, noise, data.noise.reading, use_drawing=use_drawing)
 
 
 def fitted(fit: PoseFit, *, whitened: bool = False) -> Fitted:

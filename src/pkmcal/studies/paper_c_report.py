@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Outcome, Row, Table
-from pkmcal.pages.plots import plane
+from pkmcal.pages.plots import bars, plane, trace
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
     AXIS,
@@ -260,31 +259,31 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
     labels: list[str] = []
     printed: dict[int, float] = {}
     for kind, models in PLAN.items():
-        bars: dict[int, float] = {}
+        errors: dict[int, float] = {}
         for name, method in ((name, m) for name, methods in models.items() for m in methods):
             place = len(labels) + len(data)  # a gap between machines
             labels.append(f"{MODELS[name]}, {LABELS[method]}")
             places.append(place)
-            bars[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
+            errors[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
             known = PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
             if known:
                 printed[place] = float(known)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
-        data.append(_series("bar", TRUTHS[kind], bars, colour))
-    dots = _series("scatter", "independent prototype", printed, "--ink")
+        lying = bars(TRUTHS[kind], errors.values(), errors, color=colour)  # so names can be read
+        data.append({**lying, "orientation": "h", "width": 0.8})
     marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
-    data.append({**dots, "mode": "markers", "marker": marks})
-    for series in data:  # lying, so that names can be read
-        series |= {"x": series["y"], "y": series["x"], "hovertemplate": "%{x:.3g} mm"}
-    for series in data[:-1]:
-        series |= {"orientation": "h", "width": 0.8}
+    data.append(
+        trace("independent prototype", printed.values(), printed, "--ink", "markers", marker=marks)
+    )
+    for each in data:
+        each["hovertemplate"] = "%{x:.3g} mm"
     layout = plane("mm", "")
     layout |= {"margin": {"l": 8, "r": 16, "t": 34, "b": 44}, "barmode": "overlay"}
     layout["xaxis"] |= {"type": "log"}
     layout["xaxis"] |= {"tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5], "range": [-1.5, 0.9]}
     layout["yaxis"] |= {"tickvals": places, "ticktext": labels, "showgrid": False}
     layout["yaxis"] |= {"range": [places[-1] + 0.6, -0.6], "automargin": True}
-    return {"data": data, "layout": layout, "config": {}}
+    return {"data": data, "layout": layout}
 
 
 def _residual_plot(s: Found) -> dict[str, Any]:
@@ -294,25 +293,14 @@ def _residual_plot(s: Found) -> dict[str, Any]:
     motors = [f"q{sign}" for sign in "₁₂₃₄"]
     for label, which, key in VALIDATED[1:]:
         ours = 1e3 * each_rms(s.values("control_rms", "design", *which))
-        paper = dict(zip(motors, (1e3 * v for v in TABLE_3[key][1]), strict=True))
-        found = dict(zip(motors, ours.tolist(), strict=True))
-        bars = _series("bar", f"{label}: the paper", paper, colours[key])
-        data.append({**bars, "marker": {"color": colours[key], "opacity": 0.35}})
-        data.append(_series("bar", f"{label}: found", found, colours[key]))
+        paper = 1e3 * np.array(TABLE_3[key][1])
+        data += [
+            bars(f"{label}: the paper", motors, paper, color=colours[key], opacity=0.35),
+            bars(f"{label}: found", motors, ours, color=colours[key]),
+        ]
     layout = plane("", "mrad")
     layout["margin"] = {"l": 58, "r": 8, "t": 34, "b": 40}
-    return {"data": data, "layout": layout, "config": {}}
-
-
-def _series(kind: str, name: str, values: Mapping[Any, float], colour: str) -> dict[str, Any]:
-    return {
-        "type": kind,
-        "name": name,
-        "x": list(values),
-        "y": [round(v, 4) for v in values.values()],
-        "marker": {"color": colour},
-        "hovertemplate": "%{x}: %{y:.3g}",
-    }
+    return {"data": data, "layout": layout}
 
 
 # ------------------------------------------------------------------ for programs

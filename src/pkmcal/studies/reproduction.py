@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.studies.engine import StudyResult
+from pkmcal.studies.engine import StudyResult, Told
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key, Setting
 from pkmcal.wording import brief, count, number
@@ -25,10 +25,6 @@ PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """A prototype's figures as it prints them, by what was estimated how and by quantity."""
 ASIDE = ", its Monte-Carlo error aside"
-
-
-def _silent(_text: str, _share: float) -> None:
-    """Tell nobody."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +38,9 @@ class Options:
     seed: int = 0
     long: bool = False
     photographs: bool = False
-    told: Callable[[str, float], None] = _silent
+    told: Told = lambda _text, _share: None
 
-    def within(self, first: float, last: float) -> Callable[[str, float], None]:
+    def within(self, first: float, last: float) -> Told:
         """The same telling, of a part of the work."""
         return lambda text, share: self.told(text, first + (last - first) * share)
 

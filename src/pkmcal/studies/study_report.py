@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict, note
-from pkmcal.pages.plots import plane
+from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.calibrations import ESTIMATE
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.findings import HELD, PROMISE, SHARES, CellFindings, Gain, SweepResult
@@ -252,12 +252,6 @@ def _kind(name: str) -> str:
 # ------------------------------------------------------------------ plots
 
 
-def _trace(name: str, x: list[Any], y: list[float], colour: str, **more: Any) -> dict[str, Any]:
-    shape = {"type": "scatter", "mode": "lines+markers", "name": name, "x": x}
-    values = [None if not np.isfinite(v) else round(v, 6) for v in y]
-    return {**shape, "y": values, "line": {"color": colour}, "marker": {"color": colour}, **more}
-
-
 def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindings]]]:
     """Cells along a name, for every combination of all else."""
     others: dict[tuple[Any, ...], list[CellFindings]] = {}
@@ -281,17 +275,17 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
             means = [study.at(name, value) for value in values]
             bars = {"type": "data", "array": [2e3 * s.error for s in means]}
             y = [1e3 * s.value for s in means]
-            data.append(_trace("error, all else together", x, y, "--calibrated", error_y=bars))
+            data.append(trace("error, all else together", x, y, "--calibrated", error_y=bars))
         else:
             for k, (label, cells) in enumerate(groups):
                 colour = f"--leg{k % 8 + 1}"
                 bars = {"type": "data", "array": [2e3 * c.position.error for c in cells]}
                 y = [1e3 * c.position.value for c in cells]
-                data.append(_trace(label or "error", x, y, colour, error_y=bars))
+                data.append(trace(label or "error", x, y, colour, error_y=bars))
                 stated = [1e3 * c.position_sigma for c in cells]
                 dash = {"color": colour, "dash": "dot"}
                 told = f"stated, {label}" if label else "stated"
-                data.append(_trace(told, x, stated, colour, line=dash, mode="lines"))
+                data.append(trace(told, x, stated, colour, "lines", line=dash))
         unit = study.subject.names[name].unit
         layout = plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
         layout["yaxis"] |= {"rangemode": "tozero"}
@@ -307,7 +301,7 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
                 f"By {_name(name)}",
                 caption,
                 f"The tool's position error by {_name(name)}, with what calibrations state of it.",
-                {"data": data, "layout": layout, "config": {}},
+                {"data": data, "layout": layout},
                 height=380,
             )
         )
@@ -316,7 +310,7 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
 
 def _held(study: SweepResult) -> Plot:
     """Intervals that hold against their promise, all combinations together."""
-    x = (100 * SHARES).tolist()
+    x = 100 * SHARES
     used = [cell for cell in study.found if np.isfinite(cell.held).all()]
     own, tool = (
         100 * np.mean(shares, axis=0) if used else np.full(len(SHARES), np.nan)
@@ -324,9 +318,9 @@ def _held(study: SweepResult) -> Plot:
     )
     line = {"color": "--quiet", "dash": "dash"}
     data = [
-        _trace("as promised", [50, 100], [50, 100], "--quiet", line=line, mode="lines"),
-        _trace("parameters", x, own.tolist(), "--calibrated"),
-        _trace("tool's pose", x, tool.tolist(), "--drawing"),
+        trace("as promised", [50, 100], [50, 100], "--quiet", "lines", line=line),
+        trace("parameters", x, own, "--calibrated"),
+        trace("tool's pose", x, tool, "--drawing"),
     ]
     layout = plane("interval, %", "hold the truth, %")
     return Plot(
@@ -334,7 +328,7 @@ def _held(study: SweepResult) -> Plot:
         "Intervals that hold",
         "All combinations together.",
         "Share of intervals that hold the truth against the share that they promise.",
-        {"data": data, "layout": layout, "config": {}},
+        {"data": data, "layout": layout},
         height=380,
     )
 

@@ -28,7 +28,7 @@ from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.placement import check_drawable
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
-from pkmcal.studies.paper_a import HexapodByAxes, JointByAxes
+from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.wording import listed
 
 PAPER = "a"
@@ -90,13 +90,13 @@ class StudySubject:
     """What is studied: a design, or [A] 4.3. name : in words. warnings : what to know of it."""
 
     name: str
-    design: Design | HexapodByAxes
+    design: Design | JointByAxes
     warnings: tuple[str, ...] = ()
 
     @property
     def names(self) -> Mapping[str, Varied]:
         """What can be varied."""
-        return OF_PAPER if isinstance(self.design, HexapodByAxes) else NAMES
+        return OF_PAPER if isinstance(self.design, JointByAxes) else NAMES
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def subject_of(origin: str) -> StudySubject:
     Raises InputError where it is none of these.
     """
     if origin == PAPER:
-        return StudySubject("the joint calibration of [A] 4.3", HexapodByAxes())
+        return StudySubject("the joint calibration of [A] 4.3", JointByAxes())
     folder = session_folder(origin)
     if folder is not None:
         session = load_session(folder, measured=False)
@@ -252,14 +252,14 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
     out: list[Cell] = []
     for values in product(*varied.values()):
         chosen = dict(zip(varied, values, strict=True))
-        if isinstance(subject.design, HexapodByAxes):
-            out.append(Cell(chosen, JointByAxes(_paper(subject.design, chosen))))
+        if isinstance(subject.design, JointByAxes):
+            out.append(Cell(chosen, _paper(subject.design, chosen)))
         else:
             out.append(Cell(chosen, SimulatedCalibrations(_design(subject.design, chosen))))
     return out
 
 
-def _paper(setting: HexapodByAxes, values: Mapping[str, Value]) -> HexapodByAxes:
+def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
     """[A] 4.3 with other values."""
     own: dict[str, Any] = {
         {"configurations": "poses", "legs": "legs_seen", "reading_noise": "joint_noise"}.get(

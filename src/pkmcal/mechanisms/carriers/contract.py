@@ -104,20 +104,6 @@ class NamedMotion(NamedTuple):
     together: str = ""
 
 
-class CarriedPoint(NamedTuple):
-    """A limb's end and its derivatives.
-
-    value : (..., 3) m, base frame.
-    by_motion : (...,) reading's column (..., 3) on the base side, or the platform pose's six
-        numbers (..., 3, 6) on the platform side.
-    by_parameters : (..., 3, n).
-    """
-
-    value: Array
-    by_motion: Array
-    by_parameters: Array
-
-
 class Site(NamedTuple):
     """Where a carrier stands in a mechanism file: leg from 1, ``base`` or ``platform``, the file's
     motion, and what names the place of one of the part's keys, or of the whole part.
@@ -285,13 +271,6 @@ class BaseCarrier(Carrier, ABC):
         )
 
     @classmethod
-    def point(cls, parameters: Array, readings: Array) -> CarriedPoint:
-        """A with all derivatives."""
-        shape = (*np.broadcast_shapes(parameters.shape[:-1], readings.shape), 3)
-        value, by_reading = (np.broadcast_to(x, shape) for x in cls.place(parameters, readings))
-        return CarriedPoint(value, by_reading, cls.by_parameters(parameters, readings))
-
-    @classmethod
     def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
         """Readings (...,) that put A at a distance (...,) from B (..., 3), m.
 
@@ -362,15 +341,6 @@ class PlatformCarrier(Carrier, ABC):
     ) -> Array:
         """Derivatives (..., 3, n) of B by the parameters: here exactly, by complex steps."""
         return complex_steps(lambda p: cls.place(p, T_base_platform, internal)[0], parameters)
-
-    @classmethod
-    def point(
-        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
-    ) -> CarriedPoint:
-        """B with all derivatives."""
-        value, arm = cls.place(parameters, T_base_platform, internal)
-        by_parameters = cls.by_parameters(parameters, T_base_platform, internal)
-        return CarriedPoint(value, by_pose(arm), by_parameters)
 
     @staticmethod
     def upright(parameters: Array, T_base_platform: Array) -> Array:
