@@ -206,7 +206,7 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     together are in balance.
     """
     linear = fit.problem(views).linearize(fit.state)
-    rows = eliminate(linear, np.zeros(1)).rows[0]
+    rows = eliminate(linear).rows[0]
     normals = rows.mT @ rows
     whole = normals.sum(axis=0)
     right = rows.mT @ linear.value[0][..., None]

@@ -72,7 +72,7 @@ class Information:
     @cached_property
     def reduced(self) -> Reduced:
         """The same with the configurations' own unknowns eliminated."""
-        return eliminate(self.linear, np.zeros(len(self.state.z)))
+        return eliminate(self.linear)
 
     def pieces(self) -> Iterator[Information]:
         """What some configurations say after the other, so many as the solver works on at once; the

@@ -287,7 +287,7 @@ def _basis(problem: Problem, state: BatchState) -> Array:
     root: Array = np.zeros((0, count))
     for cut, part, at in _cuts(problem, state):
         linear = part.linearize(at)
-        rows = eliminate(linear, np.zeros(1)).rows[0].reshape(-1, count)
+        rows = eliminate(linear).rows[0].reshape(-1, count)
         before = root if cut.start else linear.shared_by
         root = np.asarray(np.linalg.qr(np.concatenate([before, rows]), mode="r"))
     half = inverse_root(root[None], NULL, loose=False)[0]
@@ -357,7 +357,7 @@ def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
         by_shared=np.concatenate([linear.by_shared, extra[None]], axis=-1),
         shared_by=np.pad(linear.shared_by, ((0, 0), (0, extra.shape[-1]))),
     )
-    reduced = eliminate(wide, np.zeros(1))
+    reduced = eliminate(wide)
     return reduced.rows[0], reduced.value[0]
 
 

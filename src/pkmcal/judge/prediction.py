@@ -105,7 +105,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
         )
     held = hold(machine, replace(measurements, joint_noise=SOFT), start)
     linear = held.problem.linearize(held.state)
-    reduced = eliminate(linear, np.zeros(1))
+    reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(stacked(linear, reduced)[0][0])
     picks = _picks(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape

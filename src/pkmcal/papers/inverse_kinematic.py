@@ -431,7 +431,7 @@ def unknowns_kept(
     """
     first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     linear = first.ideal(begin).linearize(begin)
-    jac = stacked(linear, eliminate(linear, np.zeros(1)))[0][0]
+    jac = stacked(linear, eliminate(linear))[0][0]
     sizes = np.full(problem.unknowns.count, PLACED)
     sizes[problem.unknowns.machine] = machine.parameters.tolerances_free()
     keep = np.ones(len(sizes), dtype=bool)

@@ -167,7 +167,7 @@ def information_of(
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
-    reduced = eliminate(problem.linearize(state), np.zeros(1)).rows[0]
+    reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
     rows[assembled.seen] = reduced  # of what shows nothing, nothing is told
     prior = problem.prior

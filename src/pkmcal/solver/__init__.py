@@ -18,7 +18,6 @@ from pkmcal.solver.elimination import (
     divisions,
     eliminate,
     flat,
-    own_factors,
     stacked,
 )
 from pkmcal.solver.ranks import (
@@ -82,7 +81,6 @@ __all__ = [
     "normal_inverse",
     "normal_root",
     "of_runs",
-    "own_factors",
     "put",
     "soft_weights",
     "stacked",

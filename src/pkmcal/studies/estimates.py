@@ -67,7 +67,7 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """Errors (B, na) of the shared unknowns, drawn with the Cramér-Rao bound's covariance at a
     state; none along what nothing tells.
     """
-    reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
+    reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     s, vt, scale = directions(rows)
     known = s > LOOSE * s[:, :1]
