@@ -17,7 +17,7 @@ from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.solver import Stop, take
+from pkmcal.solver.search import Stop, take
 from test_identify_scene import JOINT_NOISE, exact, guess, make_scene
 
 

@@ -9,26 +9,10 @@ import pytest
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
-from pkmcal.solver import (
-    Compact,
-    Linear,
-    Stop,
-    StripLayout,
-    Strips,
-    column_space,
-    compact,
-    eliminate,
-    final_weights,
-    inverse_root,
-    minimise,
-    normal_root,
-    of_runs,
-    put,
-    soft_weights,
-    stacked,
-    take,
-)
-from pkmcal.solver.strips import normal_equations
+from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.ranks import column_space, inverse_root, normal_root
+from pkmcal.solver.search import Stop, final_weights, minimise, of_runs, put, soft_weights, take
+from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
 from test_identify_scene import guess, make_scene
 
 

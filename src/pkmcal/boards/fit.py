@@ -21,15 +21,9 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.cameras.contract import Camera
 from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
-from pkmcal.solver import (
-    Linear,
-    Stop,
-    Values,
-    eliminate,
-    final_weights,
-    minimise,
-    normal_root,
-)
+from pkmcal.solver.elimination import Linear, eliminate
+from pkmcal.solver.ranks import normal_root
+from pkmcal.solver.search import Stop, Values, final_weights, minimise
 
 LEAST_KNOWN = 1e-14
 """Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""

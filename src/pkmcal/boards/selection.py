@@ -25,7 +25,7 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.solver import eliminate
+from pkmcal.solver.elimination import eliminate
 
 FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of pixels a radian in the picture's middle, as a share of its width."""

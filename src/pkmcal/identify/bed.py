@@ -19,7 +19,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.solver import stacked
+from pkmcal.solver.elimination import stacked
 
 POINTS = 60
 """Places all over the bed: where nobody probed counts as well."""

@@ -35,11 +35,7 @@ from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import (
-    Solution,
-    Stop,
-    minimise,
-)
+from pkmcal.solver.search import Solution, Stop, minimise
 
 LEAST_SCALE = 1.0
 """The stated noise of poses, and of edges that nothing shades, is never believed to be too large.

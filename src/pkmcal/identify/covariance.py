@@ -30,20 +30,15 @@ from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.solver import (
+from pkmcal.solver.elimination import Linear, Reduced, condensed, divisions, eliminate, stacked
+from pkmcal.solver.ranks import (
     RANK_TOLERANCE,
-    Linear,
-    Reduced,
     column_space,
-    condensed,
-    divisions,
-    eliminate,
     inverse_root,
     normal_inverse,
     normal_root,
-    stacked,
-    take,
 )
+from pkmcal.solver.search import take
 
 NULL = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""

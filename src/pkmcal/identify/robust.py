@@ -17,12 +17,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kind, Kinds
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import (
-    FULL,
-    final_weights,
-    minimise,
-    soft_weights,
-)
+from pkmcal.solver.search import FULL, final_weights, minimise, soft_weights
 
 TAIL = float(np.exp(-(FULL**2) / 2))
 """Share of two clean residuals' norms beyond FULL, where weights begin to fall."""

@@ -32,7 +32,8 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
-from pkmcal.solver import Linear, divisions, eliminate, inverse_root
+from pkmcal.solver.elimination import Linear, divisions, eliminate
+from pkmcal.solver.ranks import inverse_root
 
 SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see

@@ -20,7 +20,7 @@ from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
-from pkmcal.solver import Stop
+from pkmcal.solver.search import Stop
 from pkmcal.wording import count, listed
 
 FAR = 5.0

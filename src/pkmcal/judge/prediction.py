@@ -32,15 +32,8 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.solver import (
-    RANK_TOLERANCE,
-    Linear,
-    Reduced,
-    column_space,
-    eliminate,
-    inverse_root,
-    stacked,
-)
+from pkmcal.solver.elimination import Linear, Reduced, eliminate, stacked
+from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a

@@ -35,7 +35,8 @@ from pkmcal.identify.rows import PoseBlocks, PoseData, pose_rows
 from pkmcal.identify.start import mean_pose
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import Linear, Values, minimise, take
+from pkmcal.solver.elimination import Linear
+from pkmcal.solver.search import Values, minimise, take
 
 TURN = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""

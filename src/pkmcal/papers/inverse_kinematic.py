@@ -36,17 +36,8 @@ from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
-from pkmcal.solver import (
-    Linear,
-    Solution,
-    Stop,
-    Values,
-    eliminate,
-    minimise,
-    of_runs,
-    stacked,
-    take,
-)
+from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
 
 Form = Literal["joint", "implicit"]
 PRINTED = 1e-4

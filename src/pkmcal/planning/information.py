@@ -33,7 +33,7 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.planning.route import spans
-from pkmcal.solver import eliminate
+from pkmcal.solver.elimination import eliminate
 from pkmcal.wording import listed
 
 PLACE = 1.0

@@ -52,7 +52,7 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.simulation.edges import FITTED, moved_outward
 from pkmcal.simulation.placement import draw_configurations
-from pkmcal.solver import Stop, take
+from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import covered

@@ -18,7 +18,9 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import directions, eliminate, minimise
+from pkmcal.solver.elimination import eliminate
+from pkmcal.solver.ranks import directions
+from pkmcal.solver.search import minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
