@@ -148,7 +148,7 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    found = np.sqrt(np.mean(result.problem.data.shading**2))
+    found = np.sqrt(np.mean(result.info.problem.data.shading**2))
     # Student's scale, with tails for what these normal shifts do not have, lies somewhat lower
     assert found == pytest.approx(0.9 * sigma if sigma > 0.03 else sigma, rel=0.1)
     error = (result.solution.state.z - truth.z) ** 2
@@ -166,7 +166,7 @@ def test_a_line_that_is_another_things_edge_is_let_go():
     scene = replace(scene, shading=np.where(wrong, -3.0, scene.shading))
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    assert np.median(result.problem.data.shading) == pytest.approx(0.1, rel=0.2)
+    assert np.median(result.info.problem.data.shading) == pytest.approx(0.1, rel=0.2)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
     assert np.mean(error / variance) == pytest.approx(1, abs=0.25)

@@ -10,7 +10,7 @@ import pytest
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import information, machine_covariance
+from pkmcal.identify.covariance import Information, machine_covariance
 from pkmcal.identify.estimate import told_unknowns
 from pkmcal.identify.gauge import (
     BestFit,
@@ -166,7 +166,7 @@ def test_covariance_transformed_equals_covariance_recomputed(first, second):
     for rows in (first, second):
         assembled = assemble(machine, m, rows, use_drawing=False)
         state = apply(machine, scene.state(), rows)
-        info = information(assembled.problem, batch_of(machine, assembled, state))
+        info = Information(assembled.problem, batch_of(machine, assembled, state))
         told.append(
             machine_covariance(assembled.problem, machine, state, info.covariance[0], second)
         )

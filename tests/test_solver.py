@@ -150,7 +150,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
     )
     start = replace(truth, z=0 * truth.z, T_camera_base=station)
     together = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
-    assert len(set(together.steps.tolist())) > 1
+    assert len(set(together.solution.steps.tolist())) > 1
     for run in range(4):
         only = np.array([run])
         alone = solve_batch(
@@ -159,7 +159,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
             robust=False,
             scale_noise=False,
         )
-        assert alone.steps[0] == together.steps[run]
+        assert alone.solution.steps[0] == together.solution.steps[run]
         np.testing.assert_allclose(
             alone.solution.state.z[0], together.solution.state.z[run], atol=1e-11
         )
@@ -171,7 +171,7 @@ def test_typical_number_of_steps():
     start = replace(truth, z=0 * truth.z)
     found = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(found.solution.stop) == {Stop.CONVERGED}
-    assert found.steps.max() <= 10
+    assert found.solution.steps.max() <= 10
 
 
 def rosenbrock(x, runs):

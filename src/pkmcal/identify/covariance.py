@@ -130,11 +130,6 @@ class Information:
         return half @ half.mT
 
 
-def information(problem: Problem, state: BatchState, normal: Array | None = None) -> Information:
-    """What a problem says at a state."""
-    return Information(problem, state, normal)
-
-
 def reduced_rows(
     problem: Problem,
     state: BatchState,

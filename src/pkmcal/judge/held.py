@@ -156,7 +156,7 @@ def hold(
     if trust is None:
         _check_enough(assembled.problem, begin)
         result = solve_batch(assembled.problem, begin, scale_readings=False)
-        problem, found = result.problem, result.solution
+        problem, found = result.info.problem, result.solution
     else:
         problem = assembled.trusting(trust.weights)
         found = minimise(problem, begin)

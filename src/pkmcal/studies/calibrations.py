@@ -164,7 +164,7 @@ class SimulatedCalibrations:
         k = int(data.assembled.seen.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(found.noise_scale, found.pose_scale)
+        scale = np.maximum(found.noise_scale, found.scale.poses)
         good = np.array([stop is Stop.CONVERGED for stop in found.solution.stop])
         told = [self._told(data, found, run) for run in range(n)]
         return {
@@ -173,7 +173,7 @@ class SimulatedCalibrations:
                 told={
                     "chi2": found.solution.cost / dof,
                     "scale": scale,
-                    "steps": found.steps.astype(float),
+                    "steps": found.solution.steps.astype(float),
                     "failed": 1.0 - (good & (scale <= TOO_NOISY)),
                 },
                 covariance=np.array([covariance for _, covariance in told]),
