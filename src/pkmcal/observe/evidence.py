@@ -25,8 +25,8 @@ from pkmcal.observe.predict import (
     TubeList,
     edge_points,
     legs_in_camera,
+    normals_of_edges,
     of_edges,
-    plane_normals,
     visible_stretch,
 )
 from pkmcal.observe.tables import BIN, DistanceTables
@@ -168,7 +168,7 @@ def score(
     legs = view.legs(photographs).moved(T_camera_base)
     a, b, u = of_edges(legs, tubes)
     radius = view.machine.values[tubes.radius].astype(a.dtype)
-    normal, ok = plane_normals(a, u, radius, tubes)
+    normal, ok = normals_of_edges(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     base = a + radius[:, None] * normal
     begin, end = (view.camera.project(base + at[..., None] * u) for at in (first, last))
