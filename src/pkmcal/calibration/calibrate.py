@@ -171,21 +171,18 @@ def calibrate(
         session = _load(session, refine_camera, clock)
         seen = _observe(session, seed, clock)
         try:
-            found = _identify(seen, refine_camera, method, seed, holdout, clock)
+            turns, richer = _identify(seen, refine_camera, clock)
             # without one that was in a wrong place, another may show itself to be
             while wrong := misplaced(
-                seen.session,
-                found.turns.measurements,
-                found.turns.estimate,
-                seen.known.T_camera_base,
+                seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
             ):
-                turns = found.turns
                 seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-                found = _identify(seen, refine_camera, method, seed, holdout, clock)
+                turns, richer = _identify(seen, refine_camera, clock)
         except ResultError:
             check_radii(seen, None, refine_camera, seed)
             raise
-        check_radii(seen, found.turns.estimate, refine_camera, seed)
+        check_radii(seen, turns.estimate, refine_camera, seed)
+        found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
         return _judge(seen, found, method, seed, clock)
 
 
@@ -245,14 +242,9 @@ def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
 
 
 def _identify(
-    seen: SeenSession,
-    refine_camera: bool,
-    method: Method,
-    seed: int,
-    holdout: int,
-    clock: _Clock,
-) -> _Identified:
-    """The machine, in turns with looks at the edges, and by the paper's method if asked for."""
+    seen: SeenSession, refine_camera: bool, clock: _Clock
+) -> tuple[Turns, tuple[RicherModel, ...]]:
+    """The machine, in turns with looks at the edges, and richer models that were tried."""
     session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     if seen.photographs:
         turns = take_turns(seen, cameras, clock.told, clock.lap)
@@ -265,15 +257,31 @@ def _identify(
     check_poses(session, turns.measurements, stated, richer)
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
+    return turns, richer
+
+
+def _estimated(
+    drawing: Machine,
+    turns: Turns,
+    richer: tuple[RicherModel, ...],
+    method: Method,
+    seed: int,
+    holdout: int,
+    clock: _Clock,
+) -> _Identified:
+    """The estimate without what is held out, by the paper's method if asked for.
+
+    Only now, when all is found, are configurations set aside: photographs that miss are misplaced.
+    """
     out = None
     if holdout:
-        region = chosen(session.machine, turns.estimate, turns.measurements, holdout)
+        region = chosen(drawing, turns.estimate, turns.measurements, holdout)
         out = LeftOut(region, turns.measurements)
-        turns = set_aside(session.machine, turns, out.region)
+        turns = set_aside(drawing, turns, region)
     estimate = turns.estimate
     if method != "bundle":
         clock.told("Repeating the paper's method", 0.9)
-        estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
+        estimate = by_paper(method, drawing, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
 

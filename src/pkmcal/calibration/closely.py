@@ -26,12 +26,13 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import KnownScene
 from pkmcal.errors import PkmcalError
+from pkmcal.geometry.rigid import angle_between
 from pkmcal.identify.bundle import bundle, machine_told
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, concatenate
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
+from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turned_about
 from pkmcal.observe.evidence import StationView, apart, grain, settle
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.tables import distance_tables
@@ -218,8 +219,8 @@ def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     edge = grain(view, at[np.argmax(evidence)])
     by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]
-    turned = turn_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
-    here = turn_between(at, first) < ALIKE
+    turned = angle_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
+    here = angle_between(at, first) < ALIKE
     same = here | (turned < ALIKE)
     worth = np.where(same, by_edges - by_edges.max() + by_legs[here].max(), by_legs)
     order = np.argsort(-worth, kind="stable")
