@@ -333,6 +333,9 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(moved**2))
     ratio = np.sqrt(np.diag(found.covariance))[known] / sigma[known]
     np.testing.assert_allclose(ratio, 1, atol=0.05)
+    # the drawing is in what is told: without it that still is what was asked for
+    without = bundle(scene.machine, other, start, told=told, use_drawing=False, **plain)
+    np.testing.assert_array_equal(without.state.theta, found.state.theta)
     # what moves by less than its deviations is like before; by the drawing alone it was not
     after = machine_told(all_, together)
     assert after.like(after)

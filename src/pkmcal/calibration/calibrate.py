@@ -52,9 +52,9 @@ from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.identify.unidentified import (
     Findings,
     explain,
-    joined_by_boards,
     only_heights,
     seen_legs,
+    seen_through_boards,
 )
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
@@ -359,7 +359,7 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
     told = what_data_tell(measurements, estimate)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
     bed = bed_of(measurements, estimate) if only_heights(estimate) else None
-    return explain(told, estimate, joined_by_boards(seen, measurements), counted, bed)
+    return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
 
 
 class _Clock:

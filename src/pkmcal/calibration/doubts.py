@@ -26,7 +26,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.start import mean_pose, start_state
+from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
@@ -224,7 +224,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             place = int(poses.configuration[rows[at - 1]]), int(poses.configuration[rows[at]])
             body = state.T_camera_base[s] @ state.T_base_platform[poses.configuration[later]]
             seen = poses.T_station_target[later]
-            mount = mean_pose(inverse(body) @ seen)
+            mount = middle_pose(inverse(body) @ seen)
             on = np.append(measurements.on_platform, True)
             board = replace(
                 measurements,
@@ -268,7 +268,7 @@ def _camera_moved(
     poses = measurements.poses
     number = measurements.camera_of_station
     there = state.T_base_platform[poses.configuration[later]] @ state.T_mount[poses.mount[later]]
-    station = mean_pose(poses.T_station_target[later] @ inverse(there))
+    station = middle_pose(poses.T_station_target[later] @ inverse(there))
     camera = replace(
         measurements,
         poses=replace(poses, station=_changed(poses.station, later, measurements.n_stations)),

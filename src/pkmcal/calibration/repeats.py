@@ -392,13 +392,12 @@ def _rigid(points: Array) -> Array:
 class MotionFit:
     """Motions that explain edges' turns best, by group.
 
-    motion : (G, p). explained, total : sums of squared whitened turns. rank : (G,) freedoms used.
+    motion : (G, p). explained, total : sums of squared whitened turns.
     """
 
     motion: Array
     explained: Array
     total: Array
-    rank: Array
 
 
 def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> MotionFit:
@@ -415,8 +414,7 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(seen, along / np.where(seen, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]
-    total = groups.total(dot(white, white))
-    return MotionFit(motion, dot(motion, right), total, seen.sum(axis=1))
+    return MotionFit(motion, dot(motion, right), groups.total(dot(white, white)))
 
 
 def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:

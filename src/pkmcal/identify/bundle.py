@@ -357,7 +357,7 @@ def bundle(
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case. told : what other measurements told of the
-        machine, with the drawing in it, in the drawing's place.
+        machine, with the drawing in it, in the drawing's place, whether that is taken or not.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
         scale_readings : and that of the readings, which may become less.
@@ -366,7 +366,7 @@ def bundle(
     Raises ResultError where the search cannot start, is given up, or ends without an answer.
     """
     gauge = gauge or default_gauge(machine)
-    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
+    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing or told is not None)
     batch = batch_of(machine, assembled, start)
     problem = assembled.problem
     # mounts are known to be near their start, as far as nothing else tells

@@ -47,11 +47,11 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
     body = T_camera_base[seen.station]
     body = np.where(on_platform[seen.mount][:, None, None], body @ poses[seen.configuration], body)
     each = inverse(body) @ seen.T_station_target
-    mounts = [mean_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
+    mounts = [middle_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
     return np.array(mounts).reshape(-1, 4, 4)
 
 
-def mean_pose(poses: Array) -> Array:
+def middle_pose(poses: Array) -> Array:
     """The pose (4, 4) nearest to poses (n, 4, 4), a few wrong ones forgiven; the identity of none.
 
     The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).

@@ -302,7 +302,7 @@ def settle(
     look = look_under(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = first_mixture(len(candidates))
-    last = np.inf
+    last = float("inf")
     for _ in range(steps):
         mixture = look.mixture(mixture, widest=widest)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
@@ -312,8 +312,10 @@ def settle(
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
-        if max(last, last := float(gain.max())) < SETTLED:
+        most = float(gain.max())
+        if max(last, most) < SETTLED:
             break  # one step may have been too long
+        last = most
     mixture = look.mixture(first_mixture(len(candidates)), 10, widest)
     return candidates, _summed(look.evidence(mixture))
 

@@ -30,8 +30,8 @@ from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference,
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
-from pkmcal.identify.decided import EXACT
 from pkmcal.identify.estimate import State
+from pkmcal.identify.found import EXACT
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
@@ -42,7 +42,7 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.rows import EdgeData, PoseData
-from pkmcal.identify.start import mean_pose
+from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
@@ -470,7 +470,7 @@ def _start(
         target = assembled.places.poses
         measured = problem.pose_data.T_station_target[:, target.row, target.place]
         each = inverse(T_camera_base[:, station] @ found.T_base_platform[:, row]) @ measured
-        mounts = np.stack([mean_pose(poses) for poses in each])[:, None]
+        mounts = np.stack([middle_pose(poses) for poses in each])[:, None]
     return BatchState(
         np.zeros((runs, u.n_free)),
         T_camera_base,
