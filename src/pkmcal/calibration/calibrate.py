@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
@@ -46,9 +46,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bed import bed_of
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.identify.unidentified import (
     Findings,
     explain,
@@ -118,25 +116,10 @@ class Calibration(ShownCalibration):
             data_share=e.data_share,
             poses=e.state.T_base_platform[e.configurations],
             stations=session.station_names,
+            legs_seen=e.edge_weights.size > 0,
             residuals=np.concatenate([edges.ravel(), poses[e.pose_weights >= 0.5].ravel()]),
             chi2=e.statistics.chi2_as_stated,
             warnings=session.warnings,
-        )
-
-    def tool_error(self, T_base_platform: Array) -> ToolError:
-        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
-        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
-        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
-        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
-        array that holds no poses.
-        """
-        machine = self.estimate.machine
-        return tool_error(
-            self.session.machine,
-            machine,
-            free_of_gauge(machine, self.estimate.covariance),
-            checked_poses(T_base_platform),
-            legs_seen=self.estimate.edge_weights.size > 0,
         )
 
 

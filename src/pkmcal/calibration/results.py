@@ -89,22 +89,16 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
     return standing
 
 
-def texts_of(
-    calibration: Calibration,
-    not_identified: Sequence[str] = (),
-    holdout: dict[str, Any] | None = None,
-    over: ToolMap | str | None = None,
-    photographs: Mapping[str, Sequence[str]] | None = None,
-) -> dict[str, str | bytes]:
-    """What a calibration leaves on disk besides its page: texts by their files' names.
+def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, str | bytes]:
+    """What a calibration leaves on disk besides its page, texts by their files' names.
 
-    not_identified, holdout, over, photographs : as for :func:`document_of`.
+    document : of :func:`document_of`.
     """
     from pkmcal.cameras.files import camera_text
 
     texts: dict[str, str | bytes] = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over, photographs)),
+        EVERYTHING: json_text(document),
     }
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():

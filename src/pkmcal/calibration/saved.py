@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,9 +25,7 @@ from pkmcal.calibration.results import (
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validate
-from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Statistics
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
 from pkmcal.wording import listed
@@ -116,23 +114,10 @@ class SavedCalibration(ShownCalibration):
             data_share=self.data_share,
             poses=self.T_base_platform[self.used],
             stations=tuple(station.name for station in self.stations),
+            legs_seen=bool(residuals.get("edges")),
             residuals=np.array([*parts[0], *parts[1]], dtype=float),
             chi2=Statistics(**statistics).chi2_as_stated if whole else float("nan"),
             warnings=tuple(document.get("warnings") or ()),
-        )
-
-    def tool_error(self, T_base_platform: Array) -> ToolError:
-        """As :meth:`pkmcal.calibration.calibrate.Calibration.tool_error`, from the file."""
-        edges = (self.document.get("residuals") or {}).get("edges")
-        # what the file's machine calls its drawing are the calibrated values
-        table = replace(self.machine.parameters, drawing=self.drawing)
-        machine = replace(self.machine, parameters=table)
-        return tool_error(
-            machine.with_values(self.drawing),
-            machine,
-            free_of_gauge(machine, self.covariance),
-            checked_poses(T_base_platform),
-            legs_seen=bool(edges),
         )
 
     def with_stations(self, names: Sequence[str]) -> Array:

@@ -264,20 +264,16 @@ def observation_of(
     estimate: Estimate,
 ) -> Observation:
     """The last looks joined, with what the estimate gave up among the rejected."""
-    edges = concatenate([look.edges for look in looks]) if looks else EdgeSet.empty()
-    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
-    nowhere = [np.zeros((0, 2))], [np.zeros(0, dtype=int)]
+    seen = legs.joined(looks, float("nan"), float("nan"))
     given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
-        edges=edges,
-        rejected=tuple(r for look in looks for r in look.rejected)
+        edges=seen.edges,
+        rejected=seen.rejected
         + boards.rejected
-        + tuple(edges.rejection(k, _OUTLIER) for k in given_up)
+        + tuple(seen.edges.rejection(k, _OUTLIER) for k in given_up)
         + _poses_given_up(session, measurements, estimate),
-        points=np.concatenate([look.points for look in looks] or nowhere[0]),
-        point_edge=np.concatenate(
-            [look.point_edge + k for look, k in zip(looks, first, strict=bool(looks))] or nowhere[1]
-        ),
+        points=seen.points,
+        point_edge=seen.point_edge,
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
     )

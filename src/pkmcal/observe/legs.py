@@ -314,7 +314,7 @@ def search(
         if done is not None:
             done(len(window.images))
         del window  # before the next one is decoded
-    return _joined(looks, float("nan"), reach)
+    return joined(looks, float("nan"), reach)
 
 
 def _searched(
@@ -371,19 +371,18 @@ def measure(
             done(len(window.images))
         del seen, window  # before the next one is decoded
     away = np.concatenate(moved)
-    return _joined(looks, blur, float(np.median(away)) if len(away) else 0.0)
+    return joined(looks, blur, float(np.median(away)) if len(away) else 0.0)
 
 
-def _joined(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
-    """One station's windows as one look."""
-    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
+def joined(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
+    """One station's windows, or all stations, as one look."""
+    first = np.cumsum([0, *(len(look.edges) for look in looks)])[:-1]
+    number = [look.point_edge + k for look, k in zip(looks, first, strict=True)]
     return StationEdges(
-        edges=concatenate([look.edges for look in looks]),
+        edges=concatenate([EdgeSet.empty(), *(look.edges for look in looks)]),
         rejected=tuple(rejection for look in looks for rejection in look.rejected),
-        points=np.concatenate([look.points for look in looks]),
-        point_edge=np.concatenate(
-            [look.point_edge + k for look, k in zip(looks, first, strict=True)]
-        ),
+        points=np.concatenate([np.zeros((0, 2)), *(look.points for look in looks)]),
+        point_edge=np.concatenate([np.zeros(0, dtype=int), *number]),
         blur=blur,
         moved=moved,
     )
