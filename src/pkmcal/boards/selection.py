@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.boards.fit import (
     CameraFit,
     Views,
@@ -148,7 +148,7 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
         residuals,
         float(np.sqrt(np.nanmean(squares))),
         np.sqrt(np.nanmean(squares, axis=1)),
-        float(np.sqrt(np.mean(bend**2))) if bend.size else float("nan"),
+        rms(bend),
     )
 
 

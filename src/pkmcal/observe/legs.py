@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, spread_over
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
@@ -259,8 +259,7 @@ class Photographs:
 
     def spread(self, most: int) -> Integers:
         """Numbers of up to ``most`` photographs, evenly over all."""
-        count = len(self.images)
-        return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+        return spread_over(len(self.images), most)
 
     @property
     def window(self) -> int:
@@ -321,7 +320,7 @@ def _searched(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, reach: float
 ) -> StationEdges:
     """One window's part of :func:`search`."""
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
+    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
     places = search_legs(photographs.images, tubes, points, clear, reach)
     found = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
@@ -401,7 +400,7 @@ class _Seen:
 
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES)
+    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, PLACES)
     grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
@@ -435,7 +434,7 @@ def _measured(
     return look, np.abs(position[k, e, s])
 
 
-def _predict(
+def predicted(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
     """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
