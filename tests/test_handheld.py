@@ -30,7 +30,6 @@ from pkmcal.observe import legs, surroundings
 from pkmcal.observe.alone import Alone, find_alone, turned_about
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import decode
-from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT
 from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
@@ -408,8 +407,7 @@ def looked(simulated):
 def view_of(session, p, poses):
     """What a search looks at in one photograph."""
     tables = distance_tables(p.images)
-    machine, tubes = session.machine, tubes_of(session.machine)
-    return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+    return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
 def found_with(monkeypatch, truth, doubts, textured=False):

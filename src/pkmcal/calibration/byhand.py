@@ -34,7 +34,7 @@ from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, Alone, find_alone
 from pkmcal.observe.evidence import StationView
-from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
+from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
@@ -219,8 +219,8 @@ def _alone(session: Session, scene: KnownScene, photograph: legs.Photographs) ->
     """The places of a photograph by the search in it alone."""
     p = photograph
     view = StationView(
-        scene.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        scene.T_base_platform, distance_tables([p.images[0]]),
+        scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
+        distance_tables([p.images[0]]),
     )  # fmt: skip
     return find_alone(view, p.images[0])
 

@@ -34,7 +34,6 @@ from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turned_about
 from pkmcal.observe.evidence import StationView, apart, grain, settle
-from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
@@ -179,8 +178,8 @@ def look_closer(
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
     view = StationView(
-        before.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        before.T_base_platform, distance_tables(p.images, *FINEST),
+        before.machine, p.camera, p.configuration, session.joints, before.T_base_platform,
+        distance_tables(p.images, *FINEST),
     )  # fmt: skip
     near = found.evidence > found.evidence[0] - BEHIND * found.unit
     places = np.concatenate([found.T_camera_base[near][:CLOSER], others])

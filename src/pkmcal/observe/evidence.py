@@ -27,6 +27,7 @@ from pkmcal.observe.predict import (
     legs_in_camera,
     normals_of_edges,
     of_edges,
+    tubes_of,
     visible_stretch,
 )
 from pkmcal.observe.tables import BIN, DistanceTables
@@ -64,12 +65,16 @@ class StationView:
 
     machine: Machine
     camera: Camera
-    tubes: TubeList
     configuration: Integers
     all_joints: Array
     all_poses: Array
     tables: DistanceTables
     guessed: LegsInCamera | None = None
+
+    @cached_property
+    def tubes(self) -> TubeList:
+        """The machine's tubes."""
+        return tubes_of(self.machine)
 
     @property
     def joints(self) -> Array:
