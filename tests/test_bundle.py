@@ -12,8 +12,7 @@ from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.bundle import bundle, machine_told, solve_batch, what_data_tell
 from pkmcal.identify.covariance import identifiability, machine_covariance
-from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
-from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism

@@ -21,7 +21,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-def spread_over(count: int, most: int) -> Integers:
+def evenly(count: int, most: int) -> Integers:
     """Numbers of up to ``most`` of so many things in a row, evenly, the first and the last too."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 

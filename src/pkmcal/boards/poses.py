@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, spread_over
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import THREADS
 from pkmcal.boards.find import detect_board
@@ -127,7 +127,7 @@ def detect_again(
     missed = [k for k, detection in enumerate(found) if not detection.found]
     if board.type != "chessboard" or not missed or most < 1:
         return tuple(found)
-    chosen = [missed[k] for k in spread_over(len(missed), most)]
+    chosen = [missed[k] for k in evenly(len(missed), most)]
     out = list(found)
     with ThreadPoolExecutor(THREADS) as pool:
         again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)

@@ -231,7 +231,7 @@ class Candidate:
     fit: CameraFit
 
 
-def candidates(
+def camera_candidates(
     views: Views, image_size: tuple[int, int], models: tuple[str, ...]
 ) -> tuple[Candidate, ...]:
     """Every model with each of its sets of terms, fitted; models without a start are missing."""

@@ -19,8 +19,8 @@ from pkmcal.calibration.results import (
     FORMAT,
     FORMAT_KEY,
     POSE_WEIGHT,
-    joint_rows,
-    turned,
+    of_inverse_poses,
+    rows_of_stations,
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
@@ -138,7 +138,7 @@ class SavedCalibration(ShownCalibration):
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
             )
         where = np.array([self.placed.index(name) for name in names], dtype=int)
-        rows = joint_rows(len(self.machine.parameters), where)
+        rows = rows_of_stations(len(self.machine.parameters), where)
         return self.joint_covariance[np.ix_(rows, rows)]
 
     @property
@@ -336,7 +336,7 @@ def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Arr
     _check_covariance(document, "covariance", matrix[:count, :count])
     _check_covariance(document, key, matrix)
     found = np.array([poses[name] for name in known.stations]).reshape(-1, 4, 4)
-    return known.stations, turned(matrix, found)
+    return known.stations, of_inverse_poses(matrix, found)
 
 
 def _check_size(

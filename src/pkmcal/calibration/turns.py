@@ -24,7 +24,7 @@ from pkmcal.calibration.recognise import WORKERS, Progress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
-from pkmcal.identify.start import misfit, start_state
+from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -129,7 +129,7 @@ def better_start(machine: Machine, measurements: Measurements, known: State) -> 
         steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
     except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations
         return known
-    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
+    return min(known, steps, key=lambda state: edge_misfit(machine, measurements, state))
 
 
 def identify_poses(
@@ -264,7 +264,7 @@ def observation_of(
     estimate: Estimate,
 ) -> Observation:
     """The last looks joined, with what the estimate gave up among the rejected."""
-    seen = legs.joined(looks, float("nan"), float("nan"))
+    seen = legs.joined_looks(looks, float("nan"), float("nan"))
     given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
         edges=seen.edges,

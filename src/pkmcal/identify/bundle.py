@@ -24,7 +24,7 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import Gauge, apply, default_gauge
+from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
 from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
 from pkmcal.identify.problem import Problem
@@ -447,7 +447,7 @@ def _estimate(
     shared, u = result.info.covariance[0], problem.unknowns
     solved = state_of(assembled, found, start)
     full = machine_covariance(problem, machine, solved, shared, gauge)
-    state = apply(machine, solved, gauge)
+    state = in_gauge(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
     optics, variance = own_blocks(shared, u.optics, u.n_optics), np.diagonal(shared)

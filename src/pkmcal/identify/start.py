@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.robust import distances
+from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
@@ -67,9 +67,9 @@ def middle_pose(poses: Array) -> Array:
     return pose(rot, np.median(poses[:, :3, 3], axis=0))
 
 
-def misfit(machine: Machine, measurements: Measurements, state: State) -> float:
+def edge_misfit(machine: Machine, measurements: Measurements, state: State) -> float:
     """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
     assembled = assemble(machine, measurements, default_gauge(machine))
-    distance = distances(assembled.problem, batch_of(machine, assembled, state)).edges
+    distance = norms(assembled.problem, batch_of(machine, assembled, state)).edges
     found = distance[np.isfinite(distance)]
     return float(np.median(found)) if found.size else np.inf

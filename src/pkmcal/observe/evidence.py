@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, spread_over
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
@@ -109,7 +109,7 @@ class StationView:
 
     def few(self, count: int) -> Integers:
         """Numbers of up to ``count`` photographs, spread over all."""
-        return spread_over(len(self.configuration), count)
+        return evenly(len(self.configuration), count)
 
     def with_joints(self, joints: Array) -> StationView:
         """The same photographs with other readings (M, m)."""

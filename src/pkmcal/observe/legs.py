@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, spread_over
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
@@ -259,7 +259,7 @@ class Photographs:
 
     def spread(self, most: int) -> Integers:
         """Numbers of up to ``most`` photographs, evenly over all."""
-        return spread_over(len(self.images), most)
+        return evenly(len(self.images), most)
 
     @property
     def window(self) -> int:
@@ -313,7 +313,7 @@ def search(
         if done is not None:
             done(len(window.images))
         del window  # before the next one is decoded
-    return joined(looks, float("nan"), reach)
+    return joined_looks(looks, float("nan"), reach)
 
 
 def _searched(
@@ -370,10 +370,10 @@ def measure(
             done(len(window.images))
         del seen, window  # before the next one is decoded
     away = np.concatenate(moved)
-    return joined(looks, blur, float(np.median(away)) if len(away) else 0.0)
+    return joined_looks(looks, blur, float(np.median(away)) if len(away) else 0.0)
 
 
-def joined(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
+def joined_looks(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
     """One station's windows, or all stations, as one look."""
     first = np.cumsum([0, *(len(look.edges) for look in looks)])[:-1]
     number = [look.point_edge + k for look, k in zip(looks, first, strict=True)]

@@ -25,8 +25,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.rows import PERFECT
 from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements

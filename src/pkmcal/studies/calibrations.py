@@ -38,9 +38,9 @@ from pkmcal.identify.gauge import (
     alignment,
     changed_frames,
     default_gauge,
+    in_gauge,
     transformation,
 )
-from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.rows import EdgeData, PoseData
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
