@@ -30,14 +30,13 @@ def true_normals(edges: Any, truth: TrueMachine, radius: np.ndarray, row: np.nda
 
     radius : (n,) of their tubes, m. row : (n,) of T_base_platform.
     """
-    from pkmcal.geometry.cylinders import edge_normals
+    from pkmcal.geometry.cylinders import edge_normal_jacobians
 
     T, pose = truth.T_camera_base[edges.station], truth.T_base_platform[row]
     ends = truth.a[edges.leg], (pose @ np.pad(truth.b, ((0, 0), (0, 1)), constant_values=1.0)[
         edges.leg][..., None])[:, :3, 0]  # fmt: skip
     a, b = ((T[:, :3, :3] @ end[..., None])[..., 0] + T[:, :3, 3] for end in ends)
-    u = (b - a) / np.linalg.norm(b - a, axis=-1, keepdims=True)
-    return edge_normals(a, u, radius)[np.arange(len(edges)), edges.side]
+    return edge_normal_jacobians(a, b, radius, edges.side).n
 
 
 def true_radii(folder: Path, drawing: Any, edges: Any) -> np.ndarray:

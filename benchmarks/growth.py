@@ -34,7 +34,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
-from pkmcal.solver import minimise
+from pkmcal.solver.search import minimise
 from test_identify_scene import guess, make_scene
 from test_pose_sessions import make
 

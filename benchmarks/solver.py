@@ -43,7 +43,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.papers.four_step import solve
 from pkmcal.papers.leg_axes import centres_from_axes
-from pkmcal.solver import minimise
+from pkmcal.solver.search import minimise
 from pkmcal.studies import paper_a
 from pkmcal.studies.engine import batches
 from test_identify_scene import guess, make_scene

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.calibration.source import Source
-from pkmcal.cameras.files import save_camera
+from pkmcal.cameras.files import camera_text
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, look_at
@@ -46,7 +46,7 @@ def calibration(folder: Path, machine, *, usable=True, camera=CAMERA, session=Tr
     if session:
         (home / "session.yaml").write_text("pkmcal_session: 1\n")
         (home / "cameras").mkdir()
-        save_camera(camera, home / "cameras" / "a.yaml")
+        (home / "cameras" / "a.yaml").write_text(camera_text(camera))
     table = machine.parameters
     rng = np.random.default_rng(2)
     root = 1e-4 * rng.normal(size=(len(table), len(table)))

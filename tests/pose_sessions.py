@@ -9,7 +9,7 @@ import numpy as np
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.covariance import information
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
@@ -127,7 +127,7 @@ def bound(machine, case, estimate, rng, draws=30):
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     problem = assembled.problem
     state = batch_of(machine, assembled, estimate.state)
-    half = spread(information(problem, state))
+    half = spread(Information(problem, state))
     joints = estimate.machine.inverse(allowed(estimate.machine, workspace(rng)))
     own = np.zeros((1, len(case.poses), problem.layout.own_motion.shape[1]))
     centre = predicted(

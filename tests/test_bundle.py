@@ -12,12 +12,11 @@ from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.bundle import bundle, machine_told, solve_batch, what_data_tell
 from pkmcal.identify.covariance import identifiability, machine_covariance
-from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
-from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.solver import Stop, take
+from pkmcal.solver.search import Stop, take
 from test_identify_scene import JOINT_NOISE, exact, guess, make_scene
 
 
@@ -148,7 +147,7 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    found = np.sqrt(np.mean(result.problem.data.shading**2))
+    found = np.sqrt(np.mean(result.info.problem.data.shading**2))
     # Student's scale, with tails for what these normal shifts do not have, lies somewhat lower
     assert found == pytest.approx(0.9 * sigma if sigma > 0.03 else sigma, rel=0.1)
     error = (result.solution.state.z - truth.z) ** 2
@@ -166,7 +165,7 @@ def test_a_line_that_is_another_things_edge_is_let_go():
     scene = replace(scene, shading=np.where(wrong, -3.0, scene.shading))
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    assert np.median(result.problem.data.shading) == pytest.approx(0.1, rel=0.2)
+    assert np.median(result.info.problem.data.shading) == pytest.approx(0.1, rel=0.2)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
     assert np.mean(error / variance) == pytest.approx(1, abs=0.25)
@@ -333,6 +332,9 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(moved**2))
     ratio = np.sqrt(np.diag(found.covariance))[known] / sigma[known]
     np.testing.assert_allclose(ratio, 1, atol=0.05)
+    # the drawing is in what is told: without it that still is what was asked for
+    without = bundle(scene.machine, other, start, told=told, use_drawing=False, **plain)
+    np.testing.assert_array_equal(without.state.theta, found.state.theta)
     # what moves by less than its deviations is like before; by the drawing alone it was not
     after = machine_told(all_, together)
     assert after.like(after)

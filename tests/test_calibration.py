@@ -13,7 +13,7 @@ from pkmcal.commands.comparison import compare
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth
@@ -33,7 +33,7 @@ def errors_in_sigmas(calibration, folder):
     """Kinematic parameters' errors over their deviations, frames as the calibration has them."""
     truth = load_truth(folder, calibration.session.machine)
     estimate = calibration.estimate
-    true = apply(
+    true = in_gauge(
         truth.machine, replace(estimate.state, theta=truth.machine.values), ThreeCentres()
     ).theta
     sigma = np.sqrt(np.diag(estimate.covariance))

@@ -22,7 +22,7 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.boards.selection import (
     _tries,
-    candidates,
+    camera_candidates,
     first_fit,
     line_offsets,
     positions,
@@ -256,13 +256,13 @@ def wide_views():
 
 @pytest.fixture(scope="module")
 def wide_pool(wide_views):
-    return candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
+    return camera_candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
 
 
 @pytest.fixture
 def fitted_once(wide_pool, monkeypatch):
     """Every model's fit to these views, which does not depend on the model that is asked for."""
-    monkeypatch.setattr("pkmcal.boards.camera.candidates", lambda *_: wide_pool)
+    monkeypatch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
 
 
 @pytest.mark.usefixtures("fitted_once")

@@ -18,7 +18,7 @@ from pkmcal.files import parse_yaml, validate
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import (
@@ -226,7 +226,7 @@ def free_errors(drawing, estimate, truth):
     table = drawing.parameters
     shift = np.zeros_like(estimate.state.edge_shift)
     told = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
-    true = apply(drawing, told, default_gauge(drawing)).theta
+    true = in_gauge(drawing, told, default_gauge(drawing)).theta
     error = table.to_free(estimate.machine.values) - table.to_free(true)
     to_free = np.linalg.pinv(table.free_matrix())
     covariance = to_free @ estimate.covariance @ to_free.T

@@ -38,7 +38,6 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
     view = StationView(
         mechanism,
         camera_of(),
-        tubes_of(mechanism),
         np.arange(len(pictures)) if configuration is None else np.asarray(configuration),
         readings,
         mechanism.forward_result(readings).T_base_platform,

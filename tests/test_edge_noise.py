@@ -14,7 +14,7 @@ from pkmcal.identify.bundle import as_ended, bundle, solve_batch
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.rows import EdgeData
 from pkmcal.measurements import ALIKE, OWN_SHADING, concatenate
-from pkmcal.solver import minimise
+from pkmcal.solver.search import minimise
 from test_identify_scene import make_scene
 
 LINE = 0.05

@@ -17,9 +17,8 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.gauge import centre_index, default_gauge
-from pkmcal.identify.start import misfit, start_state
+from pkmcal.identify.gauge import centre_index, default_gauge, in_gauge
+from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import (
     Machine,
@@ -386,7 +385,9 @@ def test_the_bundle_starts_from_the_steps(name):
     far = scene.drawing.with_values(found.theta)
     known = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
     start = better_start(scene.drawing, measurements, known)
-    assert misfit(scene.drawing, measurements, start) <= misfit(scene.drawing, measurements, known)
+    assert edge_misfit(scene.drawing, measurements, start) <= edge_misfit(
+        scene.drawing, measurements, known
+    )
     best = bundle(scene.drawing, measurements, start)
     again = bundle(scene.drawing, measurements, four_step(far, measurements))
     np.testing.assert_allclose(again.state.theta, best.state.theta, atol=1e-5)

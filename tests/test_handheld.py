@@ -12,7 +12,7 @@ import pytest
 from faults import fault, replaced
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand, closely
-from pkmcal.calibration.byhand import misplaced, without_misplaced
+from pkmcal.calibration.byhand import GIVEN_UP, TURNED, misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
@@ -21,17 +21,16 @@ from pkmcal.calibration.results import document_of
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.files import Exif, read_exif, with_exif
-from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
+from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import legs, surroundings
-from pkmcal.observe.alone import Alone, find_alone, turn_between, turned_about
+from pkmcal.observe.alone import Alone, find_alone, turned_about
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import decode
-from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT
 from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
@@ -273,7 +272,7 @@ def at_truth(monkeypatch, folder, off=2e-3):
 
     def place(session, photographs, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
-        near = perturb(truth, off * rng.normal(size=(3, 6)))
+        near = perturb(truth, off * rng.normal(size=(len(truth), 6)))
         known = KnownScene.as_drawn(session.machine, near, session.joints)
         return SeenSession(session, photographs, boards, known)
 
@@ -293,6 +292,18 @@ def breathed(simulated, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         at_truth(patch, folder)
         return calibrate(folder), load_truth(folder, load_mechanism("gough-stewart"))
+
+
+def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
+    """The estimate without them gives up all of their edges, and says nothing of where they are."""
+    settings = replace(SETTINGS, configurations=4)
+    folder, machine = tmp_path / "session", load_mechanism("gough-stewart")
+    rendered(folder, machine, camera_of_size((480, 360)), settings, seed=7)
+    at_truth(monkeypatch, folder)
+    calibration = calibrate(folder, holdout=1)
+    assert len(calibration.session.stations) == 4
+    assert calibration.session.warnings == ()
+    assert calibration.estimate.configurations.sum() == 3
 
 
 def test_focal_lengths_are_found_within_their_deviations(breathed):
@@ -386,8 +397,7 @@ def looked(simulated):
 def view_of(session, p, poses):
     """What a search looks at in one photograph."""
     tables = distance_tables(p.images)
-    machine, tubes = session.machine, tubes_of(session.machine)
-    return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+    return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
 def found_with(monkeypatch, truth, doubts, textured=False):
@@ -485,24 +495,24 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     calibration, _ = breathed
     session, measurements = calibration.session, calibration.measurements
     estimate, T = calibration.estimate, calibration.estimate.state.T_camera_base
-    assert misplaced(session, measurements, estimate, T) == []
+    assert misplaced(session, measurements, estimate, T) == {}
     weights = estimate.edge_weights.copy()
     weights[measurements.edges.station == 1] *= 0.4
     given_up = replace(estimate, edge_weights=weights)
     wrong = misplaced(session, measurements, given_up, T)
-    assert wrong == [1]
+    assert wrong == {1: GIVEN_UP}
     # nor do three legs, none of which another one contradicts
     edges = measurements.edges
     fewer = edges.select((edges.station != 2) | (edges.leg < 3))
     mine = (edges.station != 2) | (edges.leg < 3)
     of_three = replace(estimate, edge_weights=estimate.edge_weights[mine])
-    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == [2]
+    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == {2: GIVEN_UP}
     # a board that agrees tells its place
     shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
     with_board = replace(given_up, pose_weights=np.ones(1))
-    assert misplaced(session, shown, with_board, T) == []
+    assert misplaced(session, shown, with_board, T) == {}
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
-    assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
+    assert misplaced(session, measurements, estimate, perturb(T, turn)) == {2: TURNED}
     photographs = read_photographs(session)
     known = KnownScene.as_drawn(session.machine, T, session.joints)
     seen = SeenSession(session, photographs, Boards(), known)
@@ -569,7 +579,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     found, _ = look_closer(session, p, drawn, equal, NONE)
     assert equal.doubt == 0.5
     assert found.doubt < 1e-3
-    assert np.degrees(turn_between(found.T_camera_base[0], true)) < 4
+    assert np.degrees(angle_between(found.T_camera_base[0], true)) < 4
     # one place alone is weighed against chance
     one = Alone(true[None], np.array([20.0]), equal.unit)
     alone, _ = look_closer(session, p, drawn, one, NONE)
@@ -581,7 +591,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
         Alone(equal.T_camera_base[1:], equal.evidence[1:], equal.unit),
         true[None],
     )
-    assert np.degrees(turn_between(told.T_camera_base[0], true)) < 2
+    assert np.degrees(angle_between(told.T_camera_base[0], true)) < 2
     assert alone.doubt < 1e-3
 
 
@@ -644,8 +654,8 @@ def test_a_board_on_the_base_weighs_places_together(looked):
     assert sorted(told) == [0, 1]  # the third does not show it
     for k, one in told.items():
         assert one.doubt < 1e-6
-        assert turn_between(one.T_camera_base[0], truth[k]) < 1e-6
+        assert angle_between(one.T_camera_base[0], truth[k]) < 1e-6
     # a photograph in which nothing was found gets its place from the board
     found[1] = Alone(truth[1:2] @ turns[0], np.array([-5.0]), 1.0)
-    assert turn_between(byhand._on_board(found, boards)[1].T_camera_base[1], truth[1]) < 1e-6
+    assert angle_between(byhand._on_board(found, boards)[1].T_camera_base[1], truth[1]) < 1e-6
     assert byhand._on_board(found, boards.of(np.array([2]))) == {}

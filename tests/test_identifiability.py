@@ -17,7 +17,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
+from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.identify.verdict import judge
@@ -59,7 +59,7 @@ def told(machine, measurements, state):
 
 def surprise(machine, found, state):
     """Squared errors by the whole covariance, per freedom: 1 is expected, frames left out."""
-    truth = apply(machine, state, default_gauge(machine))
+    truth = in_gauge(machine, state, default_gauge(machine))
     error = found.machine.values - machine.parameters.unit_axes(truth.theta)
     sigma = np.sqrt(np.diag(found.covariance))
     free = sigma > 1e-9
@@ -167,7 +167,7 @@ def normalised_steps(machine, state, truth):
     """RMS (m) of the base centres by the four steps."""
     gauge = default_gauge(machine)
     index = np.concatenate([g.index[:, :3] for g in machine.layout.base])
-    found, true = (apply(machine, s, gauge).theta[index] for s in (state, truth))
+    found, true = (in_gauge(machine, s, gauge).theta[index] for s in (state, truth))
     return np.sqrt(np.mean((found - true) ** 2))
 
 

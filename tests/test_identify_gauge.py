@@ -10,18 +10,18 @@ import pytest
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import information, machine_covariance
+from pkmcal.identify.covariance import Information, machine_covariance
 from pkmcal.identify.estimate import told_unknowns
 from pkmcal.identify.gauge import (
     BestFit,
     ThreeCentres,
     alignment,
-    apply,
     carried_errors,
     centre_index,
     changed_frames,
     freedoms,
     generators,
+    in_gauge,
     station_generators,
     transformation,
 )
@@ -42,7 +42,7 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     scene = make_scene(rng)
     machine = scene.machine
     state = moved_state(rng, scene, 0.2)
-    told = apply(machine, state, gauge)
+    told = in_gauge(machine, state, gauge)
     c = gauge.constraints(machine)
     np.testing.assert_allclose(c @ told.theta, c @ machine.parameters.drawing, atol=1e-14)
     legs = closure(machine.layout, told.theta, scene.joints[0], told.T_base_platform)
@@ -50,7 +50,7 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     base, _ = centre_index(machine.layout)
     seen = [move(s.T_camera_base[:, None], s.theta[base]) for s in (state, told)]
     np.testing.assert_allclose(seen[0], seen[1], atol=1e-13)
-    again = apply(machine, told, gauge)
+    again = in_gauge(machine, told, gauge)
     np.testing.assert_allclose(again.theta, told.theta, atol=1e-14)
 
 
@@ -59,7 +59,7 @@ def test_three_centres_as_the_design_says():
     scene = make_scene(rng)
     base = centre_index(scene.machine.layout)[0]
     d = scene.machine.parameters.drawing[base]
-    a = apply(scene.machine, moved_state(rng, scene), ThreeCentres()).theta[base]
+    a = in_gauge(scene.machine, moved_state(rng, scene), ThreeCentres()).theta[base]
     np.testing.assert_allclose(a[0], d[0], atol=1e-14)
     np.testing.assert_allclose(np.cross(a[2] - a[0], d[2] - d[0]), 0, atol=1e-14)
     assert (a[2] - a[0]) @ (d[2] - d[0]) > 0
@@ -71,7 +71,7 @@ def test_best_fit_is_the_least_squares_fit():
     """No small motion of either frame brings the centres nearer to the drawing."""
     rng = np.random.default_rng(2)
     scene = make_scene(rng)
-    told = apply(scene.machine, moved_state(rng, scene), BestFit())
+    told = in_gauge(scene.machine, moved_state(rng, scene), BestFit())
     drawing = scene.machine.parameters.drawing
 
     def cost(e, f):
@@ -135,16 +135,16 @@ def test_errors_are_carried_by_a_finite_frame_change():
 
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_transformation_is_the_derivative_of_apply(gauge):
-    """Errors told in the gauge, by central differences through the whole of ``apply``."""
+    """Errors told in the gauge, by central differences through the whole of ``in_gauge``."""
     rng = np.random.default_rng(5)
     scene = make_scene(rng)
     machine = scene.machine
-    state = apply(machine, with_mounts(scene.state(), rng), gauge)
+    state = in_gauge(machine, with_mounts(scene.state(), rng), gauge)
     unknowns = told_unknowns(state)
     s = transformation(machine, state, gauge)
     for _ in range(5):
         d = 1e-6 * rng.normal(size=s.shape[1])
-        plus, minus = (apply(machine, off(state, sign * d), gauge) for sign in (1, -1))
+        plus, minus = (in_gauge(machine, off(state, sign * d), gauge) for sign in (1, -1))
         numeric = 0.5 * (plus.theta - minus.theta)
         np.testing.assert_allclose(numeric, (s @ d)[unknowns.machine], atol=1e-12)
         numeric = 0.5 * pose_difference(plus.T_camera_base, minus.T_camera_base).ravel()
@@ -165,8 +165,8 @@ def test_covariance_transformed_equals_covariance_recomputed(first, second):
     told = []
     for rows in (first, second):
         assembled = assemble(machine, m, rows, use_drawing=False)
-        state = apply(machine, scene.state(), rows)
-        info = information(assembled.problem, batch_of(machine, assembled, state))
+        state = in_gauge(machine, scene.state(), rows)
+        info = Information(assembled.problem, batch_of(machine, assembled, state))
         told.append(
             machine_covariance(assembled.problem, machine, state, info.covariance[0], second)
         )
@@ -182,7 +182,7 @@ def test_end_effector_does_not_depend_on_the_gauge():
     scene = make_scene(rng)
     poses = []
     for gauge in GAUGES:
-        told = apply(scene.machine, scene.state(), gauge)
+        told = in_gauge(scene.machine, scene.state(), gauge)
         machine = scene.machine.with_values(told.theta)
         T = machine.forward(scene.joints[0], told.T_base_platform)
         b = machine.platform_centers()
@@ -210,6 +210,6 @@ def test_fixed_parameters_take_frames_away():
 
 def test_alignment_of_a_state_already_in_the_gauge_is_nothing():
     scene = make_scene(np.random.default_rng(10))
-    state = apply(scene.machine, scene.state(), ThreeCentres())
+    state = in_gauge(scene.machine, scene.state(), ThreeCentres())
     for transform in alignment(scene.machine, state, ThreeCentres()):
         np.testing.assert_allclose(transform, np.eye(4), atol=1e-13)

@@ -10,8 +10,7 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.gauge import ThreeCentres, centre_index
-from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.gauge import ThreeCentres, centre_index, in_gauge
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.linear import centres, procrustes_scale, scale_ratio
 from test_identify_scene import exact, guess

@@ -12,7 +12,7 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements, Mount, PoseSet
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -119,7 +119,7 @@ def test_truth_is_found_without_noise(name):
         robust=False,
         scale_noise=False,
     )
-    truth = apply(session.drawing, session.state(), default_gauge(session.drawing))
+    truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
     error = found.machine.values - session.drawing.parameters.unit_axes(truth.theta)
     sigma = np.sqrt(np.diag(found.covariance))
     # micrometres where photographs leave tens of them; the drawing pulls on what they do not tell
@@ -137,7 +137,7 @@ def test_errors_are_as_large_as_they_say(name):
         found = bundle(
             session.drawing, session.measurements, session.guess(np.random.default_rng(seed))
         )
-        truth = apply(session.drawing, session.state(), default_gauge(session.drawing))
+        truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
         table = session.drawing.parameters
         # an axis by its two turns: along itself it changes by squares of small angles only
         error = table.to_free(found.machine.values) - table.to_free(truth.theta)

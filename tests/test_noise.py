@@ -10,7 +10,7 @@ import pytest
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.covariance import information
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.kinds import EDGES, READINGS
 from pkmcal.identify.noise import FEWEST, Components, components
@@ -159,7 +159,7 @@ def test_traces_are_those_of_the_hat_matrix(name):
     used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
-    found = components(information(problem, state), weight)
+    found = components(Information(problem, state), weight)
     left = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
     square = np.array([[np.sum(part**2) for part in row] for row in left])
     freedom = np.array([np.trace(left[i][i]) for i in range(3)])

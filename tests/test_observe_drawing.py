@@ -14,7 +14,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pkmcal.cameras import camera_models
-from pkmcal.geometry.cylinders import edge_normals
+from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.mechanisms import load_mechanism
 
@@ -176,7 +176,7 @@ def true_normals(legs, tubes, sides, configurations):
     for leg, tube, side, k in zip(legs, tubes, sides, configurations, strict=True):
         shape = [t for t in tubes_at(machine(), poses()[k]) if t.leg == leg][tube]
         a, u = FRONT[:3, :3] @ shape.start + FRONT[:3, 3], FRONT[:3, :3] @ shape.axis
-        normals.append(edge_normals(a, u, np.array(shape.radius))[side])
+        normals.append(edge_normal_jacobians(a, a + u, np.array(shape.radius), side).n)
     return np.array(normals)
 
 

@@ -129,7 +129,7 @@ def view_of(pictures, mechanism=None, seen=None):
     readings = machine().inverse(seen)
     names = np.arange(len(pictures))
     tables = distance_tables(pictures)
-    return StationView(mechanism, camera_of(), tubes_of(mechanism), names, readings, seen, tables)
+    return StationView(mechanism, camera_of(), names, readings, seen, tables)
 
 
 def misplaced(T_camera_base):

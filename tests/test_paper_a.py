@@ -264,11 +264,11 @@ def test_axis_as_edges_is_the_same_measurement():
 
 
 def pair_normals(axis, radius):
-    from pkmcal.geometry.cylinders import edge_normals
+    from pkmcal.geometry.cylinders import edge_normal_jacobians
 
-    u, point, _, _ = from_coordinates(axis)
-    n = edge_normals(point, u, radius)
-    np.testing.assert_allclose(dot(n, point[:, None]), -radius[:, None] * np.ones(2), atol=1e-12)
+    u, point, _, _ = (x[:, None] for x in from_coordinates(axis))
+    n = edge_normal_jacobians(point, point + u, radius[:, None], np.arange(2)).n
+    np.testing.assert_allclose(dot(n, point), -radius[:, None] * np.ones(2), atol=1e-12)
     return n
 
 

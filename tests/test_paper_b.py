@@ -10,7 +10,7 @@ import pytest
 import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
-from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
+from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.papers import linear
 from pkmcal.simulation import Settings
@@ -55,7 +55,7 @@ def edges_around_a_mirror(rng):
     b = apply((T @ poses)[None], machine.platform_centers()[:, None])
     a = np.broadcast_to(centres[:, None], b.shape)
     u, _ = line_through(a, b)
-    n = edge_normals(a, u, np.full(a.shape[:-1], RADIUS))
+    n = edge_normal_jacobians(a[..., None, :], b[..., None, :], np.array(RADIUS), np.arange(2)).n
     length = np.linalg.norm(b - a, axis=-1)[..., None]
     along = (0.02 + (length - 0.04) * np.linspace(0, 1, 100))[:, :, None]
     points = (a[:, :, None] + RADIUS * n)[..., None, :] + along[..., None] * u[:, :, None, None]

@@ -9,7 +9,8 @@ from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, identifiability, reduced_rows
 from pkmcal.identify.noise import components
 from pkmcal.papers import linear
-from pkmcal.solver import condensed, elimination
+from pkmcal.solver import elimination
+from pkmcal.solver.elimination import condensed
 from test_identify_scene import make_scene
 
 CONFIGURATIONS = 7

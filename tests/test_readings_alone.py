@@ -72,10 +72,10 @@ def estimate(drawing, joints, noise):
 
 def whitened(found, truth):
     """The parameters' errors in the result's frames, along the covariance's axes, in sigmas."""
-    from pkmcal.identify.gauge import apply, default_gauge
+    from pkmcal.identify.gauge import default_gauge, in_gauge
 
     drawing = found.machine.with_values(found.machine.parameters.drawing)
-    true = apply(drawing, replace(found.state, theta=truth.values), default_gauge(drawing)).theta
+    true = in_gauge(drawing, replace(found.state, theta=truth.values), default_gauge(drawing)).theta
     error, c = found.machine.values - true, found.covariance
     known = np.flatnonzero(np.diag(c) > 0)
     error, c = error[known], c[np.ix_(known, known)]

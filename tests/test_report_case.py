@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.cameras.pinhole import Pinhole
-from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
+from pkmcal.geometry.cylinders import contour_point, edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.estimate import Estimate, State, Statistics
@@ -61,7 +61,7 @@ def one_edge(machine, camera, T, pose, joints, place, shift):
     leg, tube, side = place
     legs = legs_in_camera(machine, T, pose, joints)
     a, u, radius = legs.a[leg], legs.u[leg], np.array(RADIUS[tube])
-    normal = edge_normals(a, u, radius)[side]
+    normal = edge_normal_jacobians(a, a + u, radius, np.array(side)).n
     span = np.array([0.04, 0.22]) if tube == 0 else np.array([0.26, 0.32])
     points = contour_point(a, u, normal, radius, np.linspace(*span, 9))
     pixels = camera.project(points)

@@ -220,7 +220,7 @@ def test_a_failed_save_leaves_the_old_result(folder, calibrated, monkeypatch):
     def fail(*_calibration):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results, "document_of", fail)
+    monkeypatch.setattr("pkmcal.report.calibration.document_of", fail)
     with pytest.raises(OSError, match="No space"):
         save(calibrated, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

@@ -11,7 +11,7 @@ import pytest
 
 from pkmcal.cameras import camera_models
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.geometry.cylinders import contour_point, edge_normals
+from pkmcal.geometry.cylinders import contour_point, edge_normal_jacobians
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure
@@ -76,7 +76,7 @@ def picture(parts, view, lighting=DARK, T_camera_base=FRONT, seed=0):
 def predicted_edge(tube, side, upright):
     """Pixels along an edge, across the image first where ``upright``; sorted along the edge."""
     a, u = apply(FRONT, tube.start), FRONT[:3, :3] @ tube.axis
-    n = edge_normals(a, u, np.array(tube.radius))[side]
+    n = edge_normal_jacobians(a, a + u, np.array(tube.radius), np.array(side)).n
     along = np.linspace(0, tube.length, 400)
     pixel = CAMERA.project(contour_point(a, u, n, np.array(tube.radius), along))
     pixel = pixel if upright else pixel[:, ::-1]
@@ -285,8 +285,7 @@ def _check_exact(machine, T_camera_base, poses, edges, e):
     ends = limb_ends(machine.layout, machine.values, np.zeros(6), poses[edges.configuration[e]])
     T, leg = T_camera_base[edges.station[e]], edges.leg[e]
     a, b = apply(T, ends.a[leg]), apply(T, ends.b[leg])
-    u = (b - a) / np.linalg.norm(b - a)
-    n = edge_normals(a, u, machine.radii()[leg][edges.tube[e]])[edges.side[e]]
+    n = edge_normal_jacobians(a, b, machine.radii()[leg][edges.tube[e]], edges.side[e]).n
     np.testing.assert_allclose(edges.normal[e], n, atol=1e-10)
 
 

@@ -9,27 +9,10 @@ import pytest
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
-from pkmcal.solver import (
-    Compact,
-    Linear,
-    Stop,
-    StripLayout,
-    Strips,
-    column_space,
-    compact,
-    eliminate,
-    eliminated,
-    final_weights,
-    inverse_root,
-    minimise,
-    normal_root,
-    of_runs,
-    put,
-    soft_weights,
-    stacked,
-    take,
-)
-from pkmcal.solver.strips import normal_equations
+from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.ranks import column_space, inverse_root, normal_root
+from pkmcal.solver.search import Stop, final_weights, minimise, of_runs, put, soft_weights, take
+from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
 from test_identify_scene import guess, make_scene
 
 
@@ -96,16 +79,10 @@ def test_damped_step_equals_dense_marquardt():
         )
 
 
-def reduced_normal(reduced) -> np.ndarray:
-    """Normal matrices (B, na, na) of the configurations' reduced rows."""
-    rows = reduced.rows.reshape(len(reduced.rows), -1, reduced.rows.shape[-1])
-    return rows.mT @ rows
-
-
 def test_reduced_normal_is_the_schur_complement():
     linear = random_linear(np.random.default_rng(2))
-    reduced = eliminate(linear, np.zeros(3))
-    normal = reduced_normal(reduced) + linear.shared_by.T @ linear.shared_by
+    rows, left = stacked(linear, eliminate(linear))
+    normal = rows.mT @ rows
     for run in range(3):
         jac, value = dense(linear, run)
         full, na = jac.T @ jac, 5
@@ -113,7 +90,7 @@ def test_reduced_normal_is_the_schur_complement():
         np.testing.assert_allclose(normal[run], schur, atol=1e-11)
         g = jac.T @ value
         g = g[:na] - full[:na, na:] @ np.linalg.solve(full[na:, na:], g[na:])
-        np.testing.assert_allclose(reduced.gradient[run], g, atol=1e-11)
+        np.testing.assert_allclose(rows[run].T @ left[run], g, atol=1e-11)
 
 
 def in_strips(rng, sharp, runs=2, k=11, own=3, na=9):
@@ -136,6 +113,18 @@ def in_strips(rng, sharp, runs=2, k=11, own=3, na=9):
     return Compact(value, usable, *prior, Strips(layout, numbers), sharp * rest, sharp * by_own)
 
 
+def with_damping(linear, damping):
+    """A problem with the rows that hold own unknowns by damping, and with these eliminated."""
+    own = linear.by_own
+    rows = np.sqrt(damping)[:, None, None, None] * np.linalg.norm(own, axis=2)[..., None]
+    wide = linear._replace(
+        value=np.pad(linear.value, ((0, 0), (0, 0), (0, own.shape[-1]))),
+        by_shared=np.pad(linear.by_shared, ((0, 0), (0, 0), (0, own.shape[-1]), (0, 0))),
+        by_own=np.concatenate([own, rows * np.eye(own.shape[-1])], axis=2),
+    )
+    return wide, eliminate(wide)
+
+
 @pytest.mark.parametrize("sharp", [1.0, 1e6])
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 def test_products_of_strips_are_those_of_their_rows(damping, sharp):
@@ -143,13 +132,10 @@ def test_products_of_strips_are_those_of_their_rows(damping, sharp):
     rows, damping = in_strips(np.random.default_rng(12), sharp), np.full(2, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
-    reduced, found = eliminate(linear, damping), eliminated(rows, damping)
-    normal, wanted = found.strips_normal + found.rows_normal, reduced_normal(reduced)
-    np.testing.assert_allclose(normal, wanted, atol=1e-9 * np.abs(wanted).max())
-    whole = normal_equations([rows], damping)
-    np.testing.assert_array_equal(whole.matrix, normal + rows.shared_by.T @ rows.shared_by)
-    atol = 1e-9 * np.abs(reduced.gradient).max()
-    np.testing.assert_allclose(whole.gradient, reduced.gradient, atol=atol)
+    whole, (jac, left) = normal_equations([rows], damping), stacked(*with_damping(linear, damping))
+    normal, gradient = jac.mT @ jac, (jac.mT @ left[..., None])[..., 0]
+    for found, by_rows in ((whole.matrix, normal), (whole.gradient, gradient)):
+        np.testing.assert_allclose(found, by_rows, atol=1e-9 * np.abs(by_rows).max())
     steps = whole.step(damping), damped_step(linear, damping)
     np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(steps[0][1][0], steps[1][1], rtol=1e-8, atol=1e-10)
@@ -164,7 +150,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
     )
     start = replace(truth, z=0 * truth.z, T_camera_base=station)
     together = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
-    assert len(set(together.steps.tolist())) > 1
+    assert len(set(together.solution.steps.tolist())) > 1
     for run in range(4):
         only = np.array([run])
         alone = solve_batch(
@@ -173,7 +159,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
             robust=False,
             scale_noise=False,
         )
-        assert alone.steps[0] == together.steps[run]
+        assert alone.solution.steps[0] == together.solution.steps[run]
         np.testing.assert_allclose(
             alone.solution.state.z[0], together.solution.state.z[run], atol=1e-11
         )
@@ -185,7 +171,7 @@ def test_typical_number_of_steps():
     start = replace(truth, z=0 * truth.z)
     found = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(found.solution.stop) == {Stop.CONVERGED}
-    assert found.steps.max() <= 10
+    assert found.solution.steps.max() <= 10
 
 
 def rosenbrock(x, runs):
@@ -280,7 +266,7 @@ def test_what_all_runs_share_stays():
 def test_stacked_rows_are_the_reduced_problem():
     """Their least squares is the shared part of the whole problem's."""
     linear = random_linear(np.random.default_rng(8))
-    rows, value = stacked(linear, eliminate(linear, np.zeros(3)))
+    rows, value = stacked(linear, eliminate(linear))
     for run in range(3):
         jac, residual = dense(linear, run)
         whole = np.linalg.lstsq(jac, residual, rcond=None)[0][:5]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras.pinhole import Pinhole
-from pkmcal.geometry.rigid import inverse, pose, rotation
-from pkmcal.observe.alone import Alone, turn_between
+from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
+from pkmcal.observe.alone import Alone
 from pkmcal.observe.predict import LegsInCamera
 from pkmcal.observe.surroundings import (
     FEWEST,
@@ -139,7 +139,7 @@ def test_landmarks_place_a_photograph():
     landmarks = scene.room.landmarks(scene.placed(0, 1, 2))
     found = scene.room.place(3, landmarks)
     assert len(found) == 1
-    assert np.degrees(turn_between(found[0], scene.T[3])) < 0.2
+    assert np.degrees(angle_between(found[0], scene.T[3])) < 0.2
     assert np.linalg.norm(inverse(found[0])[:3, 3] - inverse(scene.T[3])[:3, 3]) < 0.01
 
 
@@ -165,7 +165,7 @@ def test_the_right_place_is_named_though_legs_prefer_its_look_alike():
     legs = LegsInCamera(*(np.stack(v) for v in zip(*(
         (one.a, one.b, one.u) for one in map(legs_of, places)), strict=True)))  # fmt: skip
     told = scene.room.weighed(found, 0, CAMERA, legs, scene.placed(1))
-    assert turn_between(told.T_camera_base[0], T) < 1e-6
+    assert angle_between(told.T_camera_base[0], T) < 1e-6
     assert told.doubt < 1e-3
     # nobody is placed yet: the legs' word stands
     assert scene.room.weighed(found, 0, CAMERA, legs, {}) is found
@@ -179,7 +179,7 @@ def test_a_place_that_is_turned_a_little_is_turned_back():
     found = Alone(T[None], np.array([10.0]), 1.0)
     near = scene.room.about(found, 0, CAMERA, legs, scene.placed(1, 2))
     assert len(near) == 1
-    assert np.degrees(turn_between(near[0], scene.T[0])) < 2.5
+    assert np.degrees(angle_between(near[0], scene.T[0])) < 2.5
 
 
 def test_texture_is_found_where_it_is():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.board import Detection, chessboard
-from pkmcal.boards.poses import board_views, detect_again, detect_in, moving_poses, standing
+from pkmcal.boards.poses import board_views, detect_again, detect_in, one_a_configuration, standing
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
@@ -74,7 +74,7 @@ def without(detection, keep):
 def test_errors_of_poses_are_what_their_covariances_say(board):
     n = 200
     truth = poses_around(n)
-    poses = moving_poses(seen(board, detections(board, truth)), mount=0)
+    poses = one_a_configuration(seen(board, detections(board, truth)), mount=0)[0]
     assert len(poses) == n
     assert set(poses.station.tolist()) == {2}
     # 1200 squares of unit normals: four standard deviations of their mean
@@ -87,7 +87,7 @@ def test_rendered_boards(board):
     truth = poses_around(6, seed=3)
     images = [render(CAMERA, T, board, seed=k) for k, T in enumerate(truth)]
     found = detect_in(images, board, [f"{k}.png" for k in range(6)])
-    poses = moving_poses(seen(board, found), mount=0)
+    poses = one_a_configuration(seen(board, found), mount=0)[0]
     error = pose_difference(poses.T_station_target, truth)
     value = chi2(error, poses.whiten)
     # 36 squares; sigma is by what the corner's fit leaves, which is a little too large
@@ -103,7 +103,7 @@ def test_a_hidden_part_costs_certainty_not_truth(board):
     part = without(whole, np.arange(12, 30))
     both = seen(board, [whole, part])
     error = pose_difference(both.poses.T_camera_board, np.tile(T, (2, 1, 1)))
-    poses = moving_poses(both, 0)
+    poses = one_a_configuration(both, 0)[0]
     assert np.all(chi2(error, poses.whiten) < 24)  # one in two thousand
     sigma = np.sqrt(np.einsum("nii->ni", both.poses.covariance))
     assert np.all(sigma[1] > 1.2 * sigma[0])
@@ -118,15 +118,8 @@ def test_outlying_corners_lose_their_weight(board):
     views = seen(board, found)
     assert np.all(views.poses.weight[1, [3, 17, 40]] == 0)
     assert views.poses.weight[1].sum() > 40
-    poses = moving_poses(views, 0)
+    poses = one_a_configuration(views, 0)[0]
     assert np.all(chi2(pose_difference(poses.T_station_target, T), poses.whiten) < 24)
-
-
-def test_repeats_of_a_configuration_are_measurements_of_their_own(board):
-    found = detections(board, poses_around(4))
-    poses = moving_poses(seen(board, found, rows=[7, 7, 7, 2]), mount=1)
-    assert poses.configuration.tolist() == [7, 7, 7, 2]
-    assert poses.mount.tolist() == [1, 1, 1, 1]
 
 
 def test_photographs_without_a_board_are_rejected_with_the_reason(board):
@@ -137,14 +130,14 @@ def test_photographs_without_a_board_are_rejected_with_the_reason(board):
     (item,) = views.rejected
     assert (item.station, item.configuration, item.leg) == (2, 5, -1)
     assert item.reason == "the board: nothing is recognised"
-    assert moving_poses(views, 0).configuration.tolist() == [4, 6]
+    assert one_a_configuration(views, 0)[0].configuration.tolist() == [4, 6]
 
 
 def test_no_photograph_shows_it(board):
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     missed = Detection("0000.png", CAMERA.image_size, *none, reason="nothing is recognised")
     views = seen(board, [missed])
-    assert len(moving_poses(views, 0)) == 0
+    assert len(one_a_configuration(views, 0)[0]) == 0
     assert standing(views) is None
 
 

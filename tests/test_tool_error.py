@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, laid_over
 from pkmcal.identify.compared import compare
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
@@ -258,7 +258,7 @@ def test_a_machine_without_a_map_says_why():
 def test_frames_are_no_error(small):
     """Those by three joints in place of the truth's: other numbers, the same machine."""
     state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
-    told = apply(small.machine, state, ThreeCentres((0, 2, 4)))
+    told = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
     other = small.machine.with_values(told.theta)
     joints = small.machine.inverse(small.poses)
     plain = np.linalg.norm((other.forward(joints) - small.poses)[:, :3, 3], axis=1)

@@ -43,7 +43,7 @@ from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
-from pkmcal.solver import Solution, Stop
+from pkmcal.solver.search import Solution, Stop
 from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_identify_scene import exact
 

@@ -18,7 +18,7 @@ from pkmcal.identify.gauge import default_gauge, freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
 from pkmcal.identify.sentences import MOST
 from pkmcal.identify.tool import _around, platform_by_parameters, pose_by_parameters
-from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
+from pkmcal.identify.unidentified import describe, seen_legs, seen_through_boards, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
 from pkmcal.mechanisms.carriers.slider import Slider
@@ -498,7 +498,7 @@ def test_a_board_on_the_base_joins_stations():
     measured = Measurements(
         edges, np.zeros((1, 6)), 1e-6, 3, np.zeros(3, int), poses=poses, mounts=mounts
     )
-    seen = joined_by_boards(seen_from([1], [2], [3]), measured)
+    seen = seen_through_boards(seen_from([1], [2], [3]), measured)
     assert [np.flatnonzero(row).tolist() for row in seen] == [[0, 2], [1], [0, 2]]
 
 

@@ -24,7 +24,7 @@ from pkmcal.report import parameters
 from pkmcal.report.identifiability import held as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import TIGHT, bound_together, grouped, tight_pairs
-from pkmcal.solver import Stop
+from pkmcal.solver.search import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
 

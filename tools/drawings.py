@@ -13,7 +13,7 @@ from plots import CALIBRATED, DRAWING, GOOD, INK, MUTED, Plot, arrow_heads, dot,
 from scipy.interpolate import CubicSpline
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.cylinders import edge_normals
+from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
@@ -96,7 +96,8 @@ def _camera(T_base_camera: Array, on_paper: Callable[[Array], Array]) -> list[st
 def edge_planes() -> str:
     """A cut across a leg, u towards the reader: normals of the two edge planes, to scale."""
     scale, centre, radius = 62.0, np.array([6.3, 0.0, 0.0]), 1.5
-    n = edge_normals(centre, np.array([0.0, 0.0, 1.0]), np.array(radius))
+    above = centre + np.array([0.0, 0.0, 1.0])
+    n = edge_normal_jacobians(centre, above, np.array(radius), np.arange(2)).n
 
     def at(p: Array) -> tuple[float, float]:
         return 130 + scale * float(p[0]), 150 - scale * float(p[1])

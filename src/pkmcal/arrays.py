@@ -21,6 +21,11 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
+def evenly(count: int, most: int) -> Integers:
+    """Numbers of up to ``most`` of so many things in a row, evenly, the first and the last too."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
 def numbered(names: Iterable[Hashable]) -> Integers:
     """Numbers (n,) of things that may be alike, in the order in which each is first named."""
     number: dict[Hashable, int] = {}

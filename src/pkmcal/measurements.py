@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeVar
 
@@ -217,6 +217,11 @@ def concatenate(sets: Sequence[Set]) -> Set:
         for f in fields(sets[0])
     }
     return replace(sets[0], **joined)
+
+
+def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
+    """Edges by the number of their station, whatever number it had, as one set."""
+    return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pkmcal.boards.selection import (
     Candidate,
     HeldOut,
     best_of,
-    candidates,
+    camera_candidates,
     fitted_to_all,
     held_out,
     is_worse,
@@ -166,7 +166,7 @@ def calibrate_camera(
     check_enough(used, len(detections))
     image_size = used[0].image_size
     views = views_of(used, board)
-    pool = candidates(thinned(views), image_size, tuple(TERMS))
+    pool = camera_candidates(thinned(views), image_size, tuple(TERMS))
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)

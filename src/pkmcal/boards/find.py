@@ -331,10 +331,13 @@ def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
     for k, axis in enumerate((1, 0)):
         step = np.diff(grid, axis=axis)
         mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
-        side = _beside(step, axis).reshape(-1, 2)[ids]
+        side = _mean_of_known(_padded(step, axis, 1, 0), _padded(step, axis, 0, 1))
+        side = side.reshape(-1, 2)[ids]
         sides[:, k] = np.where(np.isfinite(side), side, mean)
         # At the board's border the bend of the nearest corner inside serves as well.
-        second = _nearest(_padded(np.diff(step, axis=axis), axis, 1, 1), axis)
+        second = _padded(np.diff(step, axis=axis), axis, 1, 1)
+        around = _mean_of_known(np.roll(second, 1, axis), np.roll(second, -1, axis))
+        second = np.where(np.isfinite(second), second, around)
         bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
     # A single row of corners has no second side: take it square.
     for k in (0, 1):
@@ -354,20 +357,12 @@ def _padded(values: Array, axis: int, before: int, after: int) -> Array:
     return out
 
 
-def _beside(step: Array, axis: int) -> Array:
-    """Mean of the steps to both sides, or the one that there is."""
-    both = np.stack([_padded(step, axis, 1, 0), _padded(step, axis, 0, 1)])
+def _mean_of_known(*parts: Array) -> Array:
+    """Means of what is known (not NaN) in parts of one shape."""
+    both = np.stack(parts)
     known = np.isfinite(both)
     total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(known.any(axis=0), total, np.nan)
-
-
-def _nearest(values: Array, axis: int) -> Array:
-    """NaN replaced by the mean of the two neighbours' values, or the one that there is."""
-    around = [np.roll(values, shift, axis) for shift in (1, -1)]
-    known = np.isfinite(np.stack(around))
-    total = np.where(known, np.stack(around), 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(np.isfinite(values), values, total)
 
 
 def _marker_axes(ids: Integers, pixels: Array) -> Array:

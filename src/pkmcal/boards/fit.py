@@ -21,16 +21,9 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.cameras.contract import Camera
 from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
-from pkmcal.solver import (
-    Linear,
-    Stop,
-    Values,
-    eliminate,
-    final_weights,
-    minimise,
-    normal_root,
-    own_factors,
-)
+from pkmcal.solver.elimination import Linear, eliminate
+from pkmcal.solver.ranks import normal_root
+from pkmcal.solver.search import Stop, Values, final_weights, minimise
 
 LEAST_KNOWN = 1e-14
 """Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
@@ -247,17 +240,13 @@ def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     """
     linear = fit.problem(views).linearize(fit.state)
     n = len(fit.camera.parameters)
-    whole = np.zeros((n, n))
+    reduced = eliminate(linear)
+    inner = np.linalg.inv(reduced.r[0] + 1e-150 * np.eye(6))
+    whole, by = np.zeros((n, n)), np.zeros((len(fit.T_camera_board), 6, n))
     if len(fit.free):
-        rows = eliminate(linear, np.zeros(1)).rows[0]
-        part = inverted((rows.mT @ rows).sum(axis=0))
-        whole[np.ix_(fit.free, fit.free)] = part
-    q, r = own_factors(linear.by_own, np.zeros(1))
-    rows = linear.by_own.shape[-2]
-    inner = np.linalg.inv(r[0] + 1e-150 * np.eye(6))
-    by = np.zeros((len(fit.T_camera_board), 6, n))
-    if len(fit.free):
-        by[..., fit.free] = -inner @ (q[0, :, :rows].mT @ linear.by_shared[0])
+        rows = reduced.rows[0]
+        whole[np.ix_(fit.free, fit.free)] = inverted((rows.mT @ rows).sum(axis=0))
+        by[..., fit.free] = -inner @ (reduced.q[0].mT @ linear.by_shared[0])
     poses = inner @ inner.mT + by @ whole @ by.mT
     return whole, poses, by
 

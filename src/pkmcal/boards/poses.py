@@ -2,10 +2,10 @@
 
 Every photograph that shows the board gives a pose by maximum likelihood from all its corners with
 their noise; corners far off lose their weight, and a board that is partly hidden counts by what
-is seen of it. A board on the platform is somewhere else in every photograph, and each photograph
-(each repeat too) is one measurement. A board on the base is always in the same place: its
-photographs are one measurement, by the means of their corners (:func:`standing`). Repeats of a
-configuration become one measurement each (:func:`one_a_configuration`).
+is seen of it. A board on the platform is somewhere else in every configuration, each of which is
+one measurement, by the mean of its repeats (:func:`one_a_configuration`). A board on the base is
+always in the same place: its photographs are one measurement, by the means of their corners
+(:func:`standing`).
 
 A pose's uncertainty here is that of its corners: their noise in the picture, and what camera
 model and board leave unexplained. What the camera's calibration may be wrong by is not in it.
@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import THREADS
 from pkmcal.boards.find import detect_board
@@ -127,8 +127,7 @@ def detect_again(
     missed = [k for k, detection in enumerate(found) if not detection.found]
     if board.type != "chessboard" or not missed or most < 1:
         return tuple(found)
-    places = np.unique(np.linspace(0, len(missed) - 1, min(most, len(missed))).astype(int))
-    chosen = [missed[k] for k in places]
+    chosen = [missed[k] for k in evenly(len(missed), most)]
     out = list(found)
     with ThreadPoolExecutor(THREADS) as pool:
         again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
@@ -162,18 +161,6 @@ def board_views(
     )
     _check_explained(seen)
     return seen
-
-
-def moving_poses(seen: BoardViews, mount: int) -> PoseSet:
-    """A board on the platform: one measurement a photograph, in the order of the photographs."""
-    kept = seen.usable
-    return pose_set(
-        seen.station,
-        seen.configuration[seen.shown[kept]],
-        mount,
-        seen.poses.T_camera_board[kept],
-        seen.poses.covariance[kept],
-    )
 
 
 def pose_set(
@@ -449,7 +436,7 @@ def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Re
     kept = np.flatnonzero(seen.usable)
     rows = seen.configuration[seen.shown[kept]]
     if not len(kept):
-        return moving_poses(seen, mount), ()
+        return PoseSet.empty(), ()
     sigma2 = float(np.median(seen.views.sigma[seen.views.seen]) ** 2)
     noise2 = seen.poses.noise**2
     common = min(noise2 / (noise2 + sigma2), MOST_COMMON)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.boards.fit import (
     CameraFit,
     Views,
@@ -25,7 +25,7 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.solver import eliminate
+from pkmcal.solver.elimination import eliminate
 
 FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of pixels a radian in the picture's middle, as a share of its width."""
@@ -148,7 +148,7 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
         residuals,
         float(np.sqrt(np.nanmean(squares))),
         np.sqrt(np.nanmean(squares, axis=1)),
-        float(np.sqrt(np.mean(bend**2))) if bend.size else float("nan"),
+        rms(bend),
     )
 
 
@@ -206,7 +206,7 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     together are in balance.
     """
     linear = fit.problem(views).linearize(fit.state)
-    rows = eliminate(linear, np.zeros(1)).rows[0]
+    rows = eliminate(linear).rows[0]
     normals = rows.mT @ rows
     whole = normals.sum(axis=0)
     right = rows.mT @ linear.value[0][..., None]
@@ -231,7 +231,7 @@ class Candidate:
     fit: CameraFit
 
 
-def candidates(
+def camera_candidates(
     views: Views, image_size: tuple[int, int], models: tuple[str, ...]
 ) -> tuple[Candidate, ...]:
     """Every model with each of its sets of terms, fitted; models without a start are missing."""

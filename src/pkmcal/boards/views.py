@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, short_repr
+from pkmcal.arrays import Array, Integers, evenly, short_repr
 from pkmcal.boards.board import Board, Detection, load_board
 from pkmcal.boards.detect import check_boards
 from pkmcal.boards.poses import (
@@ -208,7 +208,7 @@ def _check_another(
     station = session.stations[number]
     shown = np.flatnonzero([detection.found for detection in detections])
     rows = shown if shown.size else np.arange(len(detections))
-    few = rows[np.unique(np.linspace(0, len(rows) - 1, EXAMINED).astype(int))]
+    few = rows[evenly(len(rows), EXAMINED)]
     paths = [station.photographs[k].path for k in few]
     try:
         check_boards(paths, [detections[k] for k in few], board)

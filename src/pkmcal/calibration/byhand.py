@@ -27,14 +27,14 @@ from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.geometry.rigid import dot, inverse, pose_difference
+from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MachineTold
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, Alone, find_alone, turn_between
+from pkmcal.observe.alone import ALIKE, Alone, find_alone
 from pkmcal.observe.evidence import StationView
-from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
+from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
@@ -47,8 +47,11 @@ share of it."""
 LIKELY = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
-ELSEWHERE = "too few of its edges agree with the other photographs"
-"""Why one is left out that was found in one place and that the others put in another."""
+GIVEN_UP = "too few of its edges agree with the other photographs"
+TURNED = "all photographs together turn its camera by more than ten degrees"
+"""Why one is left out that was found in one place and does not belong there."""
+MOST_TURN = ALIKE / 2
+"""Turn (rad) from where a photograph was placed from which on it does not belong there."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
 """Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
 focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
@@ -85,9 +88,9 @@ def place(
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         for k in sorted(found.keys() & known.edges.keys()):
-            turn = turn_between(known.T_camera_base[k], found[k].T_camera_base[0])
-            if turn > ALIKE / 2 and found[k].doubt * len(found) < SURE:
-                lost[k] = ELSEWHERE
+            turn = angle_between(known.T_camera_base[k], found[k].T_camera_base[0])
+            if turn > MOST_TURN and found[k].doubt * len(found) < SURE:
+                lost[k] = TURNED
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
 
@@ -216,8 +219,8 @@ def _alone(session: Session, scene: KnownScene, photograph: legs.Photographs) ->
     """The places of a photograph by the search in it alone."""
     p = photograph
     view = StationView(
-        scene.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        scene.T_base_platform, distance_tables([p.images[0]]),
+        scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
+        distance_tables([p.images[0]]),
     )  # fmt: skip
     return find_alone(view, p.images[0])
 
@@ -282,14 +285,14 @@ def _on_board(found: Mapping[int, Alone], boards: Boards) -> dict[int, Alone]:
     own: dict[int, Array] = {}
     for k, T in T_camera_board.items():
         places, evidence = found[k].T_camera_base, found[k].evidence
-        alike = turn_between((T @ T_board_base)[:, None], places) < ALIKE
+        alike = angle_between((T @ T_board_base)[:, None], places) < ALIKE
         worth = np.where(alike, np.maximum(evidence, 0.0), 0.0)
         total += worth.max(axis=1)
         best = np.argmax(worth, axis=1)
         agrees = np.take_along_axis(worth, best[:, None], axis=1) > 0
         own[k] = np.where(agrees[..., None], places[best], T @ T_board_base)
     order = np.argsort(-total, kind="stable")
-    near = turn_between(T_board_base[order], T_board_base[order[0]]) < ALIKE
+    near = angle_between(T_board_base[order], T_board_base[order[0]]) < ALIKE
     order = order[~near | (np.arange(len(order)) == 0)]
     return {k: Alone(T[order], total[order], 1.0) for k, T in own.items()}
 
@@ -311,14 +314,13 @@ def _believed(found: dict[int, Alone], count: int, boards: Boards, known: Array)
 
 def misplaced(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
-) -> list[int]:
-    """Photographs by hand of which the joint estimate has given up most edges, has too few edges or
-    legs to tell their place, or finds the camera looking another way than where it was placed,
-    T_camera_base. A board that agrees with the others tells the place of its photograph whatever
-    the edges do.
+) -> dict[int, str]:
+    """Why photographs by hand do not belong where they were placed, T_camera_base, by the station's
+    number: the joint estimate finds the camera looking another way, has given up most edges, or has
+    too few edges or legs to tell the place. A board that agrees with the others tells the place of
+    its photograph whatever the edges do.
     """
-    turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
-    astray = np.sqrt(dot(turn, turn)) > ALIKE / 2
+    astray = angle_between(estimate.state.T_camera_base, T_camera_base) > MOST_TURN
     station = measurements.edges.station
     kept = np.bincount(station, estimate.edge_weights, len(session.stations))
     count = np.bincount(station, minlength=len(session.stations))
@@ -329,20 +331,23 @@ def misplaced(
     shown[station[used], measurements.edges.leg[used]] = True
     few = shown.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
     lost = ((2 * kept < count) | (kept < FEWEST_EDGES) | few) & ~by_board
-    return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
+    return {
+        k: GIVEN_UP if lost[k] else TURNED
+        for k, station in enumerate(session.stations)
+        if station.handheld and (lost[k] or astray[k])
+    }
 
 
 def without_misplaced(
-    seen: SeenSession, wrong: list[int], edges: EdgeSet, estimate: Estimate
+    seen: SeenSession, wrong: Mapping[int, str], edges: EdgeSet, estimate: Estimate
 ) -> SeenSession:
-    """What is seen without these photographs, each told, and what is known by an estimate of all.
-
-    edges : from which it was made.
+    """What is seen without these photographs, each told why, and what is known by an estimate of
+    all. edges : from which it was made.
     """
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
     known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
-    return _without(seen._replace(known=known), dict.fromkeys(wrong, ELSEWHERE))
+    return _without(seen._replace(known=known), wrong)
 
 
 def why_lost(found: Alone) -> str:
@@ -353,7 +358,7 @@ def why_lost(found: Alone) -> str:
     )
 
 
-def _without(seen: SeenSession, lost: dict[int, str]) -> SeenSession:
+def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
     """What is seen without the photographs that are lost, each told, the other stations numbered
     anew; an error where none is left.
     """

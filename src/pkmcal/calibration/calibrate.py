@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
@@ -46,15 +46,13 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bed import bed_of
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.identify.unidentified import (
     Findings,
     explain,
-    joined_by_boards,
     only_heights,
     seen_legs,
+    seen_through_boards,
 )
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
@@ -118,25 +116,10 @@ class Calibration(ShownCalibration):
             data_share=e.data_share,
             poses=e.state.T_base_platform[e.configurations],
             stations=session.station_names,
+            legs_seen=e.edge_weights.size > 0,
             residuals=np.concatenate([edges.ravel(), poses[e.pose_weights >= 0.5].ravel()]),
             chi2=e.statistics.chi2_as_stated,
             warnings=session.warnings,
-        )
-
-    def tool_error(self, T_base_platform: Array) -> ToolError:
-        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
-        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
-        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
-        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
-        array that holds no poses.
-        """
-        machine = self.estimate.machine
-        return tool_error(
-            self.session.machine,
-            machine,
-            free_of_gauge(machine, self.estimate.covariance),
-            checked_poses(T_base_platform),
-            legs_seen=self.estimate.edge_weights.size > 0,
         )
 
 
@@ -171,21 +154,18 @@ def calibrate(
         session = _load(session, refine_camera, clock)
         seen = _observe(session, seed, clock)
         try:
-            found = _identify(seen, refine_camera, method, seed, holdout, clock)
+            turns, richer = _identify(seen, refine_camera, clock)
             # without one that was in a wrong place, another may show itself to be
             while wrong := misplaced(
-                seen.session,
-                found.turns.measurements,
-                found.turns.estimate,
-                seen.known.T_camera_base,
+                seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
             ):
-                turns = found.turns
                 seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-                found = _identify(seen, refine_camera, method, seed, holdout, clock)
+                turns, richer = _identify(seen, refine_camera, clock)
         except ResultError:
             check_radii(seen, None, refine_camera, seed)
             raise
-        check_radii(seen, found.turns.estimate, refine_camera, seed)
+        check_radii(seen, turns.estimate, refine_camera, seed)
+        found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
         return _judge(seen, found, method, seed, clock)
 
 
@@ -245,14 +225,9 @@ def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
 
 
 def _identify(
-    seen: SeenSession,
-    refine_camera: bool,
-    method: Method,
-    seed: int,
-    holdout: int,
-    clock: _Clock,
-) -> _Identified:
-    """The machine, in turns with looks at the edges, and by the paper's method if asked for."""
+    seen: SeenSession, refine_camera: bool, clock: _Clock
+) -> tuple[Turns, tuple[RicherModel, ...]]:
+    """The machine, in turns with looks at the edges, and richer models that were tried."""
     session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     if seen.photographs:
         turns = take_turns(seen, cameras, clock.told, clock.lap)
@@ -265,15 +240,31 @@ def _identify(
     check_poses(session, turns.measurements, stated, richer)
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
+    return turns, richer
+
+
+def _estimated(
+    drawing: Machine,
+    turns: Turns,
+    richer: tuple[RicherModel, ...],
+    method: Method,
+    seed: int,
+    holdout: int,
+    clock: _Clock,
+) -> _Identified:
+    """The estimate without what is held out, by the paper's method if asked for.
+
+    Only now, when all is found, are configurations set aside: photographs that miss are misplaced.
+    """
     out = None
     if holdout:
-        region = chosen(session.machine, turns.estimate, turns.measurements, holdout)
+        region = chosen(drawing, turns.estimate, turns.measurements, holdout)
         out = LeftOut(region, turns.measurements)
-        turns = set_aside(session.machine, turns, out.region)
+        turns = set_aside(drawing, turns, region)
     estimate = turns.estimate
     if method != "bundle":
         clock.told("Repeating the paper's method", 0.9)
-        estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
+        estimate = by_paper(method, drawing, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
 
@@ -351,7 +342,7 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
     told = what_data_tell(measurements, estimate)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
     bed = bed_of(measurements, estimate) if only_heights(estimate) else None
-    return explain(told, estimate, joined_by_boards(seen, measurements), counted, bed)
+    return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
 
 
 class _Clock:

@@ -26,14 +26,14 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import KnownScene
 from pkmcal.errors import PkmcalError
+from pkmcal.geometry.rigid import angle_between
 from pkmcal.identify.bundle import bundle, machine_told
-from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Measurements, concatenate
+from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
+from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turned_about
 from pkmcal.observe.evidence import StationView, apart, grain, settle
-from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
@@ -109,38 +109,35 @@ def _looked(
     before, and the last of these. What was measured in others takes part; without any, what they
     told of the machine. measured : in place of the first look.
     """
-    at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
-    for k, T in places.items():
-        at[k] = T
+    stations = sorted({*known.edges, *places})
     told = None if known.edges else known.told
     only = replace(session.of_stations(stations), trackers=())
     shown = boards.of(np.array(stations, dtype=int))
-    edges = dict(known.edges)
-
-    def look(known: KnownScene, reach: float | None, state: State | None) -> _Look:
-        at = known.T_camera_base.copy()
+    at, edges = known.T_camera_base.copy(), dict(known.edges)
+    for k, T in places.items():
+        at[k] = T
+    found: list[_Look] = []
+    for reach in looks:
         for k in places:
-            if state is None and k in measured:
+            if not found and k in measured:
                 edges[k] = measured[k]
                 continue
             p = photographs[k]
             seen = known.machine, at[k], known.T_base_platform[p.configuration]
             look = legs.measure(p, *seen) if reach is None else legs.search(p, *seen, reach)
             edges[k] = look.edges
-        numbered = [
-            replace(edges[k], station=np.full(len(edges[k]), n)) for n, k in enumerate(stations)
-        ]
-        measurements = measurements_of(only, shown, concatenate(numbered))
-        start = state or start_state(known.machine, measurements, at[stations])
+        numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
+        measurements = measurements_of(only, shown, numbered)
+        if found:
+            start = found[-1].estimate.state
+        else:
+            start = start_state(known.machine, measurements, at[stations])
         estimate = bundle(session.machine, measurements, start, told=told)
         at[stations] = estimate.state.T_camera_base
-        known = KnownScene(estimate.machine, at, estimate.state.T_base_platform, dict(edges))
-        return _Look(known, measurements, estimate)
-
-    found = look(known._replace(T_camera_base=at), looks[0], None)
-    for reach in looks[1:]:
-        found = look(found.known, reach, found.estimate.state)
-    return found
+        poses = estimate.state.T_base_platform
+        known = KnownScene(estimate.machine, at.copy(), poses, dict(edges))
+        found.append(_Look(known, measurements, estimate))
+    return found[-1]
 
 
 class AskedPlaces(NamedTuple):
@@ -181,8 +178,8 @@ def look_closer(
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
     view = StationView(
-        before.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        before.T_base_platform, distance_tables(p.images, *FINEST),
+        before.machine, p.camera, p.configuration, session.joints, before.T_base_platform,
+        distance_tables(p.images, *FINEST),
     )  # fmt: skip
     near = found.evidence > found.evidence[0] - BEHIND * found.unit
     places = np.concatenate([found.T_camera_base[near][:CLOSER], others])
@@ -218,8 +215,8 @@ def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     edge = grain(view, at[np.argmax(evidence)])
     by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]
-    turned = turn_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
-    here = turn_between(at, first) < ALIKE
+    turned = angle_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
+    here = angle_between(at, first) < ALIKE
     same = here | (turned < ALIKE)
     worth = np.where(same, by_edges - by_edges.max() + by_legs[here].max(), by_legs)
     order = np.argsort(-worth, kind="stable")

@@ -26,7 +26,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.start import mean_pose, start_state
+from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
@@ -91,7 +91,7 @@ class Doubt:
     size: float = 1.0
 
 
-def misfit(estimate: Estimate) -> float:
+def pose_misfit(estimate: Estimate) -> float:
     """How far off the poses are, in their standard deviations, root mean square of the better
     BELIEVED of them, given up or not: outliers of another cause should hide nothing.
     """
@@ -137,7 +137,7 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
 
     machine : by the drawing. estimate : of these measurements.
     """
-    before = misfit(estimate)
+    before = pose_misfit(estimate)
     found: Doubt | None = None
     for doubt in chain(
         _movements(machine, measurements, estimate),
@@ -184,12 +184,12 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Do
             break
         estimate = _tried(machine, replace(measurements, joints=joints), None)
         if estimate is not None:
-            yield replace(doubt, misfit=misfit(estimate))
+            yield replace(doubt, misfit=pose_misfit(estimate))
 
 
 def _first_misfit(machine: Machine, measurements: Measurements) -> float:
-    """:func:`misfit` where an estimate would start, platform poses by the drawing and readings;
-    infinite where it cannot.
+    """:func:`pose_misfit` where an estimate would start, platform poses by the drawing and the
+    readings; infinite where it cannot.
     """
     try:
         assembled = assemble(machine, measurements, default_gauge(machine))
@@ -224,7 +224,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             place = int(poses.configuration[rows[at - 1]]), int(poses.configuration[rows[at]])
             body = state.T_camera_base[s] @ state.T_base_platform[poses.configuration[later]]
             seen = poses.T_station_target[later]
-            mount = mean_pose(inverse(body) @ seen)
+            mount = middle_pose(inverse(body) @ seen)
             on = np.append(measurements.on_platform, True)
             board = replace(
                 measurements,
@@ -241,7 +241,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             ):
                 change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
                 yield Doubt(
-                    "board moved", misfit(tried), station=int(s), before=place[0],
+                    "board moved", pose_misfit(tried), station=int(s), before=place[0],
                     configuration=place[1], moved=change,
                 )  # fmt: skip
             if len(measurements.edges):
@@ -268,7 +268,7 @@ def _camera_moved(
     poses = measurements.poses
     number = measurements.camera_of_station
     there = state.T_base_platform[poses.configuration[later]] @ state.T_mount[poses.mount[later]]
-    station = mean_pose(poses.T_station_target[later] @ inverse(there))
+    station = middle_pose(poses.T_station_target[later] @ inverse(there))
     camera = replace(
         measurements,
         poses=replace(poses, station=_changed(poses.station, later, measurements.n_stations)),
@@ -282,7 +282,7 @@ def _camera_moved(
     ):
         change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
         yield Doubt(
-            "camera moved", misfit(tried), station=s, before=place[0], configuration=place[1],
+            "camera moved", pose_misfit(tried), station=s, before=place[0], configuration=place[1],
             moved=change,
         )  # fmt: skip
 
@@ -331,7 +331,7 @@ def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> 
     other = replace(measurements, poses=replace(poses, T_station_target=T))
     tried = _tried(machine, other, None)
     if tried is not None:
-        yield Doubt("size", misfit(tried), size=float(spread))
+        yield Doubt("size", pose_misfit(tried), size=float(spread))
 
 
 def check_poses(

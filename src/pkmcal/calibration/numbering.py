@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.calibration.recognise import legs_stations
 from pkmcal.geometry.rigid import register
 from pkmcal.mechanisms import Machine
@@ -33,7 +33,7 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     layout, m = machine.layout, machine.n_joints
     if machine.n_legs != m or sorted(layout.actuated.tolist()) != list(range(m)):
         return ()
-    readings = joints[np.linspace(0, len(joints) - 1, TRIED).astype(int)]
+    readings = joints[evenly(len(joints), TRIED)]
     orders = [np.roll(np.arange(m), -first) for first in range(1, m)]
     return tuple(order for order in orders if _alike(machine, readings, order))
 

@@ -17,7 +17,6 @@ from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import KEPT, Pictures, fitting
-from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
 from pkmcal.papers.hand_eye import start_from_poses
@@ -200,14 +199,13 @@ def recognise(
     some are looked at, spread over all.
     """
     boards = boards or Boards()
-    machine, tubes = session.machine, tubes_of(session.machine)
-
+    machine = session.machine
     most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(photographs), 1))
     seen = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in photographs)
 
     def view(p: legs.Photographs) -> StationView:
         tables = distance_tables(p.images)
-        return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+        return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
@@ -386,7 +384,7 @@ def _tracker_starts(session: Session) -> list[Array | None]:
 
 
 def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
-    """The session's board in its photographs; see :func:`pkmcal.boards.find_boards`.
+    """The session's board in its photographs; see :func:`pkmcal.boards.views.find_boards`.
 
     Photographs that only show the board are decoded one by one, as they are looked at.
     """

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.calibration.recognise import read_photographs
 from pkmcal.errors import InputError
@@ -254,7 +254,7 @@ def _leg_rows(look: _Look, station: str) -> list[LegScatter]:
         mine = leg == j
         psi, theta, x, z = (float(v) for v in _deviation(axes, rows == j))
         shift, tilts = (float(v) for v in _deviation(pixels, mine))
-        ratio = float(np.sqrt(np.mean(_deviation(promised, mine) ** 2)))
+        ratio = rms(_deviation(promised, mine))
         count = len(np.unique(look.photo[edges.leg == j]))
         freedom = count - len(np.unique(edges.configuration[edges.leg == j]))
         row = (station, int(j) + 1, psi, theta, x, z, shift, tilts, ratio, count, freedom)
@@ -323,7 +323,7 @@ def _station_row(look: _Look, station: str) -> StationScatter:
         photographs=len(photo.first),
         configurations=len(np.unique(edges.configuration[same.first[same.count > 1]])),
         shift=float(shift[0]),
-        promised=float(np.sqrt(np.mean(promised**2))),
+        promised=rms(promised),
         camera=_explained(look, by_camera(ends, legs), photo),
         platform=_explained(look, by_platform(ends, legs), photo),
         legs=_explained(look, ends, groups_of(look.photo, edges.leg)),
@@ -392,13 +392,12 @@ def _rigid(points: Array) -> Array:
 class MotionFit:
     """Motions that explain edges' turns best, by group.
 
-    motion : (G, p). explained, total : sums of squared whitened turns. rank : (G,) freedoms used.
+    motion : (G, p). explained, total : sums of squared whitened turns.
     """
 
     motion: Array
     explained: Array
     total: Array
-    rank: Array
 
 
 def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> MotionFit:
@@ -415,8 +414,7 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(seen, along / np.where(seen, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]
-    total = groups.total(dot(white, white))
-    return MotionFit(motion, dot(motion, right), total, seen.sum(axis=1))
+    return MotionFit(motion, dot(motion, right), groups.total(dot(white, white)))
 
 
 def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:

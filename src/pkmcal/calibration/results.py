@@ -89,22 +89,16 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
     return standing
 
 
-def texts_of(
-    calibration: Calibration,
-    not_identified: Sequence[str] = (),
-    holdout: dict[str, Any] | None = None,
-    over: ToolMap | str | None = None,
-    photographs: Mapping[str, Sequence[str]] | None = None,
-) -> dict[str, str | bytes]:
-    """What a calibration leaves on disk besides its page: texts by their files' names.
+def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, str | bytes]:
+    """What a calibration leaves on disk besides its page, texts by their files' names.
 
-    not_identified, holdout, over, photographs : as for :func:`document_of`.
+    document : of :func:`document_of`.
     """
     from pkmcal.cameras.files import camera_text
 
     texts: dict[str, str | bytes] = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over, photographs)),
+        EVERYTHING: json_text(document),
     }
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
@@ -274,19 +268,19 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     names = session.station_names
     kept = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
-    rows = joint_rows(n, kept)
-    joint = turned(
+    rows = rows_of_stations(n, kept)
+    joint = of_inverse_poses(
         estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[kept]
     )
     return {"stations": [names[k] for k in kept], "rows": joint[n:]}
 
 
-def joint_rows(n: int, stations: Integers) -> Integers:
+def rows_of_stations(n: int, stations: Integers) -> Integers:
     """Rows of n parameters and then of some stations in a joint covariance."""
     return np.concatenate([np.arange(n), (n + 6 * stations[:, None] + np.arange(6)).ravel()])
 
 
-def turned(joint: Array, T_a_b: Array) -> Array:
+def of_inverse_poses(joint: Array, T_a_b: Array) -> Array:
     """A joint covariance of parameters and poses (k, 4, 4), (omega, tau) of T_a_b, as that of the
     parameters and (omega, tau) of T_b_a.
     """
@@ -337,7 +331,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
     """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad."""
-    return turned(covariance, T_camera_base[None])
+    return of_inverse_poses(covariance, T_camera_base[None])
 
 
 def _inverse_errors(transform: Array) -> Array:

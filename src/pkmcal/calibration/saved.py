@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,16 +19,14 @@ from pkmcal.calibration.results import (
     FORMAT,
     FORMAT_KEY,
     POSE_WEIGHT,
-    joint_rows,
-    turned,
+    of_inverse_poses,
+    rows_of_stations,
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validate
 from pkmcal.geometry.rigid import inverse
-from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Statistics
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
 from pkmcal.wording import listed
@@ -76,7 +74,7 @@ class Known:
         """What it knows where no other stations stand as they stood."""
         n = len(self.covariance) - 6 * len(self.stations)
         left = np.array([k for k, s in enumerate(self.stations) if s in stations], dtype=int)
-        rows = joint_rows(n, left)
+        rows = rows_of_stations(n, left)
         return Known(
             self.covariance[np.ix_(rows, rows)],
             tuple(self.stations[k] for k in left),
@@ -142,23 +140,10 @@ class SavedCalibration(ShownCalibration):
             data_share=self.data_share,
             poses=self.T_base_platform[self.used],
             stations=tuple(station.name for station in self.stations),
+            legs_seen=bool(residuals.get("edges")),
             residuals=np.array([*parts[0], *parts[1]], dtype=float),
             chi2=Statistics(**statistics).chi2_as_stated if whole else float("nan"),
             warnings=tuple(document.get("warnings") or ()),
-        )
-
-    def tool_error(self, T_base_platform: Array) -> ToolError:
-        """As :meth:`pkmcal.calibration.calibrate.Calibration.tool_error`, from the file."""
-        edges = (self.document.get("residuals") or {}).get("edges")
-        # what the file's machine calls its drawing are the calibrated values
-        table = replace(self.machine.parameters, drawing=self.drawing)
-        machine = replace(self.machine, parameters=table)
-        return tool_error(
-            machine.with_values(self.drawing),
-            machine,
-            free_of_gauge(machine, self.covariance),
-            checked_poses(T_base_platform),
-            legs_seen=bool(edges),
         )
 
     def known(self, names: Sequence[str], of_session: Sequence[str]) -> Known:
@@ -179,7 +164,7 @@ class SavedCalibration(ShownCalibration):
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
             )
         where = np.array([self.placed.index(name) for name in names], dtype=int)
-        rows = joint_rows(len(self.machine.parameters), where)
+        rows = rows_of_stations(len(self.machine.parameters), where)
         places = {station.name: inverse(station.T_base_camera) for station in self.stations}
         return Known(
             self.joint_covariance[np.ix_(rows, rows)],
@@ -382,7 +367,7 @@ def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Arr
     _check_covariance(document, "covariance", matrix[:count, :count])
     _check_covariance(document, key, matrix)
     found = np.array([poses[name] for name in known.stations]).reshape(-1, 4, 4)
-    return known.stations, turned(matrix, found)
+    return known.stations, of_inverse_poses(matrix, found)
 
 
 def _check_size(

@@ -6,15 +6,16 @@ The same for one that was just made and for one read back from its file.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.found import FoundParameters, found_parameters
-from pkmcal.identify.tool import NO_TURN, ToolError
+from pkmcal.identify.tool import NO_TURN, ToolError, checked_poses, tool_error
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.wording import brief, count, number
@@ -28,9 +29,10 @@ class Overview:
     """What a summary is made of.
 
     source : the session's name. drawing : (P,) values before. covariance : (P, P). data_share :
-    (P,). poses : (n, 4, 4) of the platform, of the configurations in use. residuals : (n,) of edges
-    and poses, whitened, with weights of half and more. chi2 : per degree of freedom, of the noise
-    as stated; NaN where it is not known. warnings : about the session.
+    (P,). poses : (n, 4, 4) of the platform, of the configurations in use. legs_seen : whether edges
+    of legs were. residuals : (n,) of edges and poses, whitened, with weights of half and more.
+    chi2 : per degree of freedom, of the noise as stated; NaN where it is not known. warnings :
+    about the session.
     """
 
     source: str
@@ -42,6 +44,7 @@ class Overview:
     data_share: Array
     poses: Array
     stations: tuple[str, ...]
+    legs_seen: bool
     residuals: Array
     chi2: float
     warnings: tuple[str, ...]
@@ -54,9 +57,24 @@ class ShownCalibration(ABC):
     def overview(self) -> Overview:
         """What it is made of."""
 
-    @abstractmethod
     def tool_error(self, T_base_platform: Array) -> ToolError:
-        """How sure poses (n, 4, 4) are."""
+        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
+        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
+        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
+        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
+        array that holds no poses.
+        """
+        told = self.overview()
+        # what a file's machine calls its drawing are the calibrated values
+        table = replace(told.machine.parameters, drawing=told.drawing)
+        machine = replace(told.machine, parameters=table)
+        return tool_error(
+            machine.with_values(told.drawing),
+            machine,
+            free_of_gauge(machine, told.covariance),
+            checked_poses(T_base_platform),
+            legs_seen=told.legs_seen,
+        )
 
     @property
     def parameters(self) -> FoundParameters:

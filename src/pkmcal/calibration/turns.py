@@ -24,8 +24,15 @@ from pkmcal.calibration.recognise import WORKERS, Progress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
-from pkmcal.identify.start import misfit, start_state
-from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection, concatenate
+from pkmcal.identify.start import edge_misfit, start_state
+from pkmcal.measurements import (
+    EdgeSet,
+    Measurements,
+    Observation,
+    Rejection,
+    concatenate,
+    of_stations,
+)
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined
@@ -65,25 +72,9 @@ def take_turns(
 
     lap : called with the name of a step that is done.
     """
-    session, photographs, boards, known = seen
-    total = sum(len(p.images) for p in photographs)
-    machine = session.machine
-    if all(p.station in known.edges for p in photographs):
-        # photographs by hand were measured when they were placed
-        placed = [
-            replace(known.edges[p.station], station=np.full(len(known.edges[p.station]), p.station))
-            for p in photographs
-        ]
-        measurements = measurements_of(session, boards, concatenate(placed))
-        start = start_state(known.machine, measurements, known.T_camera_base)
-        estimate = bundle(machine, measurements, start)
-    else:
-        text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
-        estimate = searched(known, legs.REACH, _counted(told, text, total, 0.35))
-        start = estimate.state
-        known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
-        text = "Finding the legs again"
-        estimate = searched(known, legs.AGAIN, _counted(told, text, total, 0.4), start)
+    session, photographs, boards, _ = seen
+    total, machine = sum(len(p.images) for p in photographs), session.machine
+    estimate = _first_estimate(seen, total, told, lap)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
@@ -138,7 +129,7 @@ def better_start(machine: Machine, measurements: Measurements, known: State) -> 
         steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
     except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations
         return known
-    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
+    return min(known, steps, key=lambda state: edge_misfit(machine, measurements, state))
 
 
 def identify_poses(
@@ -190,28 +181,41 @@ def _reached(session: Session, measurements: Measurements, start: State) -> Stat
     return replace(estimate.state, T_base_platform=found.T_base_platform, internal=found.internal)
 
 
-def _whole_legs(
-    session: Session,
-    photographs: list[legs.Photographs],
-    boards: Boards,
-    lap: Callable[[str], None],
-    known: KnownScene,
-    reach: float,
-    done: legs.Done,
-    start: State | None = None,
+def _first_estimate(
+    seen: SeenSession, total: int, told: Progress, lap: Callable[[str], None]
 ) -> Estimate:
-    """The estimate from legs that are looked for within ``reach`` px of where they should be."""
-    machine, stations, poses = known[:3]
-
-    def search(p: legs.Photographs) -> legs.StationEdges:
-        return legs.search(p, machine, stations[p.station], poses[p.configuration], reach, done)
-
-    measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
-    lap("observe")
-    start = start or start_state(machine, measurements, stations)
-    estimate = bundle(session.machine, measurements, start)
-    lap("identify")
+    """Of photographs by hand, from what was measured when they were placed; else from legs that are
+    looked for as wholes, where they should be, and again where the first look has put them.
+    """
+    session, photographs, boards, known = seen
+    if all(p.station in known.edges for p in photographs):
+        placed = of_stations({p.station: known.edges[p.station] for p in photographs})
+        measurements = measurements_of(session, boards, placed)
+        start = start_state(known.machine, measurements, known.T_camera_base)
+        return bundle(session.machine, measurements, start)
+    start: State | None = None
+    for text, reach, share in (
+        ("Finding the legs", legs.REACH, 0.35),
+        ("Finding the legs again", legs.AGAIN, 0.4),
+    ):
+        done = _counted(told, text, total, share)
+        search = partial(_whole_legs, known=known, reach=reach, done=done)
+        measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
+        lap("observe")
+        start = start or start_state(known.machine, measurements, known.T_camera_base)
+        estimate = bundle(session.machine, measurements, start)
+        lap("identify")
+        start = estimate.state
+        known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
     return estimate
+
+
+def _whole_legs(
+    photographs: legs.Photographs, known: KnownScene, reach: float, done: legs.Done
+) -> legs.StationEdges:
+    machine, T_camera_base, poses = known[:3]
+    at = T_camera_base[photographs.station], poses[photographs.configuration]
+    return legs.search(photographs, machine, *at, reach, done)
 
 
 def _measure(
@@ -260,20 +264,16 @@ def observation_of(
     estimate: Estimate,
 ) -> Observation:
     """The last looks joined, with what the estimate gave up among the rejected."""
-    edges = concatenate([look.edges for look in looks]) if looks else EdgeSet.empty()
-    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
-    nowhere = [np.zeros((0, 2))], [np.zeros(0, dtype=int)]
+    seen = legs.joined_looks(looks, float("nan"), float("nan"))
     given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
-        edges=edges,
-        rejected=tuple(r for look in looks for r in look.rejected)
+        edges=seen.edges,
+        rejected=seen.rejected
         + boards.rejected
-        + tuple(edges.rejection(k, _OUTLIER) for k in given_up)
+        + tuple(seen.edges.rejection(k, _OUTLIER) for k in given_up)
         + _poses_given_up(session, measurements, estimate),
-        points=np.concatenate([look.points for look in looks] or nowhere[0]),
-        point_edge=np.concatenate(
-            [look.point_edge + k for look, k in zip(looks, first, strict=bool(looks))] or nowhere[1]
-        ),
+        points=seen.points,
+        point_edge=seen.point_edge,
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
     )

@@ -1,7 +1,7 @@
 """What every central camera offers, whatever its lens or mirror.
 
 A central camera maps rays through one point to pixels. Everything behind the image works
-with rays, so a camera model is these four functions and a test of its field. A model is one
+with rays, so a camera model is three functions, which tell its field as well. A model is one
 file in this folder with one final subclass; :func:`camera_models` finds it, the conformance
 test runs over it, nothing else is edited.
 """
@@ -138,10 +138,6 @@ class Camera(ABC):
         inverse = np.linalg.inv(system)[..., :, :2]
         inverse = np.where(bad[..., None, None], np.nan, inverse)
         return inverse, -inverse @ by_parameters
-
-    @abstractmethod
-    def in_field(self, points: Array) -> Booleans:
-        """True where a point of the camera frame (..., 3) is imaged by this model, (...)."""
 
     @classmethod
     def from_document(cls, document: Any) -> Self:

@@ -19,7 +19,6 @@ from pkmcal.files import (
     read_text,
     shown,
     validate,
-    write_text,
     yaml_text,
 )
 from pkmcal.wording import count as count_of
@@ -105,13 +104,8 @@ def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) ->
     return matrix
 
 
-def save_camera(camera: Camera, path: Path | str) -> None:
-    """Write a camera file that :func:`load_camera` reads back the same."""
-    write_text(Path(path), camera_text(camera))
-
-
 def camera_text(camera: Camera) -> str:
-    """The text of a camera file, with the covariance where it is known."""
+    """The text of a camera file, which :func:`load_camera` reads back the same."""
     document = camera.document()
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
@@ -136,11 +130,6 @@ _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "height": ("image_height", "image_Height", "height"),
     "xi": ("xi", "Xi"),
 }
-
-
-def write_camera(camera: Camera, path: Path | str, form: str) -> None:
-    """Write a camera for another program, as :func:`foreign_text` has it."""
-    write_text(Path(path), foreign_text(camera, path, form))
 
 
 def foreign_text(camera: Camera, path: Path | str, form: str) -> str:

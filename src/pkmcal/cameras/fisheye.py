@@ -95,10 +95,6 @@ class Fisheye(Camera):
         rays = np.concatenate([np.sin(angle)[..., None] * unit, np.cos(angle)[..., None]], axis=-1)
         return np.where(good[..., None], rays, np.nan)
 
-    def in_field(self, points: Array) -> Booleans:
-        """Within the angle up to which the image radius grows; (...)."""
-        return self._reaches(_angle(points)[0], points)
-
     def _reaches(self, angle: Array, points: Array) -> Booleans:
         return (angle < self._limit()) & np.any(points != 0, axis=-1)
 

@@ -199,10 +199,6 @@ class Pinhole(Camera):
         rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
-    def in_field(self, points: Array) -> Booleans:
-        """In front of the camera, and before the lens polynomial folds back; (...)."""
-        return self._imaged(points)[0]
-
     def _by_point(self, z: Array, xy: Array, by_xy: Array | None) -> Array:
         """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""
         if by_xy is None:

@@ -107,10 +107,6 @@ class Unified(Camera):
         z = (root - self.xi * r2) / (1 + r2)
         return np.concatenate([scale[..., None] * xy, z[..., None]], axis=-1)
 
-    def in_field(self, points: Array) -> Booleans:
-        """Where one ray, and only one, has the point's image; (...)."""
-        return self._imaged(points)[3]
-
     def _five(self) -> Array:
         """Distortion in the pinhole's order, without a third radial term."""
         return np.append(self.parameters[5:], 0.0)

@@ -18,7 +18,7 @@ from pkmcal.arrays import Array, Integers, numbered
 from pkmcal.check.look import Look
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, rotation
-from pkmcal.identify.covariance import information
+from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
 from pkmcal.planning.information import tool_by_free
@@ -196,7 +196,7 @@ def _told(capture: _Capture) -> _Told:
     edges = measurements.edges
     assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)
     problem = assembled.problem
-    info = information(problem, at_truth)
+    info = Information(problem, at_truth)
     seen = np.flatnonzero(assembled.seen)
     poses, joints = capture.T_base_platform[seen], capture.joints[seen]
     by = tool_by_free(rig, problem, joints, poses)

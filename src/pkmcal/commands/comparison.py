@@ -11,7 +11,7 @@ import numpy as np
 from pkmcal.arrays import Array, rms
 from pkmcal.identify.compared import compare as machine_errors
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth
 
@@ -81,7 +81,7 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
     drawing = calibration.session.machine
-    told, table = apply(drawing, true, default_gauge(drawing)), drawing.parameters
+    told, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters
     # an axis by its two turns: along itself it changes by squares of small angles only
     error = table.to_free(estimate.machine.values) - table.to_free(told.theta)
     to_free = np.linalg.pinv(table.free_matrix())

@@ -17,7 +17,7 @@ import yaml
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
-from pkmcal.cameras.files import load_camera, write_camera
+from pkmcal.cameras.files import foreign_text, load_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact
 from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
@@ -141,10 +141,7 @@ def _sigma(source: Source) -> tuple[str, ...]:
 
 def _camera_info(source: Source, station: str, frame: str) -> str:
     """The text of a ROS camera file, whose camera_name is the frame's."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"{frame}.yaml"
-        write_camera(source.cameras[station], path, "ros")
-        text = path.read_text(encoding="utf-8")
+    text = foreign_text(source.cameras[station], f"{frame}.yaml", "ros")
     about = source.header(
         f"Camera of station {station}; pixels, pixel centres at integers, frame"
         f" {frame}_optical_frame."

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import cross, dot
 
 SIDE_SIGNS = np.array([1.0, -1.0])
@@ -51,10 +50,12 @@ def line_through(a: Array, b: Array) -> tuple[Array, Array]:
     return u, cross(a, u)
 
 
-def leg_is_seen(a: Array, b: Array, radius: Array) -> Booleans:
-    """False where the camera's centre lies in the cylinder: it has no silhouette there."""
-    _, m = line_through(a, b)
-    return dot(m, m) > (1.02 * np.asarray(radius)) ** 2
+def leg_is_seen(m: Array, radius: Array) -> Booleans:
+    """False where the camera's centre lies in the cylinder: it has no silhouette there.
+
+    m : (..., 3) moment of its axis.
+    """
+    return dot(m, m) > (1.02 * radius) ** 2
 
 
 def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
@@ -68,26 +69,6 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
     sine, cosine = (x[..., None] for x in edge_planes(distance, radius, sign))
     m_unit = m / distance[..., None]
     return cosine * m_unit - sine * cross(u, m_unit)
-
-
-def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
-    """Tangent planes of a cylinder through the camera's centre, [B] eq. 3.
-
-    a_camera, u_camera : (..., 3) point on the axis (m) and unit direction, camera frame.
-    radius : (...,) m.
-    Returns n (..., 2, 3), unit, pointing away from the axis: n . a = -radius.
-    Raises GeometryError where the centre of projection lies inside the cylinder.
-    """
-    m = cross(a_camera, u_camera)
-    distance = np.sqrt(dot(m, m))
-    if np.any(distance <= radius):
-        raise GeometryError(
-            what="a leg passes through the camera's centre of projection",
-            found=f"distance {float(np.min(distance)):.4g} m",
-            expected="more than the leg's radius",
-            next_step="check the station's pose and the drawing of the legs",
-        )
-    return np.stack([edge_normal(u_camera, m, radius, sign) for sign in SIDE_SIGNS], axis=-2)
 
 
 class SeenLines(NamedTuple):

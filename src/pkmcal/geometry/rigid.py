@@ -173,6 +173,12 @@ def pose_difference(transform: Array, reference: Array) -> Array:
     )
 
 
+def angle_between(one: Array, other: Array) -> Array:
+    """Angles (...) rad by which poses (..., 4, 4) are turned against others."""
+    turned = one[..., :3, :3] @ other[..., :3, :3].mT
+    return np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+
+
 def nearest_rotation(matrix: Array) -> Array:
     """The rotations R (..., 3, 3) that maximise tr(R^T M); reflections are excluded."""
     u, _, vt = np.linalg.svd(matrix)

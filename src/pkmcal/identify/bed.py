@@ -14,12 +14,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.bundle import as_ended
-from pkmcal.identify.covariance import information, reduced_rows
+from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.solver import stacked
+from pkmcal.solver.elimination import stacked
 
 POINTS = 60
 """Places all over the bed: where nobody probed counts as well."""
@@ -151,7 +151,7 @@ def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) ->
     """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
     assembled, state = as_ended(measurements, estimate)
     problem = assembled.problem
-    info = information(problem, state)
+    info = Information(problem, state)
     rows = stacked(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0

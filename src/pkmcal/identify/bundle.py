@@ -19,13 +19,12 @@ from pkmcal.identify.covariance import (
     Information,
     data_share,
     identifiability,
-    information,
     machine_covariance,
     reduced_rows,
 )
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import Gauge, apply, default_gauge
+from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
 from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
 from pkmcal.identify.problem import Problem
@@ -35,11 +34,7 @@ from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import (
-    Solution,
-    Stop,
-    minimise,
-)
+from pkmcal.solver.search import Solution, Stop, minimise
 
 LEAST_SCALE = 1.0
 """The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
@@ -69,29 +64,40 @@ WEIGHINGS = 5
 
 @dataclass(frozen=True)
 class BatchResult:
-    """The joint estimate of B runs.
+    """The joint estimate of B runs, with the weights and the noise that it found.
 
-    problem : with the weights in use, noise scale included. solution : states, cost, stops.
-    weight : (B, K, G) robust weights 0..1 of each kind of measurement. pose_scale, reading_scale :
-    (B,) factors on the stated noise of poses and of readings. steps : (B,). info : rows and
-    covariance at the solution. edges : their noise, as stated where it was not looked for; trust :
-    (B, K, G) what each counts besides.
+    solution : states, cost, stops; the steps of all searches before it counted. weight : (B, K, G)
+    robust weights 0..1 of each kind of measurement. scale : (B,) factors on the stated noise of
+    each kind; the edges' is the annealing's, and one as soon as their noise was looked for. info :
+    the problem as it was solved, weights and noise included, and what it says at the solution.
+    edges : their noise, as stated where it was not looked for; trust : (B, K, G) by how much more
+    or less each counts for it. stated : (B or 1,) the readings' noise before.
     """
 
-    problem: Problem
     solution: Solution
     weight: Kinds[Array]
-    pose_scale: Array
-    reading_scale: Array
-    steps: Integers
+    scale: Kinds[Array]
     info: Information
     edges: EdgeScatter
     trust: Array
+    stated: Array
+
+    @cached_property
+    def components(self) -> Components:
+        """How large the noise of each kind of rows shows itself."""
+        return components(self.info, self.weight)
 
     @property
     def noise_scale(self) -> Array:
         """What the edges in use scatter by, in times of what they are stated with, (B,)."""
-        return self.edges.factor(self.problem.blocks, self.problem.data, self.weight.edges)
+        problem = self.info.problem
+        return self.edges.factor(problem.blocks, problem.data, self.weight.edges)
+
+    @property
+    def reading_scale(self) -> Array:
+        """The factor on the readings' stated noise, (B,)."""
+        used = self.info.problem.joint_noise
+        return np.broadcast_to(used / self.stated, len(self.scale.poses))
 
 
 def solve_batch(
@@ -126,7 +132,8 @@ def solve_batch(
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
-    fit = _solved(problem, state, weight, scale, steps, begin, np.ones_like(every.edges))
+    trust, stated = np.ones_like(every.edges), problem.joint_noise
+    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated)
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -134,51 +141,18 @@ def solve_batch(
             by_data = _readings_speak(fit)
             if by_data.any():
                 fit = settle(fit, hopeless=hopeless, by_data=by_data)
-    used, steps = fit.info.problem, fit.solution.steps
-    readings = np.broadcast_to(used.joint_noise / problem.joint_noise, n_runs)
-    return BatchResult(
-        used,
-        fit.solution,
-        fit.weight,
-        fit.scale.poses,
-        readings,
-        steps,
-        fit.info,
-        fit.edges,
-        fit.trust,
-    )
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
-    before it counted, and what its problem says there. The edges' scale is the annealing's, and one
-    as soon as their noise was looked for. edges : that noise; trust : (B, K, G) by how much more or
-    less each counts for it.
-    """
-
-    solution: Solution
-    weight: Kinds[Array]
-    scale: Kinds[Array]
-    info: Information
-    edges: EdgeScatter
-    trust: Array
-
-    @cached_property
-    def components(self) -> Components:
-        """How large the noise of each kind of rows shows itself."""
-        return components(self.info, self.weight)
+    return fit
 
 
 def _settle(
-    fit: _Fit,
+    fit: BatchResult,
     by_data: Booleans,
     *,
     robust: bool,
     scale_noise: bool,
     least: Array,
     hopeless: float,
-) -> _Fit:
+) -> BatchResult:
     """Weights, noise and solution in turns until none changes any more.
 
     by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
@@ -225,11 +199,14 @@ def _settle(
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
         problem = replace(problem, joint_noise=readings)
-        fit = _solved(problem, state, weight, scale, fit.solution.steps, edges, trust)
+        steps = fit.solution.steps
+        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated)
     return fit
 
 
-def _readings_step(fit: _Fit, by_data: Booleans, before: Array, made: Array) -> tuple[Array, Array]:
+def _readings_step(
+    fit: BatchResult, by_data: Booleans, before: Array, made: Array
+) -> tuple[Array, Array]:
     """The step of the readings' noise that the data ask for, and the one to make, after which they
     will ask for none: by the secant through this and what they asked for before the last step that
     was made. Logarithms, (B,) all; nothing is asked where no run's readings are judged.
@@ -243,7 +220,7 @@ def _readings_step(fit: _Fit, by_data: Booleans, before: Array, made: Array) -> 
     return asked, asked * np.clip(pace, 1.0, FURTHEST)
 
 
-def _readings_speak(fit: _Fit) -> Booleans:
+def _readings_speak(fit: BatchResult) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
@@ -272,17 +249,18 @@ def _solved(
     steps: Integers,
     edges: EdgeScatter,
     trust: Array,
-) -> _Fit:
+    stated: Array,
+) -> BatchResult:
     """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
     parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
     found = minimise(used.as_noisy_as_at(state), state)
     found = replace(found, steps=steps + found.steps)
-    info = information(used, found.state, found.normal)
-    return _Fit(found, weight, scale, info, edges, trust)
+    info = Information(used, found.state, found.normal)
+    return BatchResult(found, weight, scale, info, edges, trust, stated)
 
 
-def _edges(fit: _Fit, by_tube: bool, *, late: bool) -> EdgeScatter:
+def _edges(fit: BatchResult, by_tube: bool, *, late: bool) -> EdgeScatter:
     """The edges' noise: of each tube where light moves edges; else their errors are normal, as
     stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
     what the likelihood would say too, but for the edges that it counts as stated; and tails would
@@ -297,7 +275,7 @@ def _edges(fit: _Fit, by_tube: bool, *, late: bool) -> EdgeScatter:
     return replace(fit.edges, scale=scale)
 
 
-def _pose_scale(fit: _Fit) -> Array:
+def _pose_scale(fit: BatchResult) -> Array:
     """The factor on the poses' stated noise that makes their chi2 equal its degrees of freedom,
     (B,), from the one in use; kept as it is where too few remain to judge it.
     """
@@ -335,7 +313,7 @@ def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float
     return np.maximum(np.sqrt(common / weight), least)
 
 
-def _shading_of(fit: _Fit, least: Array) -> Array:
+def _shading_of(fit: BatchResult, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
     problem, unit = fit.info.problem, fit.info.problem.data.shading
     variance = np.diagonal(fit.info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
@@ -379,7 +357,7 @@ def bundle(
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case. told : what other measurements told of the
-        machine, with the drawing in it, in the drawing's place.
+        machine, with the drawing in it, in the drawing's place, whether that is taken or not.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
         scale_readings : and that of the readings, which may become less.
@@ -388,7 +366,7 @@ def bundle(
     Raises ResultError where the search cannot start, is given up, or ends without an answer.
     """
     gauge = gauge or default_gauge(machine)
-    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
+    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing or told is not None)
     batch = batch_of(machine, assembled, start)
     problem = assembled.problem
     # mounts are known to be near their start, as far as nothing else tells
@@ -407,10 +385,10 @@ def bundle(
         scale_readings=scale_readings,
         hopeless=hopeless,
     )
-    if result.pose_scale[0] > hopeless:
+    if result.scale.poses[0] > hopeless:
         raise ResultError(
             what="the measured poses do not fit the machine",
-            found=f"{result.pose_scale[0]:.0f} times their noise after a first search",
+            found=f"{result.scale.poses[0]:.0f} times their noise after a first search",
         )
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
@@ -465,19 +443,19 @@ def _estimate(
     gauge: Gauge,
 ) -> Estimate:
     """The result in the gauge, with everything that a report asks for."""
-    found = result.solution.state
+    found, problem = result.solution.state, result.info.problem
+    shared, u = result.info.covariance[0], problem.unknowns
     solved = state_of(assembled, found, start)
-    full = machine_covariance(result.problem, machine, solved, result.info.covariance[0], gauge)
-    state = apply(machine, solved, gauge)
+    full = machine_covariance(problem, machine, solved, shared, gauge)
+    state = in_gauge(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
-    problem, u = result.problem, result.problem.unknowns
-    optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
+    optics, variance = own_blocks(shared, u.optics, u.n_optics), np.diagonal(shared)
     factor = measurements.intrinsics_factor
     edges, poses = problem.unweighted(found)
     residuals = Kinds(
         assembled.places.edges.taken(edges[0]),
-        assembled.places.poses.taken(poses[0] / result.pose_scale[0]),
+        assembled.places.poses.taken(poses[0] / result.scale.poses[0]),
     )
     weighted = zip(assembled.places, result.weight, strict=True)
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
@@ -502,12 +480,11 @@ def _estimate(
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
-        line_shading=result.problem.data.shading[0],
-        line_shift=(result.problem.data.shading * found.shading)[0],
-        line_shift_sigma=result.problem.data.shading[0]
-        * np.sqrt(np.diagonal(result.info.covariance[0])[u.shading]),
-        breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
-        size_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.sizes]),
+        line_shading=problem.data.shading[0],
+        line_shift=(problem.data.shading * found.shading)[0],
+        line_shift_sigma=problem.data.shading[0] * np.sqrt(variance[u.shading]),
+        breathing_sigma=np.sqrt(variance[u.breathing]),
+        size_sigma=np.sqrt(variance[u.sizes]),
     )
 
 
@@ -526,7 +503,7 @@ def _with_unseen_poses(
 
 def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Statistics:
     """What the residuals (1, K, r) and their number say of the fit."""
-    problem, state = result.problem, result.info.state
+    problem, state = result.info.problem, result.info.state
     kinds = np.array(assembled.priors)
     rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
@@ -539,7 +516,7 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
     n_drawing = int(np.sum(drawn))
     unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
     unknowns += value.shape[1] * problem.layout.own_motion.shape[1]
-    found = components(result.info, result.weight)
+    found = result.components
     freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
@@ -550,19 +527,19 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
         n_joints=n_joints,
         chi2_drawing=chi2_drawing,
         n_drawing=n_drawing,
-        steps=int(result.steps[0]),
+        steps=int(result.solution.steps[0]),
         stopped=result.solution.stop[0].value,
         noise_scale=float(result.noise_scale[0]),
         chi2_poses=chi2[2],
         n_poses=n_poses,
-        pose_scale=float(result.pose_scale[0]),
+        pose_scale=float(result.scale.poses[0]),
         dof_edges=freedom[EDGES],
         dof_joints=freedom[READINGS],
         dof_poses=freedom[POSES],
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(found, READINGS, result.reading_scale),
-        pose_range=_range(found, POSES, result.pose_scale),
-        shading=float(np.median(result.problem.data.shading[0])),
+        pose_range=_range(found, POSES, result.scale.poses),
+        shading=float(np.median(problem.data.shading[0])),
     )
 
 

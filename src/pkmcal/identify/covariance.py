@@ -30,20 +30,15 @@ from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.solver import (
+from pkmcal.solver.elimination import Linear, Reduced, condensed, divisions, eliminate, stacked
+from pkmcal.solver.ranks import (
     RANK_TOLERANCE,
-    Linear,
-    Reduced,
     column_space,
-    condensed,
-    divisions,
-    eliminate,
     inverse_root,
     normal_inverse,
     normal_root,
-    stacked,
-    take,
 )
+from pkmcal.solver.search import take
 
 NULL = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
@@ -72,7 +67,7 @@ class Information:
     @cached_property
     def reduced(self) -> Reduced:
         """The same with the configurations' own unknowns eliminated."""
-        return eliminate(self.linear, np.zeros(len(self.state.z)))
+        return eliminate(self.linear)
 
     def pieces(self) -> Iterator[Information]:
         """What some configurations say after the other, so many as the solver works on at once; the
@@ -133,11 +128,6 @@ class Information:
                 return inverse
         half = inverse_root(self.rows[0], NULL, loose=True)
         return half @ half.mT
-
-
-def information(problem: Problem, state: BatchState, normal: Array | None = None) -> Information:
-    """What a problem says at a state."""
-    return Information(problem, state, normal)
 
 
 def reduced_rows(

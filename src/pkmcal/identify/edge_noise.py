@@ -31,7 +31,7 @@ from pkmcal.identify.scatter import (
     worth,
 )
 from pkmcal.measurements import OWN_SHADING
-from pkmcal.solver import divisions
+from pkmcal.solver.elimination import divisions
 
 TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""

@@ -180,7 +180,7 @@ def pose_generators(T_base_platform: Array) -> Array:
     return out
 
 
-def count(layout: LimbLayout) -> int:
+def other_moves(layout: LimbLayout) -> int:
     """Numbers besides the frames'."""
     return 2 * layout.n_internal + 3 * _floating(layout).size
 
@@ -194,7 +194,7 @@ def _floating(layout: LimbLayout) -> Integers:
 def move_generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
     """How parameters move with all these changes, (..., P, 12 + n)."""
     frames = generators(layout, theta, drawing)
-    if not count(layout):
+    if not other_moves(layout):
         return frames
     hinges = np.zeros((*theta.shape, 2 * layout.n_internal))
     for group in layout.platform:
@@ -217,7 +217,7 @@ def _shifts(layout: LimbLayout, theta: Array) -> Array:
 
 def slid(layout: LimbLayout, theta: Array, y: Array) -> Array:
     """Parameters (..., P) after the changes y (..., n) that are not the frames'."""
-    if not count(layout):
+    if not other_moves(layout):
         return theta
     out = theta + (_shifts(layout, theta) @ y[..., 2 * layout.n_internal :, None])[..., 0]
     for group in layout.platform:
@@ -254,7 +254,7 @@ def conventions(machine: Machine) -> Array:
 def exact_moves(machine: Machine) -> Array:
     """All changes that leave every prediction as it is, a basis (12 + n, g), at the drawing's."""
     frames = respecting_motion(machine.layout.motion)
-    return _with_hinges(machine, frames, count(machine.layout))
+    return _with_hinges(machine, frames, other_moves(machine.layout))
 
 
 def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
@@ -350,7 +350,7 @@ def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Arra
     return e, f
 
 
-def apply(machine: Machine, state: State, gauge: Gauge) -> State:
+def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
     """The same machine, stations and poses told in the gauge's frames; no residual changes.
 
     What the frames make zero is zero, not the rounding of their change.

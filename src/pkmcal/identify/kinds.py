@@ -14,7 +14,8 @@ from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import Eliminated, divisions, eliminated, flat
+from pkmcal.solver.elimination import divisions, flat
+from pkmcal.solver.strips import Eliminated, eliminated
 
 EDGES, POSES, READINGS = range(3)
 """Kinds of rows in the axes of :class:`KindSums`."""

@@ -45,7 +45,9 @@ from pkmcal.identify.rows import (
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, by_own, closure, dense, on_tangents
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.solver import Compact, Linear, StripLayout, Strips, Values, of_runs
+from pkmcal.solver.elimination import Linear
+from pkmcal.solver.search import Values, of_runs
+from pkmcal.solver.strips import Compact, StripLayout, Strips
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -87,7 +89,7 @@ class _Turn(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """The joint estimation of B runs; a :class:`pkmcal.solver.LeastSquares`.
+    """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
 
     layout, drawing (P,), free (P, nz) : the machine. unknowns : which there are, and their columns.
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.

@@ -17,12 +17,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kind, Kinds
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import (
-    FULL,
-    final_weights,
-    minimise,
-    soft_weights,
-)
+from pkmcal.solver.search import FULL, final_weights, minimise, soft_weights
 
 TAIL = float(np.exp(-(FULL**2) / 2))
 """Share of two clean residuals' norms beyond FULL, where weights begin to fall."""
@@ -61,7 +56,7 @@ def as_pairs(kind: Kind) -> Array:
     return FULL / clean_norm(TAIL, kind.count)
 
 
-def distances(problem: Problem, state: BatchState) -> Kinds[Array]:
+def norms(problem: Problem, state: BatchState) -> Kinds[Array]:
     """Mahalanobis norms of each kind by its stated noise, as those of pairs (:func:`as_pairs`),
     (B, K, G); NaN for padding.
     """
@@ -86,7 +81,7 @@ def robust_scale(d: Array, usual: Array) -> Array:
     return flat[np.arange(len(flat)), count // 2]
 
 
-def scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
+def noise_scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
     """Each kind's factor, (B,), not below the least."""
     parts = zip(problem.kinds, d, strict=True)
     found = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
@@ -95,7 +90,7 @@ def scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
 
 def settled_weights(problem: Problem, state: BatchState, scale: Kinds[Array]) -> Kinds[Array]:
     """Each kind's weights at a state."""
-    parts = zip(distances(problem, state), scale, strict=True)
+    parts = zip(norms(problem, state), scale, strict=True)
     return Kinds(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
 
@@ -106,10 +101,10 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     """
     state, steps = start, 0
     most = POSE_STEPS if problem.kinds.poses.present.size else 1
-    d = distances(problem, state)
-    cut = [4 * WIDE * scale for scale in scales(problem, d, least_scale)]
+    d = norms(problem, state)
+    cut = [4 * WIDE * scale for scale in noise_scales(problem, d, least_scale)]
     for _ in range(STAGES):
-        aim = [WIDE * scale for scale in scales(problem, d, least_scale)]
+        aim = [WIDE * scale for scale in noise_scales(problem, d, least_scale)]
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
@@ -117,8 +112,8 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         searched = problem.weighted(weight).as_noisy_as_at(state)
         found = minimise(searched, state, max_steps=most)
         state, steps = found.state, steps + int(found.steps.max())
-        d = distances(problem, state)
+        d = norms(problem, state)
         if settled:
             break
-    scale = scales(problem, d, least_scale)
+    scale = noise_scales(problem, d, least_scale)
     return Anneal(state, settled_weights(problem, state, scale), scale, steps)

@@ -32,7 +32,8 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
-from pkmcal.solver import Linear, divisions, eliminate, inverse_root
+from pkmcal.solver.elimination import Linear, divisions, eliminate
+from pkmcal.solver.ranks import inverse_root
 
 SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
@@ -288,7 +289,7 @@ def _basis(problem: Problem, state: BatchState) -> Array:
     root: Array = np.zeros((0, count))
     for cut, part, at in _cuts(problem, state):
         linear = part.linearize(at)
-        rows = eliminate(linear, np.zeros(1)).rows[0].reshape(-1, count)
+        rows = eliminate(linear).rows[0].reshape(-1, count)
         before = root if cut.start else linear.shared_by
         root = np.asarray(np.linalg.qr(np.concatenate([before, rows]), mode="r"))
     half = inverse_root(root[None], NULL, loose=False)[0]
@@ -358,7 +359,7 @@ def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
         by_shared=np.concatenate([linear.by_shared, extra[None]], axis=-1),
         shared_by=np.pad(linear.shared_by, ((0, 0), (0, extra.shape[-1]))),
     )
-    reduced = eliminate(wide, np.zeros(1))
+    reduced = eliminate(wide)
     return reduced.rows[0], reduced.value[0]
 
 

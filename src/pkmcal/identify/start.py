@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.robust import distances
+from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
@@ -47,11 +47,11 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
     body = T_camera_base[seen.station]
     body = np.where(on_platform[seen.mount][:, None, None], body @ poses[seen.configuration], body)
     each = inverse(body) @ seen.T_station_target
-    mounts = [mean_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
+    mounts = [middle_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
     return np.array(mounts).reshape(-1, 4, 4)
 
 
-def mean_pose(poses: Array) -> Array:
+def middle_pose(poses: Array) -> Array:
     """The pose (4, 4) nearest to poses (n, 4, 4), a few wrong ones forgiven; the identity of none.
 
     The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).
@@ -67,9 +67,9 @@ def mean_pose(poses: Array) -> Array:
     return pose(rot, np.median(poses[:, :3, 3], axis=0))
 
 
-def misfit(machine: Machine, measurements: Measurements, state: State) -> float:
+def edge_misfit(machine: Machine, measurements: Measurements, state: State) -> float:
     """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
     assembled = assemble(machine, measurements, default_gauge(machine))
-    distance = distances(assembled.problem, batch_of(machine, assembled, state)).edges
+    distance = norms(assembled.problem, batch_of(machine, assembled, state)).edges
     found = distance[np.isfinite(distance)]
     return float(np.median(found)) if found.size else np.inf

@@ -95,7 +95,7 @@ def explain(
     """The findings of an estimate; seen : (S, L) legs that each station sees. bed : where nothing
     but heights was measured.
 
-    Stations that a board on the base joins are one here, see :func:`joined_by_boards`.
+    Stations that a board on the base joins are one here, see :func:`seen_through_boards`.
     """
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
@@ -144,7 +144,7 @@ def seen_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> B
     return out
 
 
-def joined_by_boards(seen: Booleans, measurements: Measurements) -> Booleans:
+def seen_through_boards(seen: Booleans, measurements: Measurements) -> Booleans:
     """The same (S, L), where stations that see one board on the base count as one station."""
     out, poses = seen.copy(), measurements.poses
     for k, mount in enumerate(measurements.mounts):

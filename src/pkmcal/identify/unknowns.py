@@ -143,14 +143,8 @@ class BatchState:
 
     def __post_init__(self) -> None:
         """Runs without boards or hinges get none each, so that all fields select alike."""
-        if len(self.T_mount) != len(self.z):
-            object.__setattr__(self, "T_mount", np.zeros((len(self.z), 0, 4, 4)))
-        if len(self.internal) != len(self.z):
-            none = np.zeros((*self.T_base_platform.shape[:2], 0))
-            object.__setattr__(self, "internal", none)
-        if len(self.shading) != len(self.z):
-            object.__setattr__(self, "shading", np.zeros((len(self.z), 0)))
-        if len(self.breathing) != len(self.z):
-            object.__setattr__(self, "breathing", np.zeros((len(self.z), 0)))
-        if len(self.sizes) != len(self.z):
-            object.__setattr__(self, "sizes", np.zeros((len(self.z), 0)))
+        none = {"internal": (self.T_base_platform.shape[1], 0), "T_mount": (0, 4, 4)}
+        for name in ("T_mount", "internal", "shading", "breathing", "sizes"):
+            if len(getattr(self, name)) != len(self.z):
+                empty = np.zeros((len(self.z), *none.get(name, (0,))))
+                object.__setattr__(self, name, empty)

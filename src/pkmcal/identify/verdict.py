@@ -10,8 +10,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.decided import decided_by
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.found import decided_by
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_by_parameters
@@ -20,7 +20,7 @@ from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
-from pkmcal.solver import Stop
+from pkmcal.solver.search import Stop
 from pkmcal.wording import count, listed
 
 FAR = 5.0

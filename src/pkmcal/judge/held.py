@@ -32,7 +32,8 @@ from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import RANK_TOLERANCE, Stop, column_space, minimise
+from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
+from pkmcal.solver.search import Stop, minimise
 
 RATIO = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
@@ -155,7 +156,7 @@ def hold(
     if trust is None:
         _check_enough(assembled.problem, begin)
         result = solve_batch(assembled.problem, begin, scale_readings=False)
-        problem, found = result.problem, result.solution
+        problem, found = result.info.problem, result.solution
     else:
         problem = assembled.trusting(trust.weights)
         found = minimise(problem, begin)

@@ -32,15 +32,8 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.solver import (
-    RANK_TOLERANCE,
-    Linear,
-    Reduced,
-    column_space,
-    eliminate,
-    inverse_root,
-    stacked,
-)
+from pkmcal.solver.elimination import Linear, Reduced, eliminate, stacked
+from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
@@ -105,7 +98,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
         )
     held = hold(machine, replace(measurements, joint_noise=SOFT), start)
     linear = held.problem.linearize(held.state)
-    reduced = eliminate(linear, np.zeros(1))
+    reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(stacked(linear, reduced)[0][0])
     picks = _picks(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape

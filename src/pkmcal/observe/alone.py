@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.rigid import dot, inverse, pose, rotation
+from pkmcal.geometry.rigid import angle_between, dot, inverse, pose, rotation
 from pkmcal.observe.evidence import StationView, apart, descend, evidence_of, settle
 from pkmcal.observe.places import PLACES, TURNS, frame_of, sphere
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
@@ -113,13 +113,7 @@ def distinct(view: StationView, found: Array) -> Integers:
     """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
     kept = np.array(apart(view, found, np.zeros(1, dtype=int)))
     # near the first lies the same place, less well settled
-    return kept[(turn_between(found[kept], found[0]) >= ALIKE) | (kept == 0)]
-
-
-def turn_between(one: Array, other: Array) -> Array:
-    """Angles (...) rad between poses (..., 4, 4)."""
-    turned = one[..., :3, :3] @ other[..., :3, :3].mT
-    return np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+    return kept[(angle_between(found[kept], found[0]) >= ALIKE) | (kept == 0)]
 
 
 def _unit(view: StationView, found: Array) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import pose_difference
+from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.evidence import StationView, evidence_by_name, evidence_from, settled
 from pkmcal.observe.stations import FoundStation, evidence_nearby, find_station
 from pkmcal.wording import listed
@@ -65,8 +65,7 @@ class SeenStation(NamedTuple):
         """Turn (rad) of the found pose from the one by hand; 0 without one."""
         if self.by_hand is None:
             return 0.0
-        turn = pose_difference(self.found.T_camera_base, self.by_hand)[:3]
-        return float(np.linalg.norm(turn))
+        return float(angle_between(self.found.T_camera_base, self.by_hand))
 
 
 class Hypothesis(NamedTuple):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
@@ -25,8 +25,9 @@ from pkmcal.observe.predict import (
     TubeList,
     edge_points,
     legs_in_camera,
+    normals_of_edges,
     of_edges,
-    plane_normals,
+    tubes_of,
     visible_stretch,
 )
 from pkmcal.observe.tables import BIN, DistanceTables
@@ -64,12 +65,16 @@ class StationView:
 
     machine: Machine
     camera: Camera
-    tubes: TubeList
     configuration: Integers
     all_joints: Array
     all_poses: Array
     tables: DistanceTables
     guessed: LegsInCamera | None = None
+
+    @cached_property
+    def tubes(self) -> TubeList:
+        """The machine's tubes."""
+        return tubes_of(self.machine)
 
     @property
     def joints(self) -> Array:
@@ -104,8 +109,7 @@ class StationView:
 
     def few(self, count: int) -> Integers:
         """Numbers of up to ``count`` photographs, spread over all."""
-        n = len(self.configuration)
-        return np.unique(np.linspace(0, n - 1, min(count, n)).astype(int))
+        return evenly(len(self.configuration), count)
 
     def with_joints(self, joints: Array) -> StationView:
         """The same photographs with other readings (M, m)."""
@@ -168,7 +172,7 @@ def score(
     legs = view.legs(photographs).moved(T_camera_base)
     a, b, u = of_edges(legs, tubes)
     radius = view.machine.values[tubes.radius].astype(a.dtype)
-    normal, ok = plane_normals(a, u, radius, tubes)
+    normal, ok = normals_of_edges(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     base = a + radius[:, None] * normal
     begin, end = (view.camera.project(base + at[..., None] * u) for at in (first, last))
@@ -302,7 +306,7 @@ def settle(
     look = look_under(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = first_mixture(len(candidates))
-    last = np.inf
+    last = float("inf")
     for _ in range(steps):
         mixture = look.mixture(mixture, widest=widest)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
@@ -312,8 +316,10 @@ def settle(
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
-        if max(last, last := float(gain.max())) < SETTLED:
+        most = float(gain.max())
+        if max(last, most) < SETTLED:
             break  # one step may have been too long
+        last = most
     mixture = look.mixture(first_mixture(len(candidates)), 10, widest)
     return candidates, _summed(look.evidence(mixture))
 

@@ -8,6 +8,7 @@ looked at and forgotten again. What looks at many does so in windows (`pkmcal.ob
 from __future__ import annotations
 
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -152,8 +153,41 @@ def _broken(label: str, found: str) -> InputError:
     )
 
 
-class Pictures(Sequence[Integers]):
-    """Photographs of one camera as grey levels (height, width), each decoded when it is looked at.
+class LazyPictures(Sequence[Integers], ABC):
+    """Photographs as grey levels (height, width), none of which is looked at before it is asked
+    for.
+    """
+
+    @abstractmethod
+    def look(self, number: int) -> Integers:
+        """One of them."""
+
+    @overload
+    def __getitem__(self, index: int) -> Integers: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
+    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
+        """One photograph; of a slice, those that it picks."""
+        numbers = range(len(self))[index]
+        return self.look(numbers) if isinstance(numbers, int) else Selected(self, numbers)
+
+
+class Selected(LazyPictures):
+    """Some of a sequence of photographs."""
+
+    def __init__(self, images: Sequence[Integers], numbers: Sequence[int] | Integers) -> None:
+        self._images, self._numbers = images, [int(number) for number in numbers]
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def look(self, number: int) -> Integers:
+        """One of them."""
+        return self._images[self._numbers[number]]
+
+
+class Pictures(LazyPictures):
+    """Photographs of one camera, each decoded when it is looked at.
 
     paths, labels : of all of them. kept : those that stay decoded, by their number.
     """
@@ -189,38 +223,11 @@ class Pictures(Sequence[Integers]):
     def __len__(self) -> int:
         return len(self._paths)
 
-    @overload
-    def __getitem__(self, index: int) -> Integers: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
-    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
-        """One photograph; Raises InputError as :func:`decode`. Of a slice, those that it picks."""
-        if isinstance(index, slice):
-            return Selected(self, range(len(self))[index])
-        number = range(len(self))[index]
+    def look(self, number: int) -> Integers:
+        """One of them. Raises InputError as :func:`decode`."""
         if number in self._kept:
             return self._kept[number]
         return decode(self._paths[number], self._size, self._labels[number])
-
-
-class Selected(Sequence[Integers]):
-    """Some of a sequence of photographs, none of which is looked at before it is asked for."""
-
-    def __init__(self, images: Sequence[Integers], numbers: Sequence[int] | Integers) -> None:
-        self._images, self._numbers = images, [int(number) for number in numbers]
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    @overload
-    def __getitem__(self, index: int) -> Integers: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
-    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
-        """One photograph; of a slice, those that it picks."""
-        if isinstance(index, slice):
-            return Selected(self._images, self._numbers[index])
-        return self._images[self._numbers[index]]
 
 
 def fitting(image_size: tuple[int, int], room: int) -> int:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
@@ -259,8 +259,7 @@ class Photographs:
 
     def spread(self, most: int) -> Integers:
         """Numbers of up to ``most`` photographs, evenly over all."""
-        count = len(self.images)
-        return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+        return evenly(len(self.images), most)
 
     @property
     def window(self) -> int:
@@ -314,14 +313,14 @@ def search(
         if done is not None:
             done(len(window.images))
         del window  # before the next one is decoded
-    return _joined(looks, float("nan"), reach)
+    return joined_looks(looks, float("nan"), reach)
 
 
 def _searched(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, reach: float
 ) -> StationEdges:
     """One window's part of :func:`search`."""
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
+    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
     places = search_legs(photographs.images, tubes, points, clear, reach)
     found = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
@@ -371,19 +370,18 @@ def measure(
             done(len(window.images))
         del seen, window  # before the next one is decoded
     away = np.concatenate(moved)
-    return _joined(looks, blur, float(np.median(away)) if len(away) else 0.0)
+    return joined_looks(looks, blur, float(np.median(away)) if len(away) else 0.0)
 
 
-def _joined(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
-    """One station's windows as one look."""
-    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
+def joined_looks(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
+    """One station's windows, or all stations, as one look."""
+    first = np.cumsum([0, *(len(look.edges) for look in looks)])[:-1]
+    number = [look.point_edge + k for look, k in zip(looks, first, strict=True)]
     return StationEdges(
-        edges=concatenate([look.edges for look in looks]),
+        edges=concatenate([EdgeSet.empty(), *(look.edges for look in looks)]),
         rejected=tuple(rejection for look in looks for rejection in look.rejected),
-        points=np.concatenate([look.points for look in looks]),
-        point_edge=np.concatenate(
-            [look.point_edge + k for look, k in zip(looks, first, strict=True)]
-        ),
+        points=np.concatenate([np.zeros((0, 2)), *(look.points for look in looks)]),
+        point_edge=np.concatenate([np.zeros(0, dtype=int), *number]),
         blur=blur,
         moved=moved,
     )
@@ -402,7 +400,7 @@ class _Seen:
 
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES)
+    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, PLACES)
     grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
@@ -436,7 +434,7 @@ def _measured(
     return look, np.abs(position[k, e, s])
 
 
-def _predict(
+def predicted(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
     """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""

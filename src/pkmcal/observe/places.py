@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import dot, pose, rotation
 from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
@@ -134,7 +134,7 @@ def _places(
     point = point.reshape(-1, 3)
     centre = weight @ point / weight.sum()
     size = np.sqrt(weight @ dot(point - centre, point - centre) / weight.sum())
-    few = np.linspace(0, len(point) - 1, min(len(point), POINTS)).astype(int)
+    few = evenly(len(point), POINTS)
     point, weight = point[few], weight[few]
     direction = sphere(PLACES)
     distance = size * np.geomspace(NEAREST, FURTHEST, DISTANCES)

@@ -15,11 +15,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
+from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, leg_is_seen, line_through
 from pkmcal.geometry.rigid import apply, cross, dot, of_components
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import base_ends, platform_ends
-from pkmcal.mechanisms.kinematics import inverse_result
 
 JOINT_MARGIN = 0.006
 """Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""
@@ -98,17 +96,9 @@ class LegsInCamera:
 def legs_in_camera(
     machine: Machine, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> LegsInCamera:
-    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast.
-
-    An articulated platform's hinges turn as its legs make them.
-    """
-    layout, internal = machine.layout, None
-    if layout.n_internal:
-        internal = inverse_result(layout, machine.values, T_base_platform)[1]
-    camera = T_camera_base[..., None, :, :]
-    a = apply(camera, base_ends(layout, machine.values, joints).a)
-    b = apply(camera, platform_ends(layout, machine.values, T_base_platform, internal).b)
-    a, b = np.broadcast_arrays(a, b)
+    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast."""
+    ends, camera = machine.ends_at(joints, T_base_platform), T_camera_base[..., None, :, :]
+    a, b = np.broadcast_arrays(apply(camera, ends.a), apply(camera, ends.b))
     return LegsInCamera(a, b, line_through(a, b)[0])
 
 
@@ -154,7 +144,7 @@ def edge_points(
     """
     radius = machine.values[tubes.radius].astype(legs.a.dtype)
     a, b, u = of_edges(legs, tubes)
-    normal, ok = plane_normals(a, u, radius, tubes)
+    normal, ok = normals_of_edges(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
     along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
@@ -178,15 +168,12 @@ def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
         yield of_components(*(vectors[..., k].take(tubes.leg, axis=-1) for k in range(3)))
 
 
-def plane_normals(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
+def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
     """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
     m = cross(a, u)
-    distance = np.sqrt(dot(m, m))
-    ok = distance > 1.02 * radius
-    sine = np.where(ok, radius / distance, 0.0)[..., None]
-    m_unit = m / distance[..., None]
-    sign = SIDE_SIGNS.astype(a.dtype)[tubes.side][:, None]
-    return sign * np.sqrt(1 - sine**2) * m_unit - sine * cross(u, m_unit), ok
+    ok = leg_is_seen(m, radius)
+    sign = SIDE_SIGNS.astype(a.dtype)[tubes.side]
+    return edge_normal(u, m, np.where(ok, radius, 0.0), sign), ok
 
 
 def visible_stretch(a: Array, b: Array, tubes: TubeList) -> tuple[Array, Array]:

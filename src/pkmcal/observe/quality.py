@@ -9,8 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import CLEARANCE, SEARCH_SAMPLES, Photographs, sample, search_legs
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.legs import SEARCH_SAMPLES, Photographs, predicted, sample, search_legs
 from pkmcal.observe.profiles import SATURATED
 
 BLACK = 8
@@ -74,10 +73,7 @@ def _quality(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
 ) -> Quality:
     """The same of one window."""
-    tubes = tubes_of(machine)
-    legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
-    points = edge_points(machine, photographs.camera, legs, tubes, SEARCH_SAMPLES)
-    clear = unobstructed(machine, photographs.camera, legs, tubes, points, CLEARANCE)
+    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
     places = search_legs(photographs.images, tubes, points, clear)
     edge = places.outward(points, clear, tubes)[..., None]
     half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]

@@ -13,6 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 from pkmcal.observe.tables import DistanceTables
 
@@ -44,7 +45,5 @@ def without_shadows(places: Array, light: Array) -> Integers:
     """Numbers of those places (H, 4, 4) that are no other one's shadow; light : (H,) as `lightness`
     says.
     """
-    turned = places[:, None, :3, :3] @ places[:, :3, :3].mT
-    angle = np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
-    casts = (light > MOSTLY) & (angle < TURNED)
+    casts = (light > MOSTLY) & (angle_between(places[:, None], places) < TURNED)
     return np.flatnonzero((light > -MOSTLY) | ~casts.any(axis=1))

@@ -136,13 +136,13 @@ def find_station(
     best = candidates[:1]
     nearer = descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
     ends = np.concatenate([nearer, best])
-    scores = score(view, ends, every, LAST_REACH)
+    scores, each = score(view, ends, every, LAST_REACH), grain(view, candidates[0])
     return FoundStation(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
         evidence=float(evidence[0]),
         by_chance=confirmed,
-        second=_second(evidence, each := grain(view, candidates[0])),
+        second=_second(evidence, each),
         told=T_camera_base is not None,
         grain=each,
     )

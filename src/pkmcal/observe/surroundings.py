@@ -22,8 +22,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import cross, dot, inverse, pose, rotation
-from pkmcal.observe.alone import ALIKE, Alone, turn_between
+from pkmcal.geometry.rigid import angle_between, cross, dot, inverse, pose, rotation
+from pkmcal.observe.alone import ALIKE, Alone
 from pkmcal.observe.predict import LegsInCamera
 
 LARGEST = 1600
@@ -292,7 +292,7 @@ class Surroundings:
             return found
         T = found.T_camera_base
         gain = self._gain(T, one, camera, [legs[h] for h in range(len(T))], placed)
-        alike = turn_between(T[:, None], T) < ALIKE
+        alike = angle_between(T[:, None], T) < ALIKE
         worth = found.evidence + np.where(alike, gain, -np.inf).max(axis=1)
         order = np.argsort(-worth, kind="stable")
         order = order[~alike[order, order[0]] | (order == order[0])]

@@ -18,7 +18,7 @@ from pkmcal.observe.predict import (
     TubeList,
     edge_points,
     legs_in_camera,
-    plane_normals,
+    normals_of_edges,
     tubes_of,
     unobstructed,
 )
@@ -183,7 +183,7 @@ def own_edges(
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
     at = photograph, edges.leg
-    own, _ = plane_normals(legs.a[at], legs.u[at], machine.values[radius], each)
+    own, _ = normals_of_edges(legs.a[at], legs.u[at], machine.values[radius], each)
     return replace(edges, normal=own)
 
 

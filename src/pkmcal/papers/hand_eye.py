@@ -32,10 +32,11 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.estimate import State
 from pkmcal.identify.rows import PoseBlocks, PoseData, pose_rows
-from pkmcal.identify.start import mean_pose
+from pkmcal.identify.start import middle_pose
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import Linear, Values, minimise, take
+from pkmcal.solver.elimination import Linear
+from pkmcal.solver.search import Values, minimise, take
 
 TURN = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""
@@ -271,11 +272,11 @@ def _carried_on(
             m = seen.mount[to_mount][0]
             rows = to_mount & (seen.mount == m)
             T_camera_body = stations[seen.station[rows]] @ body[rows]
-            mounts[m] = mean_pose(inverse(T_camera_body) @ target[rows])
+            mounts[m] = middle_pose(inverse(T_camera_body) @ target[rows])
         elif to_station.any():
             s = seen.station[to_station][0]
             rows = to_station & (seen.station == s)
-            stations[s] = mean_pose(target[rows] @ inverse(body[rows] @ mounts[seen.mount[rows]]))
+            stations[s] = middle_pose(target[rows] @ inverse(body[rows] @ mounts[seen.mount[rows]]))
         else:
             fit = good & moving & ~has_station
             pair, count = np.unique(

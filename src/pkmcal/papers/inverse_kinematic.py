@@ -25,8 +25,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
-from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.rows import PERFECT
 from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements
@@ -35,17 +34,8 @@ from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
-from pkmcal.solver import (
-    Linear,
-    Solution,
-    Stop,
-    Values,
-    eliminate,
-    minimise,
-    of_runs,
-    stacked,
-    take,
-)
+from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
 
 Form = Literal["joint", "implicit"]
 PRINTED = 1e-4
@@ -407,7 +397,7 @@ def unknowns_kept(
     """
     first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     linear = first.ideal(begin).linearize(begin)
-    jac = stacked(linear, eliminate(linear, np.zeros(1)))[0][0]
+    jac = stacked(linear, eliminate(linear))[0][0]
     sizes = np.full(problem.unknowns.count, PLACED)
     sizes[problem.unknowns.machine] = machine.parameters.tolerances_free()
     keep = np.ones(len(sizes), dtype=bool)

@@ -32,7 +32,7 @@ from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear
-from pkmcal.solver import FULL, NONE, final_weights
+from pkmcal.solver.search import FULL, NONE, final_weights
 
 STEPS, ROUNDS = 30, 30
 """Most Gauss-Newton steps with given variances, and most rounds of variances."""

@@ -19,7 +19,7 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, told_in_gauge
 from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
-from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
@@ -28,7 +28,7 @@ from pkmcal.papers.four_step_base import with_boards
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import inverse_kinematic
 from pkmcal.papers.linear_together import base_together
-from pkmcal.solver import NONE
+from pkmcal.solver.search import NONE
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]
 Repeated = Literal["four-step", "inverse-kinematic"]
@@ -72,7 +72,7 @@ def _solve(method: Repeated, machine: Machine, measurements: Measurements, guess
         state = inverse_kinematic(machine, measurements, start)
     else:
         state = four_step(machine, measurements, T_camera_base_guess=guess)
-    state = apply(machine, state, default_gauge(machine))
+    state = in_gauge(machine, state, default_gauge(machine))
     return replace(state, theta=machine.parameters.unit_axes(state.theta))
 
 
@@ -90,7 +90,7 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
     spread = np.zeros((told.count, base.spread.shape[1]))
     spread[: len(base.spread)] = base.spread
     full = told_in_gauge(machine, state, spread, np.eye(spread.shape[1]), gauge)
-    state = apply(machine, state, gauge)
+    state = in_gauge(machine, state, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     return replace(
         _estimate(

@@ -19,7 +19,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, nearest_rotation, perturb, pose, register, rotation, skew
-from pkmcal.solver import Linear, Solution, Values, minimise
+from pkmcal.solver.elimination import Linear
+from pkmcal.solver.search import Solution, Values, minimise
 
 SCALE = 1e-4
 """Metres that count as one standard deviation; it only sets where the search stops."""

@@ -34,7 +34,7 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.planning.route import spans
-from pkmcal.solver import eliminate
+from pkmcal.solver.elimination import eliminate
 from pkmcal.wording import listed
 
 PLACE = 1.0
@@ -152,7 +152,7 @@ def information_of(
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
-    reduced = eliminate(problem.linearize(state), np.zeros(1)).rows[0]
+    reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
     rows[assembled.seen] = reduced  # of what shows nothing, nothing is told
     prior = problem.prior

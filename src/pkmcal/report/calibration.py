@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.kept import keep_earlier
-from pkmcal.calibration.results import REPORT, check_output, texts_of
+from pkmcal.calibration.results import REPORT, check_output, document_of, texts_of
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
 from pkmcal.files import write_folder
@@ -56,7 +56,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, predicted, over, seen),
+        texts=texts_of(c, document_of(c, open_, predicted, over, seen)),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),

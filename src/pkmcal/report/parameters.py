@@ -13,9 +13,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
-from pkmcal.identify.decided import EXACT
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.found import FoundParameter, FoundParameters, found_parameters
+from pkmcal.identify.found import EXACT, FoundParameter, FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot

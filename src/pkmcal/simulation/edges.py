@@ -113,7 +113,7 @@ def visible_edges(
     )
     with np.errstate(invalid="ignore"):
         seen = camera.in_image(camera.project(points))
-        seen &= (leg_is_seen(a_e, b_e, radius) & (last > first))[..., None]
+        seen &= (leg_is_seen(m, radius) & (last > first))[..., None]
     seen &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
     begin, count = _longest_run(seen)
     photo, edge = np.nonzero(count >= LEAST_SEEN)

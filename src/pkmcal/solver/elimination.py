@@ -38,64 +38,22 @@ class Linear(NamedTuple):
 class Reduced(NamedTuple):
     """The problem after elimination of the own unknowns.
 
-    rows : (B, K, r', na) reduced Jacobian; the data's rows come first, the damping's after.
-    value : (B, K, r) what of the residuals the own unknowns cannot take up.
-    q, r : QR factors of the own Jacobian, q restricted to the data's rows.
-    gradient : (B, na) of half the cost, own unknowns eliminated.
+    rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) what of the residuals the own unknowns
+    cannot take up. q, r : QR factors of the own Jacobian.
     """
 
     rows: Array
     value: Array
     q: Array
     r: Array
-    gradient: Array
 
 
-def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
-    """QR factors of the own Jacobian with Marquardt damping (B,), zero for none.
-
-    The damping's rows sqrt(damping) diag(column norms) are appended, so a configuration that
-    its data do not fix stays solvable. q (B, K, r + d, d), r (B, K, d, d).
-    """
-    norms = np.sqrt(squares(by_own))
-    norms = np.where(norms > 0, norms, 1.0)
-    extra = np.sqrt(damping)[:, None, None, None] * norms[..., None] * np.eye(by_own.shape[-1])
-    return np.linalg.qr(np.concatenate([by_own, extra], axis=-2))
-
-
-def squares(columns: Array) -> Array:
-    """Sums of squares of columns (..., n, m), (..., m)."""
-    return np.einsum("...nm,...nm->...m", columns, columns)
-
-
-def eliminate(linear: Linear, damping: Array) -> Reduced:
-    """Own unknowns eliminated with Marquardt damping (B,), zero for none."""
-    n_rows = linear.by_own.shape[-2]
-    q, r = own_factors(linear.by_own, damping)
-    if not np.any(damping > 0):
-        q = q[..., :n_rows, :]
-    top, value = q[..., :n_rows, :], linear.value[..., None]
-    rows = left_of(linear.by_shared, q, top.mT @ linear.by_shared)
-    # the damping's rows carry no residual of their own, only -bottom top^T value
-    left = value - top @ (top.mT @ value)
-    gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
-    gradient = gradient + linear.shared_value @ linear.shared_by
-    return Reduced(rows, left[..., 0], top, r, gradient)
-
-
-def left_of(by_shared: Array, q: Array, along: Array) -> Array:
-    """The reduced rows ``by_shared - Q along`` (..., r', na), and those of the damping, which are
-    ``-Q along``, where q has them.
-
-    along : Q^T by_shared of all rows, (..., d, na).
-    """
-    *batch, n_rows, na = by_shared.shape
-    out = np.empty((*batch, q.shape[-2], na))
-    data = np.matmul(q[..., :n_rows, :], along, out=out[..., :n_rows, :])
-    np.subtract(by_shared, data, out=data)
-    if q.shape[-2] > n_rows:
-        np.negative(np.matmul(q[..., n_rows:, :], along), out=out[..., n_rows:, :])
-    return out
+def eliminate(linear: Linear) -> Reduced:
+    """Own unknowns eliminated."""
+    q, r = np.linalg.qr(linear.by_own)
+    value = linear.value[..., None]
+    rows = linear.by_shared - q @ (q.mT @ linear.by_shared)
+    return Reduced(rows, (value - q @ (q.mT @ value))[..., 0], q, r)
 
 
 def flat(rows: Array) -> Array:
@@ -104,7 +62,7 @@ def flat(rows: Array) -> Array:
 
 
 def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
-    """All rows on the shared unknowns, the own ones eliminated without damping: Jacobian (B, n, na)
+    """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na)
     and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
     """
     n_runs = len(reduced.rows)

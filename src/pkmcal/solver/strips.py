@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, flat, squares
+from pkmcal.solver.elimination import Linear, flat
 from pkmcal.solver.ranks import unit_diagonal
 
 
@@ -176,7 +176,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     products = numbers[..., :d].mT @ numbers
     sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
     square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
-    norms = np.einsum("...ii->...i", square) + squares(by_own)
+    norms = np.einsum("...ii->...i", square) + np.einsum("...nm,...nm->...m", by_own, by_own)
     damped = damping[:, None, None] * np.where(norms > 0, norms, 1.0)
     extra = np.sqrt(damped)[..., None] * np.eye(d)
     r = np.linalg.qr(np.concatenate([_root(square), by_own, extra], axis=-2), mode="r")

@@ -30,19 +30,19 @@ from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference,
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
-from pkmcal.identify.decided import EXACT
 from pkmcal.identify.estimate import State
+from pkmcal.identify.found import EXACT
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
     alignment,
     changed_frames,
     default_gauge,
+    in_gauge,
     transformation,
 )
-from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.rows import EdgeData, PoseData
-from pkmcal.identify.start import mean_pose
+from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
@@ -52,7 +52,7 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.simulation.edges import FITTED, moved_outward
 from pkmcal.simulation.placement import draw_configurations
-from pkmcal.solver import Stop, take
+from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import covered
@@ -162,7 +162,7 @@ class SimulatedCalibrations:
         k = int(data.assembled.seen.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(found.noise_scale, found.pose_scale)
+        scale = np.maximum(found.noise_scale, found.scale.poses)
         good = np.array([stop is Stop.CONVERGED for stop in found.solution.stop])
         told = [self._told(data, found, run) for run in range(n)]
         return {
@@ -171,7 +171,7 @@ class SimulatedCalibrations:
                 told={
                     "chi2": found.solution.cost / dof,
                     "scale": scale,
-                    "steps": found.steps.astype(float),
+                    "steps": found.solution.steps.astype(float),
                     "failed": 1.0 - (good & (scale <= TOO_NOISY)),
                 },
                 covariance=np.array([covariance for _, covariance in told]),
@@ -467,7 +467,7 @@ def _start(
         target = assembled.places.poses
         measured = problem.pose_data.T_station_target[:, target.row, target.place]
         each = inverse(T_camera_base[:, station] @ found.T_base_platform[:, row]) @ measured
-        mounts = np.stack([mean_pose(poses) for poses in each])[:, None]
+        mounts = np.stack([middle_pose(poses) for poses in each])[:, None]
     return BatchState(
         np.zeros((runs, u.n_free)),
         T_camera_base,

@@ -18,7 +18,9 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import directions, eliminate, minimise
+from pkmcal.solver.elimination import eliminate
+from pkmcal.solver.ranks import directions
+from pkmcal.solver.search import minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
@@ -67,7 +69,7 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """Errors (B, na) of the shared unknowns, drawn with the Cramér-Rao bound's covariance at a
     state; none along what nothing tells.
     """
-    reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
+    reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     s, vt, scale = directions(rows)
     known = s > LOOSE * s[:, :1]

@@ -26,7 +26,7 @@ from pkmcal.geometry.rigid import (
     register,
     rotation_vector,
 )
-from pkmcal.identify.covariance import information
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
@@ -376,7 +376,7 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
         told={
             "chi2": found.solution.cost / dof,
             "dof": np.full(len(theta), dof),
-            "steps": found.steps.astype(float),
+            "steps": found.solution.steps.astype(float),
         },
         sigma={"parameters": np.sqrt(variance)},
         covariance=stated,
@@ -400,7 +400,7 @@ def bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
     n, nz = z.shape
     T = np.broadcast_to(data.view.T_camera_base, (n, STATIONS, 4, 4))
     state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
-    covariance = information(problem, state).covariance[:, :nz, :nz]
+    covariance = Information(problem, state).covariance[:, :nz, :nz]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
     root = root @ vectors.mT  # the symmetric root is unique

@@ -92,7 +92,6 @@ def _view(viewed: Viewed, s: int) -> StationView:
         kept[s] = StationView(
             session.machine,
             station.camera,
-            tubes_of(session.machine),
             rows[few],
             session.joints,
             viewed.poses,
