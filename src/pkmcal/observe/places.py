@@ -41,6 +41,8 @@ COVER = 3.0
 """Widths of what moves from the chart's middle to its border."""
 REACH = 10
 """Cells at which distances on the chart are cut off."""
+BORDER = REACH
+"""Cells about the chart in which nothing is near."""
 SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
 """Cells by which the line of sight may be off."""
 ALONG = np.array([0.05, 0.35, 0.65, 0.95])
@@ -218,26 +220,34 @@ def _scores(
     cell = cell.reshape(len(places), -1, len(ALONG), 2)
     chord = np.diff(cell, axis=-2).reshape(len(places), -1, 2)
     middle = ((cell[..., 1:, :] + cell[..., :-1, :]) / 2).reshape(len(places), -1, 2)
-    normal = np.arctan2(chord[..., 1], chord[..., 0]) + np.pi / 2
+    # one component after the other: NumPy is slow along an axis of two
+    x, y = (np.ascontiguousarray(middle[..., k]) for k in (0, 1))
+    direction = (np.arctan2(chord[..., 1], chord[..., 0]) / np.pi + 0.5) * DIRECTIONS
     weight = np.minimum(np.sqrt(dot(chord, chord)), LONGEST)
-    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    photograph = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart))
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)[:, None]
+    table = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart)) * DIRECTIONS
     # beyond the chart nothing is near; what lies further still is taken to its border
-    border = REACH
-    limit = HALF + border - np.abs(SHIFTS).max() - 1
-    padded = np.pad(chart, ((0, 0), (0, 0), (border, border), (border, border)), "constant",
-                    constant_values=REACH)  # fmt: skip
-    n = padded.shape[-1]
-    flat, shift = padded.ravel(), SHIFTS[:, 1] * n + SHIFTS[:, 0]
+    shifted, n = _shifted(chart), chart.shape[-1] + 2 * BORDER
+    limit = n // 2 - np.abs(SHIFTS).max() - 1
     out = np.empty((len(places), TURNS, len(SHIFTS)), dtype=np.float32)
     for turn in range(TURNS):
-        angle = 2 * np.pi * turn / TURNS
-        turned = middle @ np.array(
-            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        cos, sin = np.cos(2 * np.pi / TURNS * turn), np.sin(2 * np.pi / TURNS * turn)
+        column, row = (
+            np.rint(np.clip(v, -limit, limit)).astype(np.intp) + n // 2
+            for v in (cos * x - sin * y, sin * x + cos * y)
         )
-        at = np.clip(np.rint(turned), -limit, limit).astype(np.intp) + HALF + border
-        number = np.floor(((normal + angle) % np.pi) * (DIRECTIONS / np.pi)).astype(np.intp)
-        cells = ((photograph * DIRECTIONS + number % DIRECTIONS) * n + at[..., 1]) * n + at[..., 0]
-        for s, step in enumerate(shift):
-            out[:, turn, s] = np.einsum("pn,pn->p", flat.take(cells + step), weight)
+        number = np.floor(direction + 2 * DIRECTIONS / TURNS * turn).astype(np.intp) % DIRECTIONS
+        cells = ((table + number) * n + row) * n + column
+        out[:, turn] = (weight @ shifted.take(cells, axis=0))[:, 0]
     return out
+
+
+def _shifted(chart: Integers) -> Array:
+    """Distances (cells, SHIFTS) by every line of sight, at each cell of charts (K, DIRECTIONS,
+    n, n) with a border: what is looked up together lies together.
+    """
+    around = ((0, 0), (0, 0), (BORDER, BORDER), (BORDER, BORDER))
+    flat = np.pad(chart, around, constant_values=REACH).astype(np.float32).ravel()
+    step = SHIFTS[:, 1] * (chart.shape[-1] + 2 * BORDER) + SHIFTS[:, 0]
+    # nothing is looked up so near the corners that a step leaves the tables
+    return flat.take(np.arange(flat.size)[:, None] + step, mode="clip")
