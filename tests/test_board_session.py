@@ -139,7 +139,10 @@ def test_a_board_is_made_in_proportion_to_the_machine():
 # stations through the board
 
 
-@pytest.mark.parametrize("without", [["station2"], ["station1", "station2"]])
+@pytest.mark.parametrize(
+    "without",
+    [["station2"], pytest.param(["station1", "station2"], marks=pytest.mark.slow)],
+)
 def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, without):
     """Where no station has a pose, legs tell where they stand; the board then joins them."""
     for station in without:

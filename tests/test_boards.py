@@ -255,7 +255,8 @@ def test_every_photograph_has_a_result(pictures):
         ("chessboard", (("[8, 5]", "[7, 5]"),), "8x5 inner", "7x5 inner"),
         pytest.param("chessboard", (("[8, 5]", "[9, 6]"),), "8x5 inner", "9x6 inner",
                      marks=pytest.mark.slow),  # the same search as above, of other counts
-        ("charuco", (("[9, 7]", "[7, 9]"),), "9x7 squares", "7x9 squares"),
+        pytest.param("charuco", (("[9, 7]", "[7, 9]"),), "9x7 squares", "7x9 squares",
+                     marks=pytest.mark.slow),
         ("charuco", (("[9, 7]", "[9, 6]"),), "9x7 squares", "9x6 squares"),
         ("charuco", (("5X5_100", "4X4_100"),), "markers of DICT_5X5_50", "9x7 squares"),
     ],

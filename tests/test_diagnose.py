@@ -71,7 +71,7 @@ def given(by_hand):
     return rough_pose(4) if by_hand else None
 
 
-@pytest.mark.parametrize("by_hand", [True, False])
+@pytest.mark.parametrize("by_hand", [also(True), False])
 def test_nothing_is_said_of_what_is_right(by_hand):
     """Though its drawing is 2 mm wrong."""
     rng = np.random.default_rng(0)
@@ -194,9 +194,10 @@ def test_tables_of_mirrored_photographs_are_mirrored_tables():
     np.testing.assert_allclose(tables.chance, mirrored.chance, atol=0.02)
 
 
+@pytest.mark.slow
 def test_diameters_for_radii():
-    """Legs twice as thick may still be recognised, and then nothing is said; where they are not,
-    their radii are asked too.
+    """Legs twice as thick may still be recognised, and then the estimate tells, as in
+    test_calibration.py; where they are not, their radii are asked too.
     """
     mechanism = redrawn(3, 0.001)
     radii = np.unique(tubes_of(mechanism).radius)

@@ -137,7 +137,7 @@ def test_every_figure_of_the_prototype_is_compared(short):
 
 def test_noise_twice_as_large_is_not_a_reproduction():
     quiet = H4ByBoard()
-    loud = study(runs=6, turn=2 * quiet.turn, shift=2 * quiet.shift)
+    loud = study(runs=4, turn=2 * quiet.turn, shift=2 * quiet.shift)
     failed = [c.what for c in expected.checks(loud, before()) if not c.passed]
     assert "figures of the independent prototype" in failed
 

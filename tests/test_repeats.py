@@ -456,7 +456,7 @@ def test_check_repeat_as_json(repeats):
 
 def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
-    shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3}
+    shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
     told = run("check", folder, "--repeat", "--json")
     assert told.code == 1
