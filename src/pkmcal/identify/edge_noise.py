@@ -148,20 +148,25 @@ def _student(
     from scipy.special import gammaln
 
     tails, norm = tried[..., None], worth(tried)
-    least = OWN_SHADING**2 / norm
+    least, count = OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
+    of_rest, square = weight * rest, size**2
+
+    def total(each: Array, times: Array) -> Array:
+        """Sums (V, B) over the edges of products (V, B, n) and (B, n)."""
+        return np.einsum("vbn,bn->vb", each, times)
 
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
         """One step of the two variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
         trust = (tails + PAIR) / (tails + along / s + rest / t)
-        left, of_s = trust * along - s, weight / s**2
-        of_t = np.sum(weight, axis=-1) / a**2 + STATED / a**2
+        of_s = weight / s**2
+        left = (trust * along - s) * of_s
         # the stated noise counts as some edges more
-        by_a = np.sum(left * of_s, axis=-1) + (STATED * (1 - a)) / a**2
-        by_a += np.sum(weight * (trust * rest - t), axis=-1) / a**2
-        by_b = np.sum(left * of_s * size, axis=-1)
-        aa, ab = np.sum(of_s, axis=-1) + of_t, np.sum(of_s * size, axis=-1)
-        bb = np.sum(of_s * size**2, axis=-1) + TINY
+        by_a = np.sum(left, axis=-1) + (total(trust, of_rest) - count * a) / a**2
+        by_a += STATED * (1 - a) / a**2
+        by_b = total(left, size)
+        aa, ab = np.sum(of_s, axis=-1) + (count + STATED) / a**2, total(of_s, size)
+        bb = total(of_s, square) + TINY
         det = aa * bb - ab**2
         det = np.where(det > TINY * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
@@ -183,7 +188,7 @@ def _student(
         weight * (np.log(s * t) + (tails + PAIR) * np.log1p(distance / tails)) / 2, axis=-1
     )
     constant = gammaln((tried + PAIR) / 2) - gammaln(tried / 2) - PAIR / 2 * np.log(tried)
-    cost = cost - constant * np.sum(weight, axis=-1)
+    cost = cost - constant * count
     best, run = np.argmin(cost, axis=0), np.arange(len(scale))
     factor = (norm * np.ones_like(a))[best, run]
     found = np.broadcast_to(tried, a.shape)[best, run]
