@@ -34,16 +34,16 @@ from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver.search import Solution, Stop, minimise
+from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
 
 LEAST_SCALE = 1.0
 """The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
 What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
 smaller than errors are: scaling down by them would promise too much."""
-MOST_STEPS = 100
-STEPS = 2
-"""Of a round: what is left to go then is far less than the next round's weights and deviations
-change. Only where these have settled is a solution brought to its end."""
+NEARLY = 1e-3
+"""Standard deviations, of all fitted values together, that a round's solution may have left to go,
+mostly after two steps: far less than the next round's weights and deviations change. Only where
+these have settled is it brought to its end."""
 ROUNDS = 30
 PACE, PACED = 1.6, 2
 """A round of weights, deviations and solution brings the deviations of shading and of the edges a
@@ -137,7 +137,7 @@ def solve_batch(
         scale = found.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     trust, stated = np.ones_like(every.edges), problem.joint_noise
-    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated, MOST_STEPS)
+    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated, STEP_TOLERANCE)
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -165,6 +165,7 @@ def _settle(
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
     asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
+    nearly = False
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, trust = fit.scale, fit.edges, fit.trust
@@ -195,18 +196,16 @@ def _settle(
         found_edges = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
         found_all = found_shading and found_readings and found_edges
         if found_all and _settled(scale, fit.scale, weight, fit.weight):
-            if Stop.STEPS not in fit.solution.stop:
-                return fit
-            fit = _to_the_end(fit)
-            continue
+            break
         if estimates_shading:
             units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
         problem = replace(problem, joint_noise=readings)
         steps = fit.solution.steps
-        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated, STEPS)
-    return _to_the_end(fit)
+        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated, NEARLY)
+        nearly = True
+    return _to_the_end(fit) if nearly else fit
 
 
 def _readings_step(
@@ -255,28 +254,28 @@ def _solved(
     edges: EdgeScatter,
     trust: Array,
     stated: Array,
-    most: int,
+    tolerance: float,
 ) -> BatchResult:
-    """The problem solved with these weights, from a state that ``steps`` (B,) have led to, as far
-    as so many more lead.
+    """The problem solved with these weights up to a tolerance, from a state that ``steps`` (B,)
+    have led to.
     """
     parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    found, info = _searched(used, state, steps, most)
+    found, info = _searched(used, state, steps, tolerance)
     return BatchResult(found, weight, scale, info, edges, trust, stated)
 
 
 def _to_the_end(fit: BatchResult) -> BatchResult:
-    """The same with the search gone on, where a round's few steps have left something to go."""
-    found, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, MOST_STEPS)
+    """The same with what a round's search has left to go."""
+    found, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
     return replace(fit, solution=found, info=info)
 
 
 def _searched(
-    problem: Problem, state: BatchState, steps: Integers, most: int
+    problem: Problem, state: BatchState, steps: Integers, tolerance: float
 ) -> tuple[Solution, Information]:
-    """The solution, ``steps`` (B,) and at most so many more away from the start."""
-    found = minimise(problem.as_noisy_as_at(state), state, most)
+    """The solution up to a tolerance, from a state that ``steps`` (B,) have led to."""
+    found = minimise(problem.as_noisy_as_at(state), state, tolerance=tolerance)
     found = replace(found, steps=steps + found.steps)
     return found, Information(problem, found.state, found.normal)
 
