@@ -58,9 +58,8 @@ from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.papers import Method as PaperMethod
 from pkmcal.papers.conditions import conditions
-from pkmcal.papers.methods import Method as PaperMethod
-from pkmcal.papers.methods import by_paper
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
@@ -263,6 +262,8 @@ def _estimated(
         turns = set_aside(drawing, turns, region)
     estimate = turns.estimate
     if method != "bundle":
+        from pkmcal.papers.methods import by_paper
+
         clock.told("Repeating the paper's method", 0.9)
         estimate = by_paper(method, drawing, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)

@@ -35,8 +35,8 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
+from pkmcal.observe.profiles import SHIFTS
 from pkmcal.observe.repeats import combined
-from pkmcal.papers.four_step import four_step
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -46,6 +46,9 @@ SETTLED = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
 far."""
+ASTRAY = float(SHIFTS[-1]) / 3
+"""The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
+over the profiles' reach, so that the median of hundreds of places is half of it."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
@@ -89,12 +92,12 @@ def take_turns(
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
         told("Identifying", share + 0.05)
-        start = _at_cameras(estimate.state, cameras)
-        if turn == 0:
+        start, moved = _at_cameras(estimate.state, cameras), max(look.moved for look in looks)
+        if turn == 0 and moved > ASTRAY:
             start = better_start(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
         lap("identify")
-        if max(look.moved for look in looks) < SETTLED and not cameras.active:
+        if moved < SETTLED and not cameras.active:
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
@@ -125,6 +128,8 @@ def better_start(machine: Machine, measurements: Measurements, known: State) -> 
     estimate has gone astray. Judged by the median misfit, which wrong edges do not move. Any
     machine: the steps refuse in words where the data do not allow them, and ``known`` remains.
     """
+    from pkmcal.papers.four_step import four_step
+
     try:
         steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
     except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations

@@ -6,6 +6,8 @@ pkmcal; 130 interrupted. No mistake of a user's ends in a traceback.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
 import os
 import re
@@ -43,6 +45,9 @@ DEFECT = 70
 INTERRUPTED = 130
 """What shells give a program that was ended by Ctrl-C."""
 DEBUG = "PKMCAL_DEBUG"
+UNCOLLECTED = 20_000
+"""Objects more than before at which Python looks for circles among them, instead of 700: a command
+makes 80,000 as it is loaded, which live until it ends."""
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 """The base of all complaints about options; typer gives it no public name."""
@@ -105,6 +110,9 @@ def _top(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # a process of its own: at its end no circle need be looked for
+        gc.set_threshold(UNCOLLECTED)
+        atexit.register(gc.freeze)
     # What OpenCV cannot read is told in sentences of our own.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     with withstanding():

@@ -474,8 +474,8 @@ def _text(value: Any, indent: str) -> str:
     return f"{opened}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{closed}"
 
 
-def _line(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+_line = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+_NUMBERS = {int, float, bool, type(None)}
 
 
 def _items(value: dict[str, Any] | list[Any]) -> list[Any]:
@@ -484,7 +484,7 @@ def _items(value: dict[str, Any] | list[Any]) -> list[Any]:
 
 def _is_row(value: Any) -> bool:
     """A row of a matrix or a table, which is easier to read on one line however long it is."""
-    return isinstance(value, list) and all(isinstance(v, int | float | None) for v in value)
+    return isinstance(value, list) and _NUMBERS.issuperset(map(type, value))
 
 
 def read_json(path: Path | str, label: str | None = None) -> Document:

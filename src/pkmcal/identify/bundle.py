@@ -34,16 +34,20 @@ from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver.search import Solution, Stop, minimise
+from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
 
 LEAST_SCALE = 1.0
 """The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
 What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
 smaller than errors are: scaling down by them would promise too much."""
+NEARLY = 1e-3
+"""Standard deviations, of all fitted values together, that a round's solution may have left to go,
+mostly after two steps: far less than the next round's weights and deviations change. Only where
+these have settled is it brought to its end."""
 ROUNDS = 30
-PACE = 1.6
+PACE, PACED = 1.6, 2
 """A round of weights, deviations and solution brings the deviations of shading and of the edges a
-part of the way only; from the third on they go by so much further."""
+part of the way only; from this one on, as they go on as they began, they go by so much further."""
 FURTHEST, MOST = 3.0, 0.99 * float(np.log(STEP))
 """The same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
 how far it goes: at most by how much further, and the logarithm of a step that was not cut short."""
@@ -133,7 +137,7 @@ def solve_batch(
         scale = found.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     trust, stated = np.ones_like(every.edges), problem.joint_noise
-    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated)
+    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated, STEP_TOLERANCE)
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -161,6 +165,7 @@ def _settle(
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
     asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
+    nearly = False
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, trust = fit.scale, fit.edges, fit.trust
@@ -168,18 +173,16 @@ def _settle(
             scale = Kinds(np.ones_like(scale.edges), _pose_scale(fit))
             if scale.poses.min() > hopeless:
                 return replace(fit, scale=scale)
-            edges = _edges(fit, by_tube, late=number >= FREE_ROUNDS)
+            edges = _edges(fit, by_tube, number)
+            problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
             asked, made = _readings_step(fit, by_data, asked, made)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
-        if number > 1:  # these go on as they began, slowly
-            edges = edges.beyond(fit.edges, PACE) if by_tube else edges
+        if number >= PACED:
             shading = np.maximum(
                 problem.data.shading * (shading / problem.data.shading) ** PACE, least
             )
-        if scale_noise:
-            problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
         if by_tube:
             rows = problem.unweighted(state).edges
             trust = edges.trust(problem.blocks, np.sum(rows**2, axis=-1))
@@ -200,8 +203,9 @@ def _settle(
             problem = problem.shaded(shading)
         problem = replace(problem, joint_noise=readings)
         steps = fit.solution.steps
-        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated)
-    return fit
+        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated, NEARLY)
+        nearly = True
+    return _to_the_end(fit) if nearly else fit
 
 
 def _readings_step(
@@ -250,24 +254,42 @@ def _solved(
     edges: EdgeScatter,
     trust: Array,
     stated: Array,
+    tolerance: float,
 ) -> BatchResult:
-    """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
+    """The problem solved with these weights up to a tolerance, from a state that ``steps`` (B,)
+    have led to.
+    """
     parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    found = minimise(used.as_noisy_as_at(state), state)
-    found = replace(found, steps=steps + found.steps)
-    info = Information(used, found.state, found.normal)
+    found, info = _searched(used, state, steps, tolerance)
     return BatchResult(found, weight, scale, info, edges, trust, stated)
 
 
-def _edges(fit: BatchResult, by_tube: bool, *, late: bool) -> EdgeScatter:
+def _to_the_end(fit: BatchResult) -> BatchResult:
+    """The same with what a round's search has left to go."""
+    found, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
+    return replace(fit, solution=found, info=info)
+
+
+def _searched(
+    problem: Problem, state: BatchState, steps: Integers, tolerance: float
+) -> tuple[Solution, Information]:
+    """The solution up to a tolerance, from a state that ``steps`` (B,) have led to."""
+    found = minimise(problem.as_noisy_as_at(state), state, tolerance=tolerance)
+    found = replace(found, steps=steps + found.steps)
+    return found, Information(problem, found.state, found.normal)
+
+
+def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
     """The edges' noise: of each tube where light moves edges; else their errors are normal, as
     stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
     what the likelihood would say too, but for the edges that it counts as stated; and tails would
-    take for their own what readings stated wrong do to some edges.
+    take for their own what readings stated wrong do to some edges. number : of the round.
     """
     if by_tube:
-        return edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
+        late = number >= FREE_ROUNDS
+        edges = edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
+        return edges.beyond(fit.edges, PACE) if number >= PACED else edges
     scale, found = fit.scale.edges[:, None] * fit.edges.scale, fit.components
     chi2, freedom = found.chi2[:, EDGES, None], found.freedom[:, EDGES, None]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))

@@ -32,6 +32,7 @@ from pkmcal.identify.scatter import (
 )
 from pkmcal.measurements import OWN_SHADING
 from pkmcal.solver.elimination import divisions
+from pkmcal.solver.strips import Eliminated, Strips, eliminated
 
 TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
@@ -74,29 +75,59 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
     """Squares expected of the edges' errors, in their stated noise, (B, K, G) each: along what a
     shift outward does, and across; and the square of that shift by a pixel.
     """
-    problem, rows = info.problem, info.problem.kinds.edges.rows
-    half = info.root
-    n_runs, n_rows = len(half), problem.n_rows
-    squares = []
-    for cut in divisions(info.state.T_base_platform.shape[1], n_rows * n_runs):
-        part = Information(problem.among(cut), problem.state_among(info.state, cut))
-        data, reduced = part.problem.data, part.reduced
-        v, value = data.by_shift, part.linear.value[..., rows, None]
+    problem, half = info.problem, info.root
+    n_runs, n_places = len(half), problem.blocks.present.shape[1]
+    squares: list[Array] = []
+    for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
+        part, state = problem.among(cut), problem.state_among(info.state, cut)
+        data, rows = part.data, part.compact(state)
+        layout, numbers = rows.strips
+        at = layout.configuration[:, None], layout.rows[:, ::PAIR] // PAIR
+        v = data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
-        unit = np.stack([unit, unit[..., ::-1] * [-1.0, 1.0]], axis=-2)
-        taken = reduced.q[..., rows, :], reduced.rows[..., rows, :] @ half[:, None]
-        square = np.zeros((*value.shape[:2], v.shape[2], PAIR))
-        for columns in (value, *taken):
-            pairs = columns.reshape(*columns.shape[:2], -1, PAIR, columns.shape[-1])
-            square += np.sum((unit @ pairs) ** 2, axis=-1)
-        size = shift_squares(part.problem.blocks, data)
+        turned = Strips(layout, _turned(numbers, unit[:, *at]))
+        taken = _taken_up(turned, eliminated(rows, np.zeros(n_runs)), half)
+        # a place more than there are takes in the strips' padding, -1
+        square = np.zeros((n_runs, len(part.blocks.present), n_places + 1, PAIR))
+        square[:, *at] = taken.reshape(*taken.shape[:2], -1, PAIR)
+        square = square[:, :, :-1]
+        size = shift_squares(part.blocks, data)
         weight = np.where(data.weight > 0, data.weight, 1.0)
         along = square[..., 0] * (data.scale**2 + data.own**2 * size) / weight
         rest = square[..., 1] * data.scale**2 / weight
         squares.append(np.stack([along, rest, np.broadcast_to(size, along.shape)]))
     along, rest, size = np.concatenate(squares, axis=2)
     return along, rest, size
+
+
+def _turned(numbers: Array, unit: Array) -> Array:
+    """Numbers (B, N, n, ...) of strips of edges with the two rows of each turned into those along
+    ``unit`` (B, N, n / 2, 2) and across.
+    """
+    first, second = numbers[:, :, ::PAIR], numbers[:, :, 1::PAIR]
+    x, y = np.moveaxis(unit[..., None], -2, 0)
+    out = np.empty_like(numbers)
+    out[:, :, ::PAIR] = x * first + y * second
+    out[:, :, 1::PAIR] = x * second - y * first
+    return out
+
+
+def _taken_up(strips: Strips, found: Eliminated, half: Array) -> Array:
+    """Squares (B, N, n) of strips' residuals with what the unknowns have taken up of them, where
+    ``half half^T`` is the covariance of the shared ones.
+    """
+    layout, numbers = strips
+    d, at = layout.n_own, layout.configuration
+    by_own = numbers[..., :d] @ found.inverse[:, at]
+    squares = numbers[..., -1] ** 2 + np.sum(by_own**2, axis=-1)
+    of_own = found.along @ half[:, None]
+    by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
+    for cut, columns in zip(layout.groups, layout.columns, strict=True):
+        taken = numbers[:, cut, :, d:-1] @ by_shared[:, None, columns]
+        taken -= by_own[:, cut] @ of_own[:, at[cut]]
+        squares[:, cut] += np.einsum("...i,...i->...", taken, taken)
+    return squares
 
 
 def _student(
@@ -117,20 +148,25 @@ def _student(
     from scipy.special import gammaln
 
     tails, norm = tried[..., None], worth(tried)
-    least = OWN_SHADING**2 / norm
+    least, count = OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
+    of_rest, square = weight * rest, size**2
+
+    def total(each: Array, times: Array) -> Array:
+        """Sums (V, B) over the edges of products (V, B, n) and (B, n)."""
+        return np.einsum("vbn,bn->vb", each, times)
 
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
         """One step of the two variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
         trust = (tails + PAIR) / (tails + along / s + rest / t)
-        left, of_s = trust * along - s, weight / s**2
-        of_t = np.sum(weight, axis=-1) / a**2 + STATED / a**2
+        of_s = weight / s**2
+        left = (trust * along - s) * of_s
         # the stated noise counts as some edges more
-        by_a = np.sum(left * of_s, axis=-1) + (STATED * (1 - a)) / a**2
-        by_a += np.sum(weight * (trust * rest - t), axis=-1) / a**2
-        by_b = np.sum(left * of_s * size, axis=-1)
-        aa, ab = np.sum(of_s, axis=-1) + of_t, np.sum(of_s * size, axis=-1)
-        bb = np.sum(of_s * size**2, axis=-1) + TINY
+        by_a = np.sum(left, axis=-1) + (total(trust, of_rest) - count * a) / a**2
+        by_a += STATED * (1 - a) / a**2
+        by_b = total(left, size)
+        aa, ab = np.sum(of_s, axis=-1) + (count + STATED) / a**2, total(of_s, size)
+        bb = total(of_s, square) + TINY
         det = aa * bb - ab**2
         det = np.where(det > TINY * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
@@ -152,7 +188,7 @@ def _student(
         weight * (np.log(s * t) + (tails + PAIR) * np.log1p(distance / tails)) / 2, axis=-1
     )
     constant = gammaln((tried + PAIR) / 2) - gammaln(tried / 2) - PAIR / 2 * np.log(tried)
-    cost = cost - constant * np.sum(weight, axis=-1)
+    cost = cost - constant * count
     best, run = np.argmin(cost, axis=0), np.arange(len(scale))
     factor = (norm * np.ones_like(a))[best, run]
     found = np.broadcast_to(tried, a.shape)[best, run]

@@ -55,35 +55,42 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
         values.append(rows.value)
         every += found.strips_normal + found.rows_normal
         kinds = _of_kinds(part, found, by_reading)
-        for k, (squares, along, square) in enumerate(kinds):
+        for k, (squares, along, square) in kinds.items():
             trace[:, k] += np.einsum("bcii->b", squares)
             normal[:, k] += square
-            for m, (others, beside, _) in enumerate(kinds):
+            for m in (m for m in kinds if m >= k):  # the others are their transposes
+                others, beside, _ = kinds[m]
                 own[:, k, m] += np.sum(squares * others, axis=(1, 2, 3))
                 cross[:, k, m] += flat(along).mT @ flat(beside)
         chi2 += _chi2(part, rows.value, by_reading)
+    for k, m in ((POSES, EDGES), (READINGS, EDGES), (READINGS, POSES)):
+        own[:, k, m], cross[:, k, m] = own[:, m, k], cross[:, m, k].mT
     return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
 
 
 def _of_kinds(
     problem: Problem, found: Eliminated, by_reading: Array
-) -> tuple[tuple[Array, Array, Array], ...]:
-    """Of each kind in some configurations Q_k^T Q_k (B, K, d, d), Q_k^T A_k (B, K, d, na) and the
-    sum of A_k^T A_k (B, na, na); by_reading (B, K, E).
+) -> dict[int, tuple[Array, Array, Array]]:
+    """Of each kind that there is in some configurations Q_k^T Q_k (B, K, d, d), Q_k^T A_k
+    (B, K, d, na) and the sum of A_k^T A_k (B, na, na); by_reading (B, K, E).
     """
     equations = problem.layout.n_equations
-    along = found.along_strips - found.own @ found.along
-    out = [(found.own, along, found.strips_normal)]
-    for part, rows in (
-        (found.q[:, :, equations:], found.rows[:, :, equations:]),
+    out = dict[int, tuple[Array, Array, Array]]()
+    if problem.kinds.edges.present.any():
+        along = found.along_strips - found.own @ found.along
+        out[EDGES] = found.own, along, found.strips_normal
+    for kind, part, rows in (
+        (POSES, found.q[:, :, equations:], found.rows[:, :, equations:]),
         (
+            READINGS,
             _readings(problem, found.q[:, :, :equations], by_reading),
             _readings(problem, found.rows[:, :, :equations], by_reading),
         ),
     ):
-        every = flat(rows)
-        out.append((part.mT @ part, part.mT @ rows, every.mT @ every))
-    return tuple(out)
+        if rows.size:
+            every = flat(rows)
+            out[kind] = part.mT @ part, part.mT @ rows, every.mT @ every
+    return out
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:

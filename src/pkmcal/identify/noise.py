@@ -110,7 +110,9 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     problem, sums, half = info.problem, info.by_kind, info.root
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
     count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
-    shared = half.mT[:, None] @ sums.normal @ half[:, None]
+    kinds = np.flatnonzero(count.any(axis=0))
+    shared = np.zeros((len(half), 3, *half.shape[1:]))
+    shared[:, kinds] = half.mT[:, None] @ sums.normal[:, kinds] @ half[:, None]
     trace = sums.trace + np.einsum("bkii->bk", shared)
     flat = shared.reshape(*shared.shape[:2], -1)
     cross = np.einsum("bklij,bij->bkl", sums.cross, half @ half.mT)

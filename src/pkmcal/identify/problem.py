@@ -140,7 +140,9 @@ class Problem:
         )
 
     def among(self, configurations: slice) -> Problem:
-        """The problem of some configurations only."""
+        """The problem of some configurations only; of all it is this itself, with what it knows."""
+        if configurations == slice(0, len(self.blocks.present)):
+            return self
         return replace(
             self,
             blocks=self.blocks.among(configurations),

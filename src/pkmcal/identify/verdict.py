@@ -89,8 +89,10 @@ def judge(
         hints = (*_not_by_heights(bed, findings), *hints)
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
-    least = WORTH_SAYING * _platform_sigma(estimate) if small else 0.0
-    matter = tuple(s for s in small if s.matters and s.moves_platform > least)
+    matter = tuple(s for s in small if s.matters)
+    if matter:
+        least = WORTH_SAYING * _platform_sigma(estimate)
+        matter = tuple(s for s in matter if s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate, held_out),
         *_poses_doubted(estimate, richer),
@@ -322,9 +324,10 @@ def _left_open(
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
     open_ = findings.unidentified + weak
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
+    if total <= LEFT_OPEN * findings.by_drawing:
+        return (), open_
     # where all else makes more of the deviation that was reached, that says enough
-    of_all_else = np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0))
-    if total <= max(LEFT_OPEN * findings.by_drawing, of_all_else):
+    if total <= np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
     least = min(LARGE * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)

@@ -12,3 +12,8 @@
 ``methods`` makes results of them, with standard deviations. What a paper has differently from what
 holds is named *printed*; :doc:`formulation` says why.
 """
+
+from typing import Literal
+
+Method = Literal["four-step", "linear", "inverse-kinematic"]
+"""Of them, those that ``methods`` has."""

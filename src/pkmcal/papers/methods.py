@@ -23,6 +23,7 @@ from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.papers import Method
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
 from pkmcal.papers.hand_eye import start_from_poses
@@ -30,7 +31,6 @@ from pkmcal.papers.inverse_kinematic import inverse_kinematic
 from pkmcal.papers.linear_together import base_together
 from pkmcal.solver.search import NONE
 
-Method = Literal["four-step", "linear", "inverse-kinematic"]
 Repeated = Literal["four-step", "inverse-kinematic"]
 REPETITIONS = 60
 """Repetitions for the standard deviations: they are then known to 9 %."""

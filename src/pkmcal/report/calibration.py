@@ -20,7 +20,6 @@ from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
-from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
@@ -35,7 +34,6 @@ from pkmcal.report import (
     provenance,
     residuals,
     scene,
-    validation,
     workspace,
 )
 from pkmcal.session.load import Session, digests, session_digest
@@ -48,7 +46,7 @@ if TYPE_CHECKING:
 
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
-    c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
+    c, held_out, over = calibration, _held_out(calibration), _tool_map(calibration)
     seen = digests(c.session)
     told = report_of(c, held_out, over, session_digest(c.session, seen))
     open_ = parameters.unidentified(c.estimate, c.findings)
@@ -65,6 +63,15 @@ def outcome_of(calibration: Calibration) -> Outcome:
             "timings": c.timings,
         },
     )
+
+
+def _held_out(calibration: Calibration) -> HoldOut | None:
+    """What the estimate predicts of what was held out, where that was asked for."""
+    if calibration.holdout is None:  # as a rule, and what judges others' data takes a while to load
+        return None
+    from pkmcal.judge.holdouts import holdout_of
+
+    return holdout_of(calibration)
 
 
 def _tool_map(calibration: Calibration) -> ToolMap | str:
@@ -102,6 +109,11 @@ def report_of(
     c, session, observation = calibration, calibration.session, calibration.observation
     estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
     shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
+    held = None
+    if holdout:
+        from pkmcal.report.validation import held_out
+
+        held = held_out(holdout, session)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
     links = album.links
@@ -115,7 +127,7 @@ def report_of(
         parameters.together(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
-        validation.held_out(holdout, session) if holdout else None,
+        held,
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),

@@ -186,8 +186,16 @@ class Solution:
     normal: Array
 
 
-def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
-    """Least squares from ``start``, all runs at once; each stops on its own."""
+def minimise(
+    problem: LeastSquares,
+    start: Any,
+    max_steps: int = 100,
+    tolerance: float = STEP_TOLERANCE,
+) -> Solution:
+    """Least squares from ``start``, all runs at once; each stops on its own.
+
+    tolerance : in the place of STEP_TOLERANCE, where less will do.
+    """
     values: list[Values] | None = None
     if _is_divisible(problem):
         rows = problem.extent
@@ -197,12 +205,12 @@ def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solutio
     n_runs = _count(start)
     cuts = divisions(n_runs, prod(rows))
     if len(cuts) < 2:
-        return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps)
+        return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps, tolerance)
     found: list[Solution] = []
     for cut in cuts:
         runs = np.arange(cut.start, cut.stop)
         part = _Divided.of(problem.select(runs), len(runs), *rows)
-        found.append(_minimised(part, take(start, runs), None, max_steps))
+        found.append(_minimised(part, take(start, runs), None, max_steps, tolerance))
     return Solution(
         _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
         np.concatenate([one.cost for one in found]),
@@ -262,7 +270,11 @@ class _Divided(NamedTuple):
 
 
 def _minimised(
-    problem: _Divided, start: Any, values: list[Values] | None, max_steps: int
+    problem: _Divided,
+    start: Any,
+    values: list[Values] | None,
+    max_steps: int,
+    tolerance: float,
 ) -> Solution:
     """The same of few runs; values : the residuals at the start, where they are known."""
     n_runs = _count(start)
@@ -273,7 +285,7 @@ def _minimised(
     part, here, at = problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, at, take(search, active))
+        new, gain = _try(part, here, at, take(search, active), tolerance)
         steps[active] += 1
         here, at = _kept(here, new, gain)
         state = here if active.size == n_runs else put(state, active, here)
@@ -351,7 +363,11 @@ class _Gain(NamedTuple):
 
 
 def _try(
-    problem: _Divided, state: Any, values: list[Values] | None, search: _Search
+    problem: _Divided,
+    state: Any,
+    values: list[Values] | None,
+    search: _Search,
+    tolerance: float,
 ) -> tuple[Any, _Gain]:
     """One damped step of every run; returns the states after it and what came of it.
 
@@ -369,14 +385,14 @@ def _try(
     )
     descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
-    size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
-    small = size < STEP_TOLERANCE * tolerance
+    size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
+    small = size < tolerance * unit
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    small |= accepted & (search.left(size) < STEP_TOLERANCE * tolerance)
+    small |= accepted & (search.left(size) < tolerance * unit)
     # a step that is refused for its rounding is better taken: all that is known of it is good
-    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2) & (damping < STRONG)
+    little = ~accepted & (descent - size2 < (REFUSED * unit) ** 2) & (damping < STRONG)
     small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
