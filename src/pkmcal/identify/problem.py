@@ -552,22 +552,25 @@ class Problem:
             pose_generators(state.T_base_platform),
             mount_generators(state.T_mount, self.pose_blocks.on_platform),
         )
-        poses = np.concatenate([state.T_camera_base, state.T_base_platform, state.T_mount], axis=1)
         less_frames = np.concatenate(by_frames, axis=1) @ y[:, None, :, None]
-        poses = perturb(poses, np.concatenate(steps, axis=1) - less_frames[..., 0])
-        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts
+        steps = (np.concatenate(steps, axis=1) - less_frames[..., 0], y.reshape(-1, 2, 6))
+        still = np.broadcast_to(np.eye(4), (len(z), 2, 4, 4))  # the frames' own poses, E and F
+        poses = (state.T_camera_base, state.T_base_platform, state.T_mount, still)
+        poses = perturb(np.concatenate(poses, axis=1), np.concatenate(steps, axis=1))
+        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts - 2
         inner = BatchState(
             state.z + z - by_moves[..., 0] @ self.to_free.T,
             poses[:, :first_pose],
             poses[:, first_pose:first_mount],
             state.optics + shared[:, u.optics].reshape(state.optics.shape),
-            poses[:, first_mount:],
+            poses[:, first_mount:-2],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
             state.breathing + shared[:, u.breathing],
             state.sizes + shared[:, u.sizes],
         )
-        return self._closed(state, self._in_frames(inner, y, slides), shared, own)
+        inner = self._in_frames(inner, poses[:, -2:], slides)
+        return self._closed(state, inner, shared, own)
 
     @cached_property
     def _moves_of(self) -> Array:
@@ -577,17 +580,16 @@ class Problem:
         by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
         return self.frames @ np.linalg.pinv(by_moves @ self.frames)
 
-    def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
-        """The state after exact frame changes y (B, 12) and others (B, n)."""
-        layout = self.layout
-        e, f = perturb(np.eye(4), y.reshape(-1, 2, 6)).swapaxes(0, 1)
+    def _in_frames(self, state: BatchState, frames: Array, slides: Array) -> BatchState:
+        """The state after exact changes of both frames, E and F (B, 2, 4, 4), and others (B, n)."""
+        layout, (e, f), back = self.layout, frames.swapaxes(0, 1), inverse(frames)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.drawing)
         return replace(
             state,
             z=(theta - self.drawing) @ self.to_free.T,
-            T_camera_base=state.T_camera_base @ inverse(e)[:, None],
-            T_base_platform=e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
+            T_camera_base=state.T_camera_base @ back[:, :1],
+            T_base_platform=e[:, None] @ state.T_base_platform @ back[:, 1:],
             T_mount=moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
             internal=state.internal - turned_back(layout, slides)[:, None],
         )

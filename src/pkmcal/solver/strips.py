@@ -324,6 +324,6 @@ def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquation
 
 def cost_of(value: Array, shared_value: Array, usable: Booleans) -> Array:
     """Sum of squares over usable rows; NaN there means that a leg was lost: infinite."""
-    total = np.sum(np.where(usable, value, 0.0) ** 2, axis=(1, 2))
-    total = total + np.sum(shared_value**2, axis=1)
+    used = np.where(usable, value, 0.0).reshape(len(value), -1)
+    total = np.sum(used * used, axis=1) + np.sum(shared_value * shared_value, axis=1)
     return np.where(np.isfinite(total), total, np.inf)
