@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -173,9 +174,8 @@ class Problem:
         state's own throughout, the cost would have a slope that no row tells, the noise's own,
         and near the end, with thousands of configurations, no step would keep what it promises.
         """
-        layout = self.layout
-        if not layout.shares_motors and np.all(layout.row_is_rod | (layout.row_motor < 0)):
-            return self  # readings of lengths: the noise is the same everywhere
+        if self.layout.reads_lengths:
+            return self
         return replace(self, slopes=self.closure(state).by_reading)
 
     def shaded(self, sigma: Array) -> Problem:
@@ -256,42 +256,39 @@ class Problem:
         )
 
     def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
-        """The strips' numbers (B, N, n, d + w + 1), n = m 2g edges' rows in each view, from their
-        values (2g, B, m, N): by own unknowns, by the columns of :attr:`_strip_parameters`, and the
-        residuals. Zero where they are lost.
+        """The strips' numbers (B, d + w + 1, N, n) from the values (B, N, n) of the views' n rows:
+        by own unknowns, by the columns of :attr:`_strip_parameters`, and the residuals. Zero where
+        they are lost.
         """
         data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
         tube, line = self._own_columns
-        (n_rows, n_runs, m, n), c = value.shape, ends_by.shape[-1]
         breathes = int(u.n_breathing > 0)  # a view's own station alone
-        ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], breathes, 1]
-        of_ends, _, of_optics, of_line, of_breathing, residual = (
-            slice(stop - width, stop)
-            for width, stop in zip(ends, np.cumsum(ends).tolist(), strict=True)
+        widths = (ends_by.shape[-1], len(tube), u.n_optics, len(line), breathes, 1)
+        numbers = np.empty((len(value), sum(widths), *value.shape[1:]))
+        of_ends, of_radius, of_optics, of_line, of_breathing, _ = (
+            numbers[:, stop - width : stop]
+            for width, stop in zip(widths, accumulate(widths), strict=True)
         )
-        out = np.empty((n_runs, n, m, n_rows, sum(ends)))
-        rows = out.reshape(n_runs, n, m * n_rows, sum(ends))
-        by_ends = edges.by_ends().reshape(n_runs, n, m * n_rows, 6)
-        np.matmul(by_ends, ends_by, out=rows[..., of_ends])
-        by_radius = _views_first(edges.by_radius())
-        for k in range(tube.shape[-1]):
-            np.multiply(by_radius, tube[..., k], out=out[..., c + k])
-        out[..., of_optics] = np.moveaxis(_views_first(data.by_optics), 0, -1)
+        by_ends = edges.by_ends().transpose(1, 2, 0, 3)
+        np.matmul(ends_by.mT, by_ends, out=of_ends.swapaxes(1, 2))
+        np.multiply(edges.by_radius()[:, None], tube, out=of_radius)
+        of_optics[...] = data.by_optics.swapaxes(0, 1)
         if u.n_lines:
-            out[..., of_line] = _views_first(data.by_line)[..., None] * line
-        if u.n_breathing:
-            out[..., of_breathing] = np.moveaxis(_views_first(data.by_breathing), 0, -1)
-        out[..., residual] = _views_first(value)[..., None]
+            np.multiply(data.by_line[:, None], line, out=of_line)
+        of_breathing[...] = data.by_breathing.swapaxes(0, 1)
+        numbers[:, -1] = value
         lost = ~np.isfinite(value)
         if lost.any():
-            out[_views_first(lost)] = 0.0
+            np.copyto(numbers, 0.0, where=lost[:, None])
         if self._turn is None:
-            return rows
-        d = self.layout.own_motion.shape[1]
-        turned = np.empty((*rows.shape[:3], d + self._turn.columns.shape[1] + 1))
-        turned[..., :d], turned[..., -1] = rows[..., :d], rows[..., -1]
+            return numbers
+        d, n_turned = self.layout.own_motion.shape[1], self._turn.columns.shape[1]
+        turned = np.empty((len(value), d + n_turned + 1, *value.shape[1:]))
+        turned[:, :d], turned[:, -1] = numbers[:, :d], numbers[:, -1]
         for cut, turn in zip(self._strips.groups, self._turn.by, strict=True):
-            np.matmul(rows[:, cut, :, d:-1], turn, out=turned[:, cut, :, d:-1])
+            columns = numbers[:, d:-1, cut]
+            rows = turn.T @ columns.reshape(*columns.shape[:2], -1)
+            turned[:, d:-1, cut] = rows.reshape(len(rows), n_turned, *columns.shape[2:])
         return turned
 
     def _of_rest(self, closures: Array, boards: Array) -> Array:
@@ -323,8 +320,8 @@ class Problem:
         """The views as strips."""
         views, columns = self.blocks.views, self._strip_parameters
         n_rows = 2 * self.blocks.side.shape[-1]
-        place = n_rows * (views.place.T % max(self.blocks.present.shape[1], 1))
-        rows = np.where(views.present.T[..., None], place[..., None] + np.arange(n_rows), -1)
+        place = n_rows * (views.place % max(self.blocks.present.shape[1], 1))
+        rows = np.where(views.present[..., None], place[..., None] + np.arange(n_rows), -1)
         return StripLayout(
             n_shared=self.unknowns.count,
             n_own=self.layout.own_motion.shape[1],
@@ -344,13 +341,13 @@ class Problem:
         first = np.array([cut.start for cut in views.groups], dtype=int)
         leg, station, camera = views.leg[first], views.station[first], views.camera[first]
         none = self._width - 1
-        radii = np.full((len(first), self._own_columns[0].shape[-1]), none)
+        radii = np.full((len(first), len(self._own_columns[0])), none)
         for k, one in enumerate(leg):
             radii[k, : len(layout.radius[one])] = self._column[layout.radius[one]]
-        lines = np.full((len(first), self._own_columns[1].shape[-1]), none)
+        lines = np.full((len(first), len(self._own_columns[1])), none)
         for own, found in zip(lines, self._lines, strict=True):
             own[: len(found)] = u.shading.start + found
-        parts = [self._column[layout.a_index[leg]], self._column[layout.b_index[leg]]]
+        parts = [self._column[layout.b_index[leg]], self._column[layout.a_index[leg]]]
         parts += [_columns(u.stations, station, 6), radii, _columns(u.optics, camera, u.n_optics)]
         parts.append(lines)
         if u.n_breathing:
@@ -364,23 +361,22 @@ class Problem:
         if not self.unknowns.n_lines:
             return [np.zeros(0, dtype=int) for _ in views.groups]
         line = np.where(views.present, views.taken(self.blocks.line), -1)
-        return [np.unique(line[:, cut][line[:, cut] >= 0]) for cut in views.groups]
+        return [np.unique(line[cut][line[cut] >= 0]) for cut in views.groups]
 
     @cached_property
     def _own_columns(self) -> tuple[Array, Array]:
-        """Which of its leg's radii and of its group's lines each block depends on: ones in
-        (N, m, 1, radii) and (N, m, 1, lines).
+        """Which of its leg's radii and of its group's lines each row depends on: ones in
+        (radii, N, n) and (lines, N, n).
         """
-        blocks, views = self.blocks, self.blocks.views
-        used = views.taken(blocks.tube).T[..., None, None] == np.arange(
-            max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
-        )
-        number = np.zeros((*views.place.shape, max((len(own) for own in self._lines), default=0)))
+        blocks, views, n_rows = self.blocks, self.blocks.views, 2 * self.blocks.side.shape[-1]
+        radii = max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
+        used = views.taken(blocks.tube) == np.arange(radii)[:, None, None]
+        number = np.zeros((max((len(own) for own in self._lines), default=0), *views.place.shape))
         for cut, own in zip(views.groups, self._lines, strict=True):
             if own.size:
-                line = views.taken(blocks.line)[:, cut]
-                number[:, cut, : len(own)] = line[..., None] == own
-        return used.astype(float), number.swapaxes(0, 1)[:, :, None]
+                line = views.taken(blocks.line)[cut]
+                number[: len(own), cut] = line == own[:, None, None]
+        return np.repeat(used.astype(float), n_rows, -1), np.repeat(number, n_rows, -1)
 
     @cached_property
     def _turn(self) -> _Turn | None:
@@ -634,7 +630,3 @@ def _in_rows(parts: Array) -> Array:
     """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
     return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
 
-
-def _views_first(numbers: Array) -> Array:
-    """Numbers (..., 2g, B, m, N) of edges by view, (..., B, N, m, 2g)."""
-    return np.moveaxis(numbers, (-1, -4), (-3, -1))
