@@ -278,9 +278,10 @@ class ViewData:
             by_line = by_line * np.repeat(np.where(line < 0, 0.0, own), each, axis=-1)
         if breathe:
             by_breathing = rows(views.taken(data.breathing, 1))
-        basis, side = views.taken(data.basis, 1), np.moveaxis(views.taken(blocks.side), -1, 0)
+        of_normals = split.swapaxes(-3, -2) @ views.taken(data.basis, 1).mT  # (..., m, g, 2g, 3)
+        side = np.moveaxis(views.taken(blocks.side), -1, 0)
         return cls(
-            by_row(np.einsum("...krej,...keij->e...ikr", split, basis, order="C")),
+            by_row(np.moveaxis(of_normals, (-3, -1), (0, -3))),
             by_optics,
             by_breathing,
             by_line,
