@@ -245,8 +245,8 @@ class Problem:
 
     def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
         """The strips' numbers (B, d + w + 1, N, n) from the values (B, N, n) of the views' n rows:
-        by own unknowns, by the columns of its ``strip_parameters``, and the residuals. Zero where they are
-        lost.
+        by own unknowns, by the structure's ``strip_parameters``, and the residuals. Zero where they
+        are lost.
         """
         data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
         tube, line = self.structure.own_columns
@@ -304,8 +304,8 @@ class Problem:
         return len(self.blocks.present), self.n_rows
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """The closures' derivatives (B, K, E, n) by what the structure's ``closure_index`` says, and
-        by the own unknowns; zero where they are lost.
+        """The closures' derivatives (B, K, E, n) by the structure's ``closure_index``, and by the
+        own unknowns; zero where they are lost.
         """
         by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta
         out = self._by_noise(c, by_theta)

@@ -57,7 +57,8 @@ class StripLayout:
             column[cut, d:-1] = d + columns
         column[:, :d], column[:, -1] = np.arange(d), d + na + 1
         row = d * self.configuration[:, None] + np.arange(d)
-        return (row[:, None] * (d + na + 2) + column[..., None]).ravel()
+        target = row[:, None] * (d + na + 2) + column[..., None]
+        return target.astype(np.int32).ravel()  # the largest array that a search keeps
 
     @cached_property
     def shared_target(self) -> Integers:
