@@ -276,8 +276,10 @@ def _minimised(
         new, gain = _try(part, here, at, search)
         steps[active] += 1
         here, at = _kept(here, new, gain)
-        state = here if active.size == n_runs else put(state, active, here)
-        normal = gain.normal if normal is None else put(normal, active, gain.normal)
+        if active.size == n_runs:
+            state, normal = here, gain.normal
+        else:
+            state, normal = put(state, active, here), put(cast(Array, normal), active, gain.normal)
         cost[active], search = gain.cost, gain.search
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason

@@ -287,9 +287,9 @@ class NormalEquations(NamedTuple):
         """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
         scaled, scale = unit_diagonal(self.matrix)
         # at least a few rounding units, so that an unidentified direction gives no step
-        ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
+        np.einsum("...ii->...i", scaled)[...] += np.maximum(damping, 1e-15)[:, None]
         right = (self.gradient / scale)[..., None]
-        shared = -np.linalg.solve(scaled + ridge, right)[..., 0] / scale
+        shared = -np.linalg.solve(scaled, right)[..., 0] / scale
         return shared, [part.own(shared) for part in self.parts]
 
     def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
