@@ -493,7 +493,11 @@ class Problem:
         wanted = wanted + (by_own(layout, c.rows) @ own[..., None])[..., 0]
         for _ in range(CLOSINGS):
             c = self.closure(trial)
-            back = np.linalg.pinv(by_own(layout, c.rows)) @ (wanted - c.rows.value)[..., None]
+            off, by_pose = (wanted - c.rows.value)[..., None], by_own(layout, c.rows)
+            try:
+                back = np.linalg.solve(by_pose, off)
+            except np.linalg.LinAlgError:  # a singular pose among them
+                back = np.linalg.pinv(by_pose) @ off
             step = back[..., 0] @ layout.own_motion.T
             trial = replace(
                 trial,
