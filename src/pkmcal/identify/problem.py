@@ -284,12 +284,13 @@ class Problem:
         the closures (B, K, E, n) and the boards (B, K, 6 G, na).
         """
         count, (*batch, equations, _) = self.unknowns.count, closures.shape
-        out = np.zeros((*batch, equations + boards.shape[2], self.structure.width))
-        each = np.arange(equations)[:, None]
-        out[:, :, each, self.structure.column[self.structure.closure_index]] = closures
+        out = np.zeros((*batch, equations + boards.shape[2], count + 1))
         if self.structure.choice is None:
-            by_parameters = out[:, :, :equations, count:-1]
-            out[:, :, :equations, self.unknowns.machine] = by_parameters @ self.free
+            by_free = closures.swapaxes(1, 2) @ self.structure.closure_turn
+            out[:, :, :equations, self.unknowns.machine] = by_free.swapaxes(1, 2)
+        else:
+            each = np.arange(equations)[:, None]
+            out[:, :, each, self.structure.column[self.structure.closure_index]] = closures
         out[:, :, equations:, :count] = boards
         return out[..., :count]
 

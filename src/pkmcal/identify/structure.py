@@ -185,6 +185,11 @@ class Structure:
             return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
         return self.layout.closure_index
 
+    @cached_property
+    def closure_turn(self) -> Array:
+        """(E, n, nz) from the closures' derivatives by those to the ones by the free unknowns."""
+        return np.pad(self.free, ((0, 1), (0, 0)))[self.closure_index]
+
 
 def numbered(part: slice, number: Integers, width: int) -> Integers:
     """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
