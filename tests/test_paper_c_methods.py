@@ -20,7 +20,13 @@ from pkmcal.papers.inverse_kinematic import (
     turn_between,
 )
 from pkmcal.papers.measured_platform import seen_platform, taken
-from pkmcal.papers.rotation_axis import axis_frames, facing, rotation_axis
+from pkmcal.papers.rotation_axis import (
+    MOST_PAIRS,
+    _pairs,
+    axis_frames,
+    facing,
+    rotation_axis,
+)
 from pkmcal.studies.paper_c import H4ByBoard, at_poses, start
 from pkmcal.studies.paper_c_machine import Deviations, model
 from pkmcal.studies.simulated import measurements
@@ -290,6 +296,15 @@ def boards(turns, rng, sigma=5e-4):
     seen = perturb(exact, np.repeat([sigma, 2e-4], 3) * rng.normal(size=(n, 6)))
     none = np.zeros(n, dtype=int)
     return PoseSet(none, np.arange(n), none, seen, np.broadcast_to(whiten, (n, 6, 6)))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 40, 700])
+def test_pairs_of_many_poses_are_an_even_choice_of_all(n):
+    i, j = np.triu_indices(n, 1)
+    if len(i) > MOST_PAIRS:
+        pick = np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)
+        i, j = i[pick], j[pick]
+    np.testing.assert_array_equal(_pairs(n), (i, j))
 
 
 def test_one_axis_is_found_and_tested():

@@ -52,6 +52,26 @@ def test_noise_and_estimate_are_the_same(runs, in_pieces):
     np.testing.assert_allclose(found.noise_scale, whole.noise_scale, rtol=1e-6)
 
 
+@pytest.mark.parametrize("runs", [1, 3])
+def test_residuals_by_themselves_are_the_same(runs, in_pieces):
+    problem, truth, _ = problem_of(runs)
+    whole = problem.unweighted(truth)
+    in_pieces(problem)
+    for found, expected in zip(problem.unweighted(truth), whole, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_what_weights_do_not_change_is_kept():
+    problem, truth, _ = problem_of()
+    weighted = problem.weighted(problem.kinds._replace(
+        edges=0.5 * problem.data.weight, poses=problem.pose_data.weight))  # fmt: skip
+    assert weighted.structure is problem.structure
+    part = problem.among(slice(0, 2))
+    assert part.structure is weighted.among(slice(0, 2)).structure is not problem.structure
+    wide, _ = problem.opened(truth)
+    assert wide.structure is not problem.structure
+
+
 def test_the_rows_of_pieces_say_the_same(in_pieces):
     problem, truth, machine = problem_of()
     names = ("machine", "stations")
@@ -72,13 +92,15 @@ def test_the_rows_of_pieces_say_the_same(in_pieces):
     np.testing.assert_allclose(again, spectrum, atol=1e-8 * spectrum[0])
 
 
-def test_condensed_rows_say_the_same():
+@pytest.mark.parametrize("n", [50, 5 * elimination.TALL + 7])
+def test_condensed_rows_say_the_same(n):
     rng = np.random.default_rng(0)
-    rows, value = rng.normal(size=(2, 50, 4)), rng.normal(size=(2, 50))
+    rows, value = rng.normal(size=(2, n, 4)), rng.normal(size=(2, n))
     few, rest = condensed(rows, value)
     assert few.shape == (2, 5, 4)
-    np.testing.assert_allclose(few.mT @ few, rows.mT @ rows, atol=1e-12)
-    np.testing.assert_allclose(few.mT @ rest[..., None], rows.mT @ value[..., None], atol=1e-12)
+    atol = 1e-14 * n
+    np.testing.assert_allclose(few.mT @ few, rows.mT @ rows, atol=atol)
+    np.testing.assert_allclose(few.mT @ rest[..., None], rows.mT @ value[..., None], atol=atol)
     np.testing.assert_allclose(np.sum(rest**2, axis=1), np.sum(value**2, axis=1))
 
 

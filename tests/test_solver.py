@@ -102,11 +102,11 @@ def in_strips(rng, sharp, runs=2, k=11, own=3, na=9):
     rows[k - 1, 1:] = -1
     groups, columns = [slice(0, k), slice(k, 2 * k - 1)], np.array([[0, 2, 4], [3, 2, na]])
     layout = StripLayout(na, own, k, configuration, rows, groups, columns)
-    numbers = rng.normal(size=(runs, 2 * k - 1, 4, own + 3 + 1))
-    numbers[:, rows < 0] = 0
+    numbers = rng.normal(size=(runs, own + 3 + 1, 2 * k - 1, 4))
+    numbers[:, :, rows < 0] = 0
     value = rng.normal(size=(runs, k, 13))
     value[:, :, :8] = 0
-    value[:, configuration[:, None], rows] = numbers[..., -1]
+    value[:, configuration[:, None], rows] = numbers[:, -1]
     rest, by_own = rng.normal(size=(runs, k, 5, na)), rng.normal(size=(runs, k, 5, own))
     prior = rng.normal(size=(runs, 4)), rng.normal(size=(4, na))
     usable = np.ones(value.shape, dtype=bool)

@@ -14,6 +14,10 @@ import numpy as np
 
 from pkmcal.arrays import Array
 
+_CROSSED = -np.array([[[0, 0, 0], [0, 0, 1], [0, -1, 0]],
+                      [[0, 0, -1], [0, 0, 0], [1, 0, 0]],
+                      [[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], dtype=float).reshape(3, 9)  # fmt: skip
+"""Cross-product matrices of the axes: one product makes that of any vector."""
 LEAST_ANGLE = 1e-150
 """rad; below it a turn is none."""
 
@@ -21,10 +25,7 @@ LEAST_ANGLE = 1e-150
 def skew(v: Array) -> Array:
     """Cross-product matrices: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v)
-    out = np.zeros((*v.shape, 3), dtype=v.dtype)
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
+    return (v @ _CROSSED).reshape(*v.shape, 3)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -33,7 +34,7 @@ def cross(a: Array, b: Array) -> Array:
     In memory it lies as its factors do: of arrays with the components slowest, NumPy makes one
     with the components slowest, and runs along many vectors at once.
     """
-    shape = np.broadcast_shapes(a.shape, b.shape)
+    shape = a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape)
     like = a if a.shape == shape else b
     out = np.empty_like(like, dtype=np.result_type(a, b), shape=shape)
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
@@ -141,7 +142,8 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
 
 def pose(rot: Array, t: Array) -> Array:
     """4x4 poses from rotations (..., 3, 3) and translations (..., 3)."""
-    shape = np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
+    alike = rot.shape[:-2] == t.shape[:-1]
+    shape = t.shape[:-1] if alike else np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
     out = np.zeros((*shape, 4, 4))
     out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rot, t, 1.0
     return out

@@ -36,9 +36,10 @@ class Places:
 
     def filled(self, values: Numbers) -> Numbers:
         """Values (N, ...) at their places, (K', G, ...); zero where there is none."""
-        out = np.zeros((*self.shape, *values.shape[1:]), dtype=values.dtype)
-        out[self.row, self.place] = values
-        return cast(Numbers, out)
+        count, each = self.shape
+        out = np.zeros((count * each, *values.shape[1:]), dtype=values.dtype)
+        out[self.row * each + self.place] = values
+        return cast(Numbers, out.reshape(*self.shape, *values.shape[1:]))
 
     def taken(self, values: Array) -> Array:
         """Of values (K', G, ...) those at the measurements' places, (N, ...)."""
@@ -279,10 +280,11 @@ def _edges(
         optics=at.filled(optics)[None],
         joints=measurements.joints[None, seen],
         weight=at.present[None].astype(float),
-        breathing=at.filled(-BREATHING_SIGMA * edges.by_focal[..., None])[None],
-        own=at.filled(own)[None],
     )
-    return blocks, data
+    if len(measurements.breathing_at):
+        breathing = at.filled(-BREATHING_SIGMA * edges.by_focal[..., None])[None]
+        data = replace(data, breathing=breathing)
+    return blocks, replace(data, own=at.filled(own)[None]) if len(line) else data
 
 
 def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData]:

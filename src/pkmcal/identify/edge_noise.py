@@ -102,14 +102,14 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
 
 
 def _turned(numbers: Array, unit: Array) -> Array:
-    """Numbers (B, N, n, ...) of strips of edges with the two rows of each turned into those along
+    """Numbers (B, ..., N, n) of strips of edges with the two rows of each turned into those along
     ``unit`` (B, N, n / 2, 2) and across.
     """
-    first, second = numbers[:, :, ::PAIR], numbers[:, :, 1::PAIR]
-    x, y = np.moveaxis(unit[..., None], -2, 0)
+    first, second = numbers[..., ::PAIR], numbers[..., 1::PAIR]
+    x, y = np.moveaxis(unit, -1, 0)[:, :, None]
     out = np.empty_like(numbers)
-    out[:, :, ::PAIR] = x * first + y * second
-    out[:, :, 1::PAIR] = x * second - y * first
+    out[..., ::PAIR] = x * first + y * second
+    out[..., 1::PAIR] = x * second - y * first
     return out
 
 
@@ -117,16 +117,16 @@ def _taken_up(strips: Strips, found: Eliminated, half: Array) -> Array:
     """Squares (B, N, n) of strips' residuals with what the unknowns have taken up of them, where
     ``half half^T`` is the covariance of the shared ones.
     """
-    layout, numbers = strips
+    layout, numbers = strips.layout, strips.numbers.swapaxes(1, 2)
     d, at = layout.n_own, layout.configuration
-    by_own = numbers[..., :d] @ found.inverse[:, at]
-    squares = numbers[..., -1] ** 2 + np.sum(by_own**2, axis=-1)
-    of_own = found.along @ half[:, None]
+    by_own = found.inverse.mT[:, at] @ numbers[:, :, :d]
+    squares = numbers[:, :, -1] ** 2 + np.sum(by_own**2, axis=-2)
+    of_own = (found.along @ half[:, None]).mT
     by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
     for cut, columns in zip(layout.groups, layout.columns, strict=True):
-        taken = numbers[:, cut, :, d:-1] @ by_shared[:, None, columns]
-        taken -= by_own[:, cut] @ of_own[:, at[cut]]
-        squares[:, cut] += np.einsum("...i,...i->...", taken, taken)
+        taken = by_shared[:, None, columns].mT @ numbers[:, cut, d:-1]
+        taken -= of_own[:, at[cut]] @ by_own[:, cut]
+        squares[:, cut] += np.einsum("...ir,...ir->...r", taken, taken)
     return squares
 
 

@@ -155,6 +155,8 @@ def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -
 
 def mount_generators(T_mount: Array, on_platform: Booleans) -> Array:
     """How boards (..., M, 4, 4) fixed to a body move with a frame change, (..., M, 6, 12)."""
+    if not on_platform.size:
+        return np.zeros((*T_mount.shape[:-2], 6, 12))
     own = np.zeros((*T_mount.shape[:-2], 6, 6))
     own[..., :, :] = np.eye(6)
     own[..., 3:, :3] = -skew(T_mount[..., :3, 3])
@@ -375,6 +377,8 @@ def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> Stat
 
 def moved_mounts(T_mount: Array, on_platform: Booleans, e: Array, f: Array) -> Array:
     """Boards' poses (..., M, 4, 4) in their bodies' new frames."""
+    if not on_platform.size:
+        return T_mount
     frames = np.stack([e, f], axis=-3)
     return frames[..., on_platform.astype(int), :, :] @ T_mount
 

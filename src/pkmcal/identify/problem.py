@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from itertools import accumulate
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -42,12 +43,13 @@ from pkmcal.identify.rows import (
     placed,
     pose_rows,
 )
+from pkmcal.identify.structure import Structure, numbered
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, by_own, closure, dense, on_tangents
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.solver.elimination import Linear
+from pkmcal.solver.elimination import Linear, divisions
 from pkmcal.solver.search import Values, of_runs
-from pkmcal.solver.strips import Compact, StripLayout, Strips
+from pkmcal.solver.strips import Compact, Strips
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -64,29 +66,6 @@ class _Evaluated(NamedTuple):
     poses: PoseRows
 
 
-class _Turn(NamedTuple):
-    """From a strip's columns, which are parameters, to the unknowns' where these differ.
-
-    by : (groups, w, w') of the strips with the same columns. columns : (groups, w') which of the
-    shared unknowns they are.
-    """
-
-    by: Array
-    columns: Integers
-
-    @classmethod
-    def of(cls, parameters: Integers, turn: Array) -> _Turn:
-        """Of strips with these columns (groups, w); turn (width, na) from all columns."""
-        used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
-        most = max((len(own) for own in used), default=0)
-        columns = np.full((len(used), most), turn.shape[1])
-        by = np.zeros((*parameters.shape, most))
-        for k, own in enumerate(used):
-            columns[k, : len(own)] = own
-            by[k, :, : len(own)] = turn[parameters[k]][:, own]
-        return cls(by, columns)
-
-
 @dataclass(frozen=True)
 class Problem:
     """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
@@ -96,7 +75,8 @@ class Problem:
     prior : (c, na) rows on the shared unknowns and prior_target : (c,).
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
     pose_blocks, pose_data : of boards. slopes : (B, K, E) closures by their readings, which tell
-    their noise, where they are held; None where they are the state's own.
+    their noise, where they are held; None where they are the state's own. kept : the
+    :attr:`structure`, which problems of the same measurements share.
     """
 
     layout: LimbLayout
@@ -112,6 +92,18 @@ class Problem:
     pose_blocks: PoseBlocks
     pose_data: PoseData
     slopes: Array | None = None
+    kept: Structure | None = None
+
+    def __post_init__(self) -> None:
+        """The structure of a problem of the same measurements stays."""
+        parts = self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames
+        if self.kept is None or not self.kept.made_of(*parts):
+            object.__setattr__(self, "kept", Structure(*parts))
+
+    @property
+    def structure(self) -> Structure:
+        """Where everything stands."""
+        return cast(Structure, self.kept)
 
     @cached_property
     def kinds(self) -> Kinds[Kind]:
@@ -143,9 +135,11 @@ class Problem:
         """The problem of some configurations only; of all it is this itself, with what it knows."""
         if configurations == slice(0, len(self.blocks.present)):
             return self
+        structure = self.structure.among(configurations)
         return replace(
             self,
-            blocks=self.blocks.among(configurations),
+            blocks=structure.blocks,
+            kept=structure,
             data=self.data.among(configurations),
             pose_blocks=self.pose_blocks.among(configurations),
             pose_data=self.pose_data.among(configurations),
@@ -175,9 +169,8 @@ class Problem:
         state's own throughout, the cost would have a slope that no row tells, the noise's own,
         and near the end, with thousands of configurations, no step would keep what it promises.
         """
-        layout = self.layout
-        if not layout.shares_motors and np.all(layout.row_is_rod | (layout.row_motor < 0)):
-            return self  # readings of lengths: the noise is the same everywhere
+        if self.layout.reads_lengths:
+            return self
         return replace(self, slopes=self.closure(state).by_reading)
 
     def shaded(self, sigma: Array) -> Problem:
@@ -190,7 +183,7 @@ class Problem:
         For derivatives by parameters that were held; z is then ``theta - drawing``.
         """
         n, machine = self.drawing.size, self.unknowns.machine
-        prior = [self.prior[:, machine] @ self.to_free, self.prior[:, machine.stop :]]
+        prior = [self.prior[:, machine] @ self.structure.to_free, self.prior[:, machine.stop :]]
         problem = replace(
             self,
             free=np.eye(n),
@@ -202,11 +195,6 @@ class Problem:
     def theta(self, state: BatchState) -> Array:
         """Machine parameters (B, P)."""
         return self.drawing + state.z @ self.free.T
-
-    @cached_property
-    def to_free(self) -> Array:
-        """(nz, P), from changes of the parameters to those of z."""
-        return np.linalg.pinv(self.free)
 
     def closure(self, state: BatchState) -> Closure:
         """The closure of all runs and configurations, (B, K, E)."""
@@ -252,48 +240,45 @@ class Problem:
             usable,
             found.shared_value,
             self.prior,
-            Strips(self._strips, self._of_edges(found.edges, found.of_edges)),
+            Strips(self.structure.strips, self._of_edges(found.edges, found.of_edges)),
             self._of_rest(by_closures, by_boards),
             by_own,
         )
 
     def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
-        """The strips' numbers (B, N, n, d + w + 1), n = m 2g edges' rows in each view, from their
-        values (2g, B, m, N): by own unknowns, by the columns of :attr:`_strip_parameters`, and the
-        residuals. Zero where they are lost.
+        """The strips' numbers (B, d + w + 1, N, n) from the values (B, N, n) of the views' n rows:
+        by own unknowns, by the structure's ``strip_parameters``, and the residuals. Zero where they
+        are lost.
         """
         data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
-        tube, line = self._own_columns
-        (n_rows, n_runs, m, n), c = value.shape, ends_by.shape[-1]
+        tube, line = self.structure.own_columns
         breathes = int(u.n_breathing > 0)  # a view's own station alone
-        ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], breathes, 1]
-        of_ends, _, of_optics, of_line, of_breathing, residual = (
-            slice(stop - width, stop)
-            for width, stop in zip(ends, np.cumsum(ends).tolist(), strict=True)
+        widths = (ends_by.shape[-1], len(tube), u.n_optics, len(line), breathes, 1)
+        numbers = np.empty((len(value), sum(widths), *value.shape[1:]))
+        of_ends, of_radius, of_optics, of_line, of_breathing, _ = (
+            numbers[:, stop - width : stop]
+            for width, stop in zip(widths, accumulate(widths), strict=True)
         )
-        out = np.empty((n_runs, n, m, n_rows, sum(ends)))
-        rows = out.reshape(n_runs, n, m * n_rows, sum(ends))
-        by_ends = edges.by_ends().reshape(n_runs, n, m * n_rows, 6)
-        np.matmul(by_ends, ends_by, out=rows[..., of_ends])
-        by_radius = _views_first(edges.by_radius())
-        for k in range(tube.shape[-1]):
-            np.multiply(by_radius, tube[..., k], out=out[..., c + k])
-        out[..., of_optics] = np.moveaxis(_views_first(data.by_optics), 0, -1)
+        by_ends = edges.by_ends().transpose(1, 2, 0, 3)
+        np.matmul(ends_by.mT, by_ends, out=of_ends.swapaxes(1, 2))
+        np.multiply(edges.by_radius()[:, None], tube, out=of_radius)
+        of_optics[...] = data.by_optics.swapaxes(0, 1)
         if u.n_lines:
-            out[..., of_line] = _views_first(data.by_line)[..., None] * line
-        if u.n_breathing:
-            out[..., of_breathing] = np.moveaxis(_views_first(data.by_breathing), 0, -1)
-        out[..., residual] = _views_first(value)[..., None]
+            np.multiply(data.by_line[:, None], line, out=of_line)
+        of_breathing[...] = data.by_breathing.swapaxes(0, 1)
+        numbers[:, -1] = value
         lost = ~np.isfinite(value)
         if lost.any():
-            out[_views_first(lost)] = 0.0
-        if self._turn is None:
-            return rows
-        d = self.layout.own_motion.shape[1]
-        turned = np.empty((*rows.shape[:3], d + self._turn.columns.shape[1] + 1))
-        turned[..., :d], turned[..., -1] = rows[..., :d], rows[..., -1]
-        for cut, turn in zip(self._strips.groups, self._turn.by, strict=True):
-            np.matmul(rows[:, cut, :, d:-1], turn, out=turned[:, cut, :, d:-1])
+            np.copyto(numbers, 0.0, where=lost[:, None])
+        if self.structure.turn is None:
+            return numbers
+        d, n_turned = self.layout.own_motion.shape[1], self.structure.turn.columns.shape[1]
+        turned = np.empty((len(value), d + n_turned + 1, *value.shape[1:]))
+        turned[:, :d], turned[:, -1] = numbers[:, :d], numbers[:, -1]
+        for cut, turn in zip(self.structure.strips.groups, self.structure.turn.by, strict=True):
+            columns = numbers[:, d:-1, cut]
+            rows = turn.T @ columns.reshape(*columns.shape[:2], -1)
+            turned[:, d:-1, cut] = rows.reshape(len(rows), n_turned, *columns.shape[2:])
         return turned
 
     def _of_rest(self, closures: Array, boards: Array) -> Array:
@@ -301,12 +286,13 @@ class Problem:
         the closures (B, K, E, n) and the boards (B, K, 6 G, na).
         """
         count, (*batch, equations, _) = self.unknowns.count, closures.shape
-        out = np.zeros((*batch, equations + boards.shape[2], self._width))
-        each = np.arange(equations)[:, None]
-        out[:, :, each, self._column[self._closure_index]] = closures
-        if self._choice is None:
-            by_parameters = out[:, :, :equations, count:-1]
-            out[:, :, :equations, self.unknowns.machine] = by_parameters @ self.free
+        out = np.zeros((*batch, equations + boards.shape[2], count + 1))
+        if self.structure.choice is None:
+            by_free = closures.swapaxes(1, 2) @ self.structure.closure_turn
+            out[:, :, :equations, self.unknowns.machine] = by_free.swapaxes(1, 2)
+        else:
+            each = np.arange(equations)[:, None]
+            out[:, :, each, self.structure.column[self.structure.closure_index]] = closures
         out[:, :, equations:, :count] = boards
         return out[..., :count]
 
@@ -320,90 +306,8 @@ class Problem:
         """Configurations K and rows of each, r."""
         return len(self.blocks.present), self.n_rows
 
-    @cached_property
-    def _strips(self) -> StripLayout:
-        """The views as strips."""
-        views, columns = self.blocks.views, self._strip_parameters
-        n_rows = 2 * self.blocks.side.shape[-1]
-        place = n_rows * (views.place.T % max(self.blocks.present.shape[1], 1))
-        rows = np.where(views.present.T[..., None], place[..., None] + np.arange(n_rows), -1)
-        return StripLayout(
-            n_shared=self.unknowns.count,
-            n_own=self.layout.own_motion.shape[1],
-            count=len(self.blocks.present),
-            configuration=views.configuration,
-            rows=rows.reshape(len(rows), rows.shape[1] * n_rows),
-            groups=views.groups,
-            columns=columns if self._turn is None else self._turn.columns,
-        )
-
-    @cached_property
-    def _strip_parameters(self) -> Integers:
-        """Of each group of views the columns (groups, w) that its edges' derivatives are by: the
-        parameters of both ends, the station, the radii, its camera's, its lines' and its breathing.
-        """
-        u, layout, views = self.unknowns, self.layout, self.blocks.views
-        first = np.array([cut.start for cut in views.groups], dtype=int)
-        leg, station, camera = views.leg[first], views.station[first], views.camera[first]
-        none = self._width - 1
-        radii = np.full((len(first), self._own_columns[0].shape[-1]), none)
-        for k, one in enumerate(leg):
-            radii[k, : len(layout.radius[one])] = self._column[layout.radius[one]]
-        lines = np.full((len(first), self._own_columns[1].shape[-1]), none)
-        for own, found in zip(lines, self._lines, strict=True):
-            own[: len(found)] = u.shading.start + found
-        parts = [self._column[layout.a_index[leg]], self._column[layout.b_index[leg]]]
-        parts += [_columns(u.stations, station, 6), radii, _columns(u.optics, camera, u.n_optics)]
-        parts.append(lines)
-        if u.n_breathing:
-            parts.append(_columns(u.breathing, station, 1))
-        return np.concatenate(parts, axis=1)
-
-    @cached_property
-    def _lines(self) -> list[Integers]:
-        """The lines that each group of views sees."""
-        views = self.blocks.views
-        if not self.unknowns.n_lines:
-            return [np.zeros(0, dtype=int) for _ in views.groups]
-        line = np.where(views.present, views.taken(self.blocks.line), -1)
-        return [np.unique(line[:, cut][line[:, cut] >= 0]) for cut in views.groups]
-
-    @cached_property
-    def _own_columns(self) -> tuple[Array, Array]:
-        """Which of its leg's radii and of its group's lines each block depends on: ones in
-        (N, m, 1, radii) and (N, m, 1, lines).
-        """
-        blocks, views = self.blocks, self.blocks.views
-        used = views.taken(blocks.tube).T[..., None, None] == np.arange(
-            max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
-        )
-        number = np.zeros((*views.place.shape, max((len(own) for own in self._lines), default=0)))
-        for cut, own in zip(views.groups, self._lines, strict=True):
-            if own.size:
-                line = views.taken(blocks.line)[:, cut]
-                number[:, cut, : len(own)] = line[..., None] == own
-        return used.astype(float), number.swapaxes(0, 1)[:, :, None]
-
-    @cached_property
-    def _turn(self) -> _Turn | None:
-        """How strips' columns become unknowns, where parameters are tied or are axes."""
-        if self._choice is not None:
-            return None
-        turn = np.eye(self._width, self.unknowns.count)
-        turn[self.unknowns.count : -1, self.unknowns.machine] = self.free
-        return _Turn.of(self._strip_parameters, turn)
-
-    @cached_property
-    def _closure_index(self) -> Integers:
-        """Parameters (E, n) that the closures' derivatives are by; rods on one motor share their
-        noise, so each has those of all.
-        """
-        if self.layout.shares_motors:
-            return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
-        return self.layout.closure_index
-
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """The closures' derivatives (B, K, E, n) by what :attr:`_closure_index` says, and by the
+        """The closures' derivatives (B, K, E, n) by the structure's ``closure_index``, and by the
         own unknowns; zero where they are lost.
         """
         by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta
@@ -420,15 +324,15 @@ class Problem:
             none = (*poses.value.shape[:2], 0)
             return np.zeros((*none, u.count)), np.zeros((*none, self.layout.own_motion.shape[1]))
         parts = [
-            (_columns(u.stations, boards.station, 6), poses.by_station),
-            (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
-            (_columns(u.mounts, boards.mount, 6), poses.by_mount),
+            (numbered(u.stations, boards.station, 6), poses.by_station),
+            (numbered(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (numbered(u.mounts, boards.mount, 6), poses.by_mount),
         ]
         if u.n_breathing:
-            parts.append((_columns(u.breathing, boards.station, 1), poses.by_breathing))
+            parts.append((numbered(u.breathing, boards.station, 1), poses.by_breathing))
         if u.n_sizes:  # an exact size's rows are zero, whatever column they are written to
             number = np.maximum(boards.size[boards.mount], 0)
-            parts.append((_columns(u.sizes, number, 1), poses.by_size))
+            parts.append((numbered(u.sizes, number, 1), poses.by_size))
         out = np.zeros((*poses.value.shape, u.count))
         for columns, values in parts:
             np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
@@ -438,26 +342,15 @@ class Problem:
         out[~np.isfinite(poses.value + out.sum(axis=-1))] = 0.0
         return _in_rows(out), _in_rows(own)
 
-    @cached_property
-    def _width(self) -> int:
-        """Columns of an edge's row while it is written: the shared unknowns', where parameters are
-        tied or are axes one for each parameter besides, and one for what is no unknown.
-        """
-        return self.unknowns.count + 1 + (0 if self._choice is not None else self.drawing.size)
-
-    @cached_property
-    def _column(self) -> Integers:
-        """Where each parameter's derivatives are written, (P + 1,); the last is no parameter's."""
-        if self._choice is None:
-            return self.unknowns.count + np.arange(self.drawing.size + 1)
-        out = np.full(self.drawing.size + 1, self.unknowns.count)
-        out[self._choice] = np.arange(len(self._choice))
-        return out
-
     def unweighted(self, state: BatchState) -> Kinds[Array]:
         """Residuals of each kind, (B, K, G, n), in the deviations that each measurement has by
         itself: without weights, and without what edges that are shaded alike count for together.
         """
+        count, n_rows = self.extent
+        cuts = divisions(count, len(state.z) * n_rows)
+        if len(cuts) > 1:
+            parts = (self.among(cut).unweighted(self.state_among(state, cut)) for cut in cuts)
+            return Kinds(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
@@ -525,12 +418,6 @@ class Problem:
         parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)
 
-    @cached_property
-    def _choice(self) -> Integers | None:
-        """The parameter of each free unknown where each moves one parameter alone."""
-        alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
-        return np.argmax(self.free, axis=0) if alone else None
-
     def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
         """The state after a step (B, na) and (B, K, d), taken along what bends.
 
@@ -540,7 +427,7 @@ class Problem:
         """
         u, layout = self.unknowns, self.layout
         z = shared[:, u.machine]
-        moves = z @ self._moves_of.T
+        moves = z @ self.structure.moves_of.T
         y, slides = moves[:, :12], moves[:, 12:]
         by_moves = move_generators(layout, self.theta(state), self.drawing) @ moves[..., None]
         motion = own @ layout.own_motion.T
@@ -554,42 +441,36 @@ class Problem:
             pose_generators(state.T_base_platform),
             mount_generators(state.T_mount, self.pose_blocks.on_platform),
         )
-        poses = np.concatenate([state.T_camera_base, state.T_base_platform, state.T_mount], axis=1)
         less_frames = np.concatenate(by_frames, axis=1) @ y[:, None, :, None]
-        poses = perturb(poses, np.concatenate(steps, axis=1) - less_frames[..., 0])
-        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts
+        steps = (np.concatenate(steps, axis=1) - less_frames[..., 0], y.reshape(-1, 2, 6))
+        still = np.broadcast_to(np.eye(4), (len(z), 2, 4, 4))  # the frames' own poses, E and F
+        poses = (state.T_camera_base, state.T_base_platform, state.T_mount, still)
+        poses = perturb(np.concatenate(poses, axis=1), np.concatenate(steps, axis=1))
+        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts - 2
         inner = BatchState(
-            state.z + z - by_moves[..., 0] @ self.to_free.T,
+            state.z + z - by_moves[..., 0] @ self.structure.to_free.T,
             poses[:, :first_pose],
             poses[:, first_pose:first_mount],
             state.optics + shared[:, u.optics].reshape(state.optics.shape),
-            poses[:, first_mount:],
+            poses[:, first_mount:-2],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
             state.breathing + shared[:, u.breathing],
             state.sizes + shared[:, u.sizes],
         )
-        return self._closed(state, self._in_frames(inner, y, slides), shared, own)
+        inner = self._in_frames(inner, poses[:, -2:], slides)
+        return self._closed(state, inner, shared, own)
 
-    @cached_property
-    def _moves_of(self) -> Array:
-        """Frame changes and others (12 + n, nz) that a step of z makes, as far as they can, by
-        least squares at the drawing: what they leave to be added up is small in any case.
-        """
-        by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
-        return self.frames @ np.linalg.pinv(by_moves @ self.frames)
-
-    def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
-        """The state after exact frame changes y (B, 12) and others (B, n)."""
-        layout = self.layout
-        e, f = perturb(np.eye(4), y.reshape(-1, 2, 6)).swapaxes(0, 1)
+    def _in_frames(self, state: BatchState, frames: Array, slides: Array) -> BatchState:
+        """The state after exact changes of both frames, E and F (B, 2, 4, 4), and others (B, n)."""
+        layout, (e, f), back = self.layout, frames.swapaxes(0, 1), inverse(frames)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.drawing)
         return replace(
             state,
-            z=(theta - self.drawing) @ self.to_free.T,
-            T_camera_base=state.T_camera_base @ inverse(e)[:, None],
-            T_base_platform=e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
+            z=(theta - self.drawing) @ self.structure.to_free.T,
+            T_camera_base=state.T_camera_base @ back[:, :1],
+            T_base_platform=e[:, None] @ state.T_base_platform @ back[:, 1:],
             T_mount=moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
             internal=state.internal - turned_back(layout, slides)[:, None],
         )
@@ -615,7 +496,11 @@ class Problem:
         wanted = wanted + (by_own(layout, c.rows) @ own[..., None])[..., 0]
         for _ in range(CLOSINGS):
             c = self.closure(trial)
-            back = np.linalg.pinv(by_own(layout, c.rows)) @ (wanted - c.rows.value)[..., None]
+            off, by_pose = (wanted - c.rows.value)[..., None], by_own(layout, c.rows)
+            try:
+                back = np.linalg.solve(by_pose, off)
+            except np.linalg.LinAlgError:  # a singular pose among them
+                back = np.linalg.pinv(by_pose) @ off
             step = back[..., 0] @ layout.own_motion.T
             trial = replace(
                 trial,
@@ -625,16 +510,6 @@ class Problem:
         return trial
 
 
-def _columns(part: slice, number: Integers, width: int) -> Integers:
-    """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
-    return part.start + width * number[..., None] + np.arange(width)
-
-
 def _in_rows(parts: Array) -> Array:
     """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
     return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
-
-
-def _views_first(numbers: Array) -> Array:
-    """Numbers (..., 2g, B, m, N) of edges by view, (..., B, N, m, 2g)."""
-    return np.moveaxis(numbers, (-1, -4), (-3, -1))

@@ -28,9 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.batches import NEXT
 from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
-from pkmcal.geometry.rigid import dot, inverse, pose_difference, skew
+from pkmcal.geometry.rigid import dot, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import Closure
@@ -129,13 +128,20 @@ class EdgeBlocks:
         view = np.cumsum(begins) - 1
         slot = np.arange(len(order)) - first[view]
         leg, station, configuration = keys[:, first]
-        place = (configuration * self.present.shape[1] + number[order[first]])[None]
-        place = np.repeat(place, int(slot.max(initial=-1)) + 1, axis=0)
-        place[slot, view] = (keys[2] * self.present.shape[1]) + number[order]
+        place = configuration * self.present.shape[1] + number[order[first]]
+        place = np.repeat(place[:, None], int(slot.max(initial=-1)) + 1, axis=1)
+        place[view, slot] = (keys[2] * self.present.shape[1]) + number[order]
         present = np.zeros(place.shape, dtype=bool)
-        present[slot, view] = True
-        camera = self.camera.ravel()[place[0]] if place.size else station
+        present[view, slot] = True
+        camera = self.camera.ravel()[place[:, 0]] if place.size else station
         return EdgeViews(configuration, leg, station, camera, place, present)
+
+    @cached_property
+    def number(self) -> Integers:
+        """(K, G) which each is of the views' blocks, (N m); any for padding."""
+        views, out = self.views, np.zeros(self.present.size, dtype=int)
+        out[views.place[views.present]] = np.flatnonzero(views.present)
+        return out.reshape(self.present.shape)
 
 
 @dataclass(frozen=True)
@@ -143,8 +149,8 @@ class EdgeViews:
     """What is seen of one leg in one photograph, N times: up to m blocks, whose edges are those of
     one line. Views of one leg from one station stand side by side.
 
-    configuration, leg, station, camera : (N,). place : (m, N) where each block is among those of
-    all configurations, (K G). present : (m, N) False for padding, which has another block's place.
+    configuration, leg, station, camera : (N,). place : (N, m) where each block is among those of
+    all configurations, (K G). present : (N, m) False for padding, which has another block's place.
     """
 
     configuration: Integers
@@ -155,10 +161,14 @@ class EdgeViews:
     present: Booleans
 
     def taken(self, numbers: NDArray[Scalar], axis: int = 0) -> NDArray[Scalar]:
-        """Numbers of the blocks (..., K, G, ...) by view, (..., m, N, ...); axis : that of K."""
+        """Numbers of the blocks (..., K, G, ...) by view, (..., N, m, ...); axis : that of K."""
         shape = numbers.shape
         flat = numbers.reshape(*shape[:axis], shape[axis] * shape[axis + 1], *shape[axis + 2 :])
         return flat.take(self.place, axis=axis)
+
+    def limbs(self, n_legs: int) -> Integers:
+        """Which each one's limb is, of those of all configurations, (K L)."""
+        return self.configuration * n_legs + self.leg
 
     @cached_property
     def groups(self) -> list[slice]:
@@ -225,15 +235,16 @@ class EdgeData:
 
 @dataclass(frozen=True)
 class ViewData:
-    """The edges' numbers by view, whitened and weighted, with the blocks (B or 1, m, N) last: NumPy
-    then runs along rows of many views, and a number costs a nanosecond an operation.
+    """The edges' numbers by view, whitened and weighted: of each view (B or 1, N) its n rows, which
+    are 2g of each of its m blocks. With the rows last NumPy runs along those of all views, and a
+    number costs a nanosecond an operation.
 
-    of_normals : (g, 3, 2g, ...) rows by changes of the normals, camera frame. by_optics : (w, 2g,
-    ...) by the unknowns of their camera. by_breathing : (1, 2g, ...) by their station's focal
-    breathing, none where nothing breathes. by_line : (2g, ...) by their line's shading, which moves
+    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_optics : (w, ...,
+    n) by the unknowns of their camera. by_breathing : (1, ..., n) by their station's focal
+    breathing, none where nothing breathes. by_line : (..., n) by their line's shading, which moves
     them as the camera's shift moves all; edges that are their station's only one of a line have
-    theirs among their noise. counts : (...) blocks that are there and have a weight. sign : (g, 1,
-    m, N) of the edges' sides.
+    theirs among their noise. counts : (..., n) whether the block is there and has a weight. sign :
+    (g, N, n) of the edges' sides.
     """
 
     of_normals: Array
@@ -249,46 +260,51 @@ class ViewData:
         views = blocks.views
         counts = (views.taken(data.weight, 1) > 0) & views.present
         white = np.where(counts[..., None, None], views.taken(data.weighed, 1), 0.0)
-        split = white.reshape(*white.shape[:-1], white.shape[-1] // 2, 2)
+        each = white.shape[-1]
+        split = white.reshape(*white.shape[:-1], each // 2, 2)
+
+        def by_row(numbers: Array) -> Array:
+            """Numbers (..., m, 2g) of blocks."""
+            return numbers.reshape(*numbers.shape[:-2], numbers.shape[-2] * each)
 
         def rows(by_unknowns: Array) -> Array:
-            return np.einsum("...rq,...qw->wr...", white, by_unknowns, order="C")
+            return by_row(np.einsum("...krq,...kqw->w...kr", white, by_unknowns, order="C"))
 
         by_optics = rows(views.taken(data.optics, 1))
         by_line, by_breathing = by_optics[0], by_optics[:0]
         if blocks.line.size:
             line, sigma = views.taken(blocks.line), data.shading
             own = sigma[:, line] if sigma.shape[1] > 1 else sigma[..., None]
-            by_line = by_line * np.where(line < 0, 0.0, own)
+            by_line = by_line * np.repeat(np.where(line < 0, 0.0, own), each, axis=-1)
         if breathe:
             by_breathing = rows(views.taken(data.breathing, 1))
+        of_normals = split.swapaxes(-3, -2) @ views.taken(data.basis, 1).mT  # (..., m, g, 2g, 3)
+        side = np.moveaxis(views.taken(blocks.side), -1, 0)
         return cls(
-            np.einsum("...rej,...eij->eir...", split, views.taken(data.basis, 1), order="C"),
+            by_row(np.moveaxis(of_normals, (-3, -1), (0, -3))),
             by_optics,
             by_breathing,
             by_line,
-            counts,
-            SIDE_SIGNS[np.moveaxis(views.taken(blocks.side), -1, 0)[:, None]],
+            np.repeat(counts, each, axis=-1),
+            np.repeat(SIDE_SIGNS[side], each, axis=-1),
         )
 
 
 @dataclass(frozen=True)
 class EdgeRows:
     """The edges' rows at a state, and how they answer to the two ends of their line; the ends
-    answer to all else. Arrays have the views (B, N) last, or the blocks (B, m, N).
+    answer to all else. Arrays have the views (B, N), or their rows (B, N, n), last.
 
-    rot_camera_base : (3, 3, ...) of the views' stations. ends : (2, 3, ...) base frame. lines : the
-    same from the camera's centre. frame : (3, 3, ...) their u, m and w. sine (...) and cosine
-    (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a leg passes through the
-    camera.
-    by_frame : (3, g, 2g, ...) rows by changes of the normals along u, m and w.
+    T_camera_base : (B, S, 4, 4). lines : camera frame. frame : (B, N, 3, 3) their u, m and w.
+    sine (...) and cosine (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a
+    leg passes through the camera. by_frame : (g, 3, ...) rows by changes of the normals along u, m
+    and w.
     """
 
     blocks: EdgeBlocks
     data: ViewData
     closure: Closure
-    rot_camera_base: Array
-    ends: Array
+    T_camera_base: Array
     lines: SeenLines
     frame: Array
     sine: Array
@@ -296,93 +312,111 @@ class EdgeRows:
     by_frame: Array
 
     def value(self, state: BatchState) -> Array:
-        """Rows (2g, B, m, N), zero where they do not count, with the state's cameras, lines and
-        focal lengths.
+        """Rows (B, N, n), zero where they do not count, with the state's cameras, lines and focal
+        lengths.
         """
         data, views = self.data, self.blocks.views
-        _, along_m, along_w = self.by_frame
-        rows = np.sum(self.cosine[:, None] * along_m - self.sine * along_w, axis=0)
+        (_, along_m, along_w), *others = self.by_frame
+        rows = self.cosine[0] * along_m - self.sine * along_w
+        for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
+            rows += cosine * along_m - self.sine * along_w
         for by_unknown, unknown in zip(
             data.by_optics, state.optics.transpose(2, 0, 1), strict=True
         ):
-            rows += by_unknown * unknown[:, None, views.camera]
+            rows += by_unknown * unknown[:, views.camera, None]
         if state.shading.shape[-1]:
-            rows += data.by_line * state.shading[:, views.taken(self.blocks.line)]
+            shift = state.shading[:, views.taken(self.blocks.line)]
+            rows += data.by_line * self._of_blocks(shift)
         if state.breathing.shape[-1]:
-            rows += data.by_breathing[0] * state.breathing[:, None, views.station]
+            rows += data.by_breathing[0] * state.breathing[:, views.station, None]
         return np.where(data.counts, rows, 0.0)
 
+    def _of_blocks(self, numbers: Array) -> Array:
+        """Numbers of blocks (..., m) for each of their rows, (..., n)."""
+        return np.repeat(numbers, 2 * len(self.cosine), axis=-1)
+
+    def _of_views(self, numbers: Array) -> Array:
+        """Numbers of views (...) for each of their rows, (..., n)."""
+        n_rows = self.sine.shape[-1]
+        return np.repeat(numbers, n_rows, axis=-1).reshape(*numbers.shape, n_rows)
+
     @cached_property
-    def _pulls(self) -> tuple[Array, Array, Array]:
-        """Rows by n.a, by n.b and by the radius, (g, 2g, ...) each: all derivatives are multiples
-        of these, see :meth:`~pkmcal.geometry.cylinders.SeenLines.edges`.
+    def _turns(self) -> Array:
+        """Rows by a shift of the whole line towards the camera, (g, ...): as much as by the radius;
+        see :meth:`~pkmcal.geometry.cylinders.SeenLines.edges`.
         """
-        (along_u, along_m, along_w), line = self.by_frame, self.lines
-        turn = along_w + (self.sine / self.cosine)[:, None] * along_m
-        shift = along_u / line.length[:, None]
-        turn = turn / line.distance[:, None]
-        before, behind = (
-            x[:, None] for x in (line.before / line.length, line.behind / line.length)
-        )
-        return shift - behind * turn, before * turn - shift, -turn
+        along_m, along_w = self.by_frame[:, 1], self.by_frame[:, 2]
+        turn = along_w + (self.sine / self.cosine) * along_m
+        return turn / self._of_views(self.lines.distance)
 
     def by_ends(self) -> Array:
-        """By both ends in the base frame, a before b, (B, N, m, 2g, 6)."""
-        _, m, w = self.frame
-        normals = self.cosine[:, None] * m[:, :, None] - self.sine * w[:, :, None]
-        n_rows, n_runs, n_blocks, n_views = self.by_frame.shape[2:]
-        out = np.empty((n_runs, n_views, n_blocks, n_rows, 6))
-        for k, pulls in enumerate(self._pulls[:2]):
-            by_end = out.transpose(4, 3, 0, 2, 1)[3 * k : 3 * k + 3]
-            np.multiply(pulls[0], normals[0, :, None], out=by_end)
-            for pull, normal in zip(pulls[1:], normals[1:], strict=True):
-                by_end += pull * normal[:, None]
+        """By what both ends do along m and along w, a before b, (4, B, N, n): nothing that they do
+        along u is seen, and all derivatives are multiples of these.
+        """
+        line, out = self.lines, np.empty((4, *self.sine.shape))
+        shift = self.by_frame[:, 0] / self._of_views(line.length)
+        by_b = self._of_views(line.before / line.length) * self._turns - shift
+        by_a = -self._turns - by_b
+        for k, pulls in ((0, by_a), (2, by_b)):
+            np.multiply(pulls[0], self.cosine[0], out=out[k])
+            np.multiply(pulls[0], -self.sine, out=out[k + 1])
+            for pull, cosine in zip(pulls[1:], self.cosine[1:], strict=True):
+                out[k] += pull * cosine
+                out[k + 1] -= pull * self.sine
         return out
 
     def by_radius(self) -> Array:
-        """By their tube's radius, (2g, ...)."""
-        return np.sum(self._pulls[2], axis=0)
+        """By their tube's radius, (B, N, n)."""
+        return -np.sum(self._turns, axis=0)
 
     def ends_by(self, freedoms: slice) -> Array:
-        """How both ends, a before b, answer in the base frame, (B, N, 6, d + n_a + n_b + 6): to the
-        configuration's own unknowns, to the parameters of either end, and to their station, whose
-        (omega, tau) acts as if it moved the ends p by ``R^T (omega x R p + tau)``.
+        """How both ends, a before b, answer along m and along w, (B, N, 4, d + n_b + n_a + 6): to
+        the configuration's own unknowns, to the parameters of b and of a, and to their station,
+        whose (omega, tau) moves them by ``omega x (p - t) + tau``, with t the base's origin, camera
+        frame.
         """
-        c, views = self.closure, self.blocks.views
-        own, by_internal = c.b_by_pose[..., freedoms], c.platform.by_internal
-        if by_internal.shape[-1]:
-            own = np.concatenate([own, by_internal], axis=-1)
-        parts = (own, c.a_by, c.b_by)
-        shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
-        widths = [part.shape[-1] for part in parts]
-        legs = np.zeros((*shape, 6, sum(widths) + 6))
-        first, second = widths[0], widths[0] + widths[1]
-        legs[..., 3:, :first] = own
-        legs[..., :3, first:second] = c.a_by
-        legs[..., 3:, second:-6] = c.b_by
-        n_runs, count, n_legs = shape
-        flat = legs.reshape(n_runs, count * n_legs, *legs.shape[-2:])
-        out = flat.take(views.configuration * n_legs + views.leg, axis=1)
-        axes = self.rot_camera_base  # (camera's axis, base's component, ...)
-        for k, end in enumerate(self.ends):
-            rows = slice(3 * k, 3 * k + 3)
-            out[..., rows, -3:] = axes.transpose(2, 3, 1, 0)
-            for c, (i, j) in enumerate(NEXT):
-                turned = axes[:, i] * end[j] - axes[:, j] * end[i]
-                out[..., 3 * k + c, -6:-3] = turned.transpose(1, 2, 0)
+        c, views, line = self.closure, self.blocks.views, self.lines
+        rot, origin = self.T_camera_base[..., :3, :3], self.T_camera_base[..., :3, 3]
+        turns = np.concatenate([rot, skew(origin)], axis=-1).take(views.station, axis=1)
+        turned = self.frame[..., 1:, :] @ turns
+        across, swung = turned[..., :3], turned[..., 3:]
+        by_internal = c.platform.by_internal
+        parts = (c.b_by_pose[..., freedoms], by_internal, c.b_by, c.a_by)
+        ends = across @ _side_by_side(parts, c.rows.distance.shape).take(
+            views.limbs(c.layout.n_legs), axis=1
+        )
+        of_b = ends.shape[-1] - c.a_by.shape[-1]
+        out = np.zeros((*ends.shape[:2], 4, ends.shape[-1] + 6))
+        out[..., 2:, :of_b] = ends[..., :of_b]
+        out[..., :2, of_b:-6] = ends[..., of_b:]
+        nearest = line.distance[..., None] * line.u
+        for k, place in ((0, line.before), (2, line.behind)):
+            # with p = distance w + place u: omega x (p - t) along m is omega . (p x m + m x t)
+            out[..., k, -6:-3] = place[..., None] * line.w - nearest + swung[..., 0, :]
+            out[..., k + 1, -6:-3] = swung[..., 1, :] - place[..., None] * line.m
+            out[..., k, -3:], out[..., k + 1, -3:] = line.m, line.w
         return out
 
 
+def _side_by_side(parts: tuple[Array, ...], limbs: tuple[int, ...]) -> Array:
+    """Derivatives (B, K, L, 3, n) of the limbs' ends, the limbs one after the other, (B, K L, 3,
+    n); leading axes broadcast. limbs : (B, K, L).
+    """
+    out = np.empty((*limbs, 3, sum(part.shape[-1] for part in parts)))
+    first = 0
+    for part in parts:
+        out[..., first : first + part.shape[-1]] = part
+        first += part.shape[-1]
+    return out.reshape(limbs[0], limbs[1] * limbs[2], 3, first)
+
+
 def placed(blocks: EdgeBlocks, rows: Array) -> Array:
-    """Rows (2g, B, m, N) of views at the places of their blocks, (B, K, G, 2g); zero elsewhere."""
-    views, (count, each), n_runs = blocks.views, blocks.present.shape, rows.shape[1]
-    out = np.zeros((n_runs, count * each + 1, len(rows)))
-    out[:, np.where(views.present, views.place, -1)] = np.moveaxis(rows, 0, -1)
-    return out[:, :-1].reshape(n_runs, count, each, len(rows))
-
-
-def _components_first(array: Array, components: int) -> Array:
-    return np.moveaxis(array, range(-components, 0), range(components))
+    """Rows (B, N, n) of views at the places of their blocks, (B, K, G, 2g); zero elsewhere."""
+    views, (n_runs, n, _), each = blocks.views, rows.shape, 2 * blocks.side.shape[-1]
+    if not n:
+        return np.zeros((n_runs, *blocks.present.shape, each))
+    of_blocks = rows.reshape(n_runs, views.place.size, each)
+    return np.where(blocks.present[..., None], of_blocks.take(blocks.number, axis=1), 0.0)
 
 
 def edge_rows(
@@ -391,28 +425,24 @@ def edge_rows(
     """Rows of the edges from the machine's closure (B, K), its parameters (B, P) and the stations
     (B, S, 4, 4).
     """
-    views = blocks.views
-    n_legs = c.layout.n_legs
-    both = np.stack(np.broadcast_arrays(c.base.a, c.platform.b))
-    both = np.ascontiguousarray(_components_first(both, 1)).reshape(3, 2, len(both[0]), -1)
-    ends = both.take(views.configuration * n_legs + views.leg, axis=-1)
-    rot = _components_first(T_camera_base[..., :3, :3], 2).take(views.station, axis=-1)
-    centre = _components_first(inverse(T_camera_base)[..., :3, 3], 1).take(views.station, axis=-1)
-    lines = SeenLines.between(*np.moveaxis(ends - centre[:, None], 0, -1))
-    frame = np.stack([np.moveaxis(axis, -1, 0) for axis in lines[:3]])
-    in_camera = np.einsum("ij...,fj...->fi...", rot, frame)
-    radius = theta.take(views.taken(blocks.radius), axis=-1)
-    return EdgeRows(
-        blocks,
-        data,
-        c,
-        rot,
-        np.moveaxis(ends, 0, 1),
-        lines,
-        frame,
-        *edge_planes(lines.distance[:, None], radius, data.sign),
-        np.einsum("eir...,fi...->fer...", data.of_normals, in_camera[:, :, :, None]),
-    )
+    views, limbs = blocks.views, c.rows.distance.shape
+    both = np.empty((3, 2, *limbs))
+    both[:, 0], both[:, 1] = (end.transpose(3, 0, 1, 2) for end in (c.base.a, c.platform.b))
+    both = both.reshape(3, 2, limbs[0], limbs[1] * limbs[2])
+    ends = both.take(views.limbs(limbs[2]), axis=-1)
+    moves = T_camera_base[..., :3, :].transpose(2, 3, 0, 1).take(views.station, axis=-1)
+    ends = np.einsum("ij...,je...->ie...", moves[:, :3], ends) + moves[:, 3, None]
+    lines = SeenLines.between(*ends.transpose(1, 2, 3, 0))
+    frame = np.empty((*lines.distance.shape, 3, 3))
+    for k, axis in enumerate(lines[:3]):
+        frame[..., k, :] = axis
+    n_edges, n_rows = len(data.sign), data.sign.shape[-1]
+    by_frame = np.empty((n_edges, 3, *lines.distance.shape, n_rows))
+    np.matmul(frame, data.of_normals, out=by_frame.transpose(0, 2, 3, 1, 4))
+    radius = np.repeat(theta.take(views.taken(blocks.radius), axis=-1), 2 * n_edges, axis=-1)
+    distance = np.repeat(lines.distance, n_rows, axis=-1).reshape(radius.shape)
+    planes = edge_planes(distance, radius, data.sign[:, None])
+    return EdgeRows(blocks, data, c, T_camera_base, lines, frame, *planes, by_frame)
 
 
 def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
@@ -441,6 +471,8 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     rod that is read always moves with its reading, whose noise is one of lengths: told by its
     scale, it would be the same but for a thousandth, and change with an unknown.
     """
+    if layout.reads_lengths:
+        return np.where(layout.row_motor >= 0, joint_noise, PERFECT)
     sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT)
     sigma = np.where(layout.row_is_rod, joint_noise, sigma)
     return np.where(layout.row_motor >= 0, sigma, PERFECT)

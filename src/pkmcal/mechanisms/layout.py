@@ -134,6 +134,14 @@ class LimbLayout:
         return self.driven_rows.size > self.n_readings
 
     @cached_property
+    def reads_lengths(self) -> bool:
+        """Whether a reading is a rod's length wherever there is one, so that the closures' noise is
+        the same everywhere.
+        """
+        lengths = np.all(self.row_is_rod | (self.row_motor < 0))
+        return bool(lengths) and not self.shares_motors
+
+    @cached_property
     def own_motion(self) -> Array:
         """(6 + n, d + n): the pose's directions, then its internal coordinates."""
         n, d = self.n_internal, self.motion.shape[1]

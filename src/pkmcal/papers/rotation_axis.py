@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import (
     cross,
     dot,
@@ -191,10 +191,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
 
     A turn phi with noise n of its two poses moves the axis by n / (2 sin(phi / 2)) across.
     """
-    i, j = np.triu_indices(len(rot), 1)
-    if len(i) > MOST_PAIRS:  # an even choice is as good
-        pick = np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)
-        i, j = i[pick], j[pick]
+    i, j = _pairs(len(rot))
     turn = rotation_vector(rot[j] @ rot[i].mT)
     angle = np.sqrt(dot(turn, turn))
     used = angle > LEAST_TURN
@@ -215,3 +212,17 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
     found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
     return float(found), float(expected)
+
+
+def _pairs(n: int) -> tuple[Integers, Integers]:
+    """Pairs i < j of n, told by their number row by row; of many an even choice, which is as good:
+    they grow with the square.
+    """
+    first, total = np.arange(n), n * (n - 1) // 2
+    before = first * (2 * n - first - 1) // 2
+    if total > MOST_PAIRS:
+        number = np.linspace(0, total - 1, MOST_PAIRS).astype(int)
+    else:
+        number = np.arange(total)
+    i = np.searchsorted(before, number, side="right") - 1
+    return i, number - before[i] + i + 1

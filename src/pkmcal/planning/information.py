@@ -213,7 +213,7 @@ def _told_by(
     u, n = problem.unknowns, len(machine.values)
     kept = np.array(known.stations, dtype=int)
     to_free = np.zeros((u.n_free + 6 * len(kept), n + 6 * len(kept)))
-    to_free[: u.n_free, :n] = problem.to_free
+    to_free[: u.n_free, :n] = problem.structure.to_free
     to_free[u.n_free :, n:] = np.eye(6 * len(kept))
     frames = conventions(machine)
     moved = [way.moved]

@@ -175,6 +175,7 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
 class Solution:
     """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
 
+    cost : of a search whose last step needed no trial, as the linear model says.
     normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
     but for that step.
     """
@@ -280,25 +281,27 @@ def _minimised(
     n_runs = _count(start)
     cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    search = _Search.begun(n_runs)
-    state, active = start, np.arange(n_runs)
-    part, here, at = problem, start, values
+    active, search = np.arange(n_runs), _Search.begun(n_runs)
+    state, part, here, at = start, problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, at, take(search, active), tolerance)
+        new, gain = _try(part, here, at, search, tolerance)
         steps[active] += 1
         here, at = _kept(here, new, gain)
-        state = here if active.size == n_runs else put(state, active, here)
-        cost[active], search = gain.cost, put(search, active, gain.search)
-        normal = gain.normal if normal is None else put(normal, active, gain.normal)
+        if active.size == n_runs:
+            state, normal = here, gain.normal
+        else:
+            state, normal = put(state, active, here), put(cast(Array, normal), active, gain.normal)
+        cost[active], search = gain.cost, gain.search
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
-        keep = np.flatnonzero([reason is Stop.RUNNING for reason in gain.stop])
+        keep = np.array([k for k, reason in enumerate(gain.stop) if reason is Stop.RUNNING])
         if keep.size == 0:
             break
         if keep.size < active.size:
             active = active[keep]
             part, here, at = problem.select(active), take(state, active), None
+            search = take(search, keep)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
     return Solution(state, cost, steps, final, cast(Array, normal))
 
@@ -352,10 +355,10 @@ class _Search(NamedTuple):
 
 
 class _Gain(NamedTuple):
-    """What came of a step. values : each part's residuals after it."""
+    """What came of a step. values : each part's residuals after it; None where it was not tried."""
 
     accepted: Booleans
-    values: list[Values]
+    values: list[Values] | None
     cost: Array
     search: _Search
     normal: Array
@@ -376,25 +379,31 @@ def _try(
     damping = search.damping
     normal = normal_equations(problem.rows(state, values), damping)
     shared, own = normal.step(damping)
-    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    descent, size2 = normal.promise(shared, own)
+    cost, promised = normal.cost, descent - size2
+    size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
+    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
+    small = (size < tolerance * unit) | (np.abs(promised) < ROUNDING * cost)
+    last = search.left(size) < tolerance * unit
     usable = [part.usable for part in normal.parts]
-    values, cost = problem.residuals(trial), normal.cost
+    any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
+    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    if np.all(search.undamped & any_usable & (small | last)):
+        # full steps as short as these keep what they promise: nothing is left to be tried
+        every = np.ones(len(cost), dtype=bool)
+        stop = [Stop.CONVERGED] * len(cost)
+        return trial, _Gain(every, None, cost - promised, search, normal.matrix, stop)
+    values = problem.residuals(trial)
     cost_trial = total(
         cost_of(part.value, part.shared_value, use)
         for part, use in zip(values, usable, strict=True)
     )
-    descent, size2 = normal.promise(shared, own)
-    ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
-    size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
-    small = size < tolerance * unit
-    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
-    small |= np.abs(descent - size2) < ROUNDING * cost
+    ratio = (cost - cost_trial) / np.maximum(promised, 1e-300)
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    small |= accepted & (search.left(size) < tolerance * unit)
+    small |= accepted & last
     # a step that is refused for its rounding is better taken: all that is known of it is good
-    little = ~accepted & (descent - size2 < (REFUSED * unit) ** 2) & (damping < STRONG)
+    little = ~accepted & (promised < (REFUSED * unit) ** 2) & (damping < STRONG)
     small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
-    any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
     return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)

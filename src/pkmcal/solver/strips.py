@@ -48,8 +48,8 @@ class StripLayout:
 
     @cached_property
     def own_target(self) -> Integers:
-        """Where the products of a strip's rows by own unknowns with all its columns are summed, out
-        of (K, d, d + na + 2): own unknowns, shared ones, none, and the residual.
+        """Where the products (N, d + w + 1, d) of all a strip's columns with its own unknowns' are
+        summed, out of (K, d, d + na + 2): own unknowns, shared ones, none, and the residual.
         """
         d, na = self.n_own, self.n_shared
         column = np.empty((len(self.configuration), d + self.columns.shape[1] + 1), dtype=int)
@@ -57,7 +57,8 @@ class StripLayout:
             column[cut, d:-1] = d + columns
         column[:, :d], column[:, -1] = np.arange(d), d + na + 1
         row = d * self.configuration[:, None] + np.arange(d)
-        return (row[..., None] * (d + na + 2) + column[:, None]).ravel()
+        target = row[:, None] * (d + na + 2) + column[..., None]
+        return target.astype(np.int32).ravel()  # the largest array that a search keeps
 
     @cached_property
     def shared_target(self) -> Integers:
@@ -68,7 +69,7 @@ class StripLayout:
 
 
 class Strips(NamedTuple):
-    """Strips' numbers (B, N, n, d + w + 1): by the own unknowns, by the shared ones of their
+    """Strips' numbers (B, d + w + 1, N, n): by the own unknowns, by the shared ones of their
     columns, and the residual.
     """
 
@@ -100,10 +101,11 @@ class Compact(NamedTuple):
             np.zeros((*batch, n_rows + 1, na + 1)),
         )
         at = layout.configuration[:, None]
-        by_own[:, at, layout.rows] = numbers[..., :d]
+        by_row = np.moveaxis(numbers, 1, -1)
+        by_own[:, at, layout.rows] = by_row[..., :d]
         for cut, columns in zip(layout.groups, layout.columns, strict=True):
             place = at[cut, ..., None], layout.rows[cut, :, None], columns
-            by_shared[:, *place] = numbers[:, cut, :, d:-1]
+            by_shared[:, *place] = by_row[:, cut, :, d:-1]
         by_own, by_shared = by_own[:, :, :-1], by_shared[:, :, :-1, :-1]
         rest = slice(n_rows - self.by_own.shape[2], None)
         by_own[:, :, rest], by_shared[:, :, rest] = self.by_own, self.by_shared
@@ -114,7 +116,7 @@ def compact(linear: Linear) -> Compact:
     """The same of a Jacobian that stands in memory."""
     (*_, n_own), (n_runs, count, _, n_shared) = linear.by_own.shape, linear.by_shared.shape
     layout = StripLayout.none(n_shared, n_own, count)
-    strips = Strips(layout, np.zeros((n_runs, 0, 0, n_own + 1)))
+    strips = Strips(layout, np.zeros((n_runs, n_own + 1, 0, 0)))
     rows = linear.value, linear.usable, linear.shared_value, linear.shared_by
     return Compact(*rows, strips, linear.by_shared, linear.by_own)
 
@@ -173,7 +175,8 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     """
     (layout, numbers), by_own = rows.strips, rows.by_own
     n_runs, d, na = len(numbers), layout.n_own, layout.n_shared
-    products = numbers[..., :d].mT @ numbers
+    strips = numbers.swapaxes(1, 2)
+    products = strips @ np.ascontiguousarray(strips[:, :, :d].mT)
     sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
     square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
     norms = np.einsum("...ii->...i", square) + np.einsum("...nm,...nm->...m", by_own, by_own)
@@ -187,7 +190,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     along_strips = inverse.mT @ with_shared
     along = along_strips + q.mT @ rows.by_shared
     fitted = inverse.mT @ with_value + q.mT @ value
-    normal, slope = _group_sums(layout, numbers[..., d:])
+    normal, slope = _group_sums(layout, numbers[:, d:])
     return Eliminated(
         inverse,
         along,
@@ -204,12 +207,12 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
 
 
 def _group_sums(layout: StripLayout, numbers: Array) -> tuple[Array, Array]:
-    """J_s^T J_s (B, na, na) and J_s^T value (B, na) of strips (B, N, n, w + 1)."""
-    n_runs, na, width = len(numbers), layout.n_shared, numbers.shape[-1]
+    """J_s^T J_s (B, na, na) and J_s^T value (B, na) of strips (B, w + 1, N, n)."""
+    (n_runs, width), na = numbers.shape[:2], layout.n_shared
     products = np.empty((n_runs, len(layout.groups), width, width))
     for k, cut in enumerate(layout.groups):
-        rows = flat(numbers[:, cut])
-        np.matmul(rows.mT, rows, out=products[:, k])
+        columns = numbers[:, :, cut].reshape(n_runs, width, -1)
+        np.matmul(columns, columns.mT, out=products[:, k])
     sums = _summed(products, layout.shared_target, (n_runs, na + 2, na + 2))
     return sums[:, :na, :na], sums[:, :na, -1]
 
@@ -284,9 +287,9 @@ class NormalEquations(NamedTuple):
         """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
         scaled, scale = unit_diagonal(self.matrix)
         # at least a few rounding units, so that an unidentified direction gives no step
-        ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
+        np.einsum("...ii->...i", scaled)[...] += np.maximum(damping, 1e-15)[:, None]
         right = (self.gradient / scale)[..., None]
-        shared = -np.linalg.solve(scaled + ridge, right)[..., 0] / scale
+        shared = -np.linalg.solve(scaled, right)[..., 0] / scale
         return shared, [part.own(shared) for part in self.parts]
 
     def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
@@ -324,6 +327,6 @@ def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquation
 
 def cost_of(value: Array, shared_value: Array, usable: Booleans) -> Array:
     """Sum of squares over usable rows; NaN there means that a leg was lost: infinite."""
-    total = np.sum(np.where(usable, value, 0.0) ** 2, axis=(1, 2))
-    total = total + np.sum(shared_value**2, axis=1)
+    used = np.where(usable, value, 0.0).reshape(len(value), -1)
+    total = np.sum(used * used, axis=1) + np.sum(shared_value * shared_value, axis=1)
     return np.where(np.isfinite(total), total, np.inf)

@@ -194,6 +194,7 @@ class Carrier(ABC):
         return ()
 
     @classmethod
+    @cache
     def _vectors(cls) -> tuple[tuple[slice, bool], ...]:
         """Places of the fields with three numbers, and which of them are points."""
         return tuple(

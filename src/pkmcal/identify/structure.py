@@ -1,0 +1,196 @@
+"""Where everything stands in a problem: what neither weights nor noise nor a state change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.identify.gauge import move_generators
+from pkmcal.identify.rows import EdgeBlocks
+from pkmcal.identify.unknowns import Unknowns
+from pkmcal.mechanisms.layout import LimbLayout
+from pkmcal.solver.strips import StripLayout
+
+
+class _Turn(NamedTuple):
+    """From a strip's columns, which are parameters, to the unknowns' where these differ.
+
+    by : (groups, w, w') of the strips with the same columns. columns : (groups, w') which of the
+    shared unknowns they are.
+    """
+
+    by: Array
+    columns: Integers
+
+    @classmethod
+    def of(cls, parameters: Integers, turn: Array) -> _Turn:
+        """Of strips with these columns (groups, w); turn (width, na) from all columns."""
+        used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
+        most = max((len(own) for own in used), default=0)
+        columns = np.full((len(used), most), turn.shape[1])
+        by = np.zeros((*parameters.shape, most))
+        for k, own in enumerate(used):
+            columns[k, : len(own)] = own
+            by[k, :, : len(own)] = turn[parameters[k]][:, own]
+        return cls(by, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Of a problem with these parts (:class:`~pkmcal.identify.problem.Problem`); made when it is
+    asked for, and once for all problems of the same measurements.
+    """
+
+    layout: LimbLayout
+    drawing: Array
+    free: Array
+    unknowns: Unknowns
+    blocks: EdgeBlocks
+    frames: Array
+
+    def made_of(self, *parts: object) -> bool:
+        """Whether it is made of these, in their order."""
+        own = self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames
+        return all(mine is other for mine, other in zip(own, parts, strict=True))
+
+    @cached_property
+    def _parts(self) -> dict[tuple[int, int], Structure]:
+        """Those of some configurations that were asked for."""
+        return {}
+
+    def among(self, configurations: slice) -> Structure:
+        """That of some configurations only."""
+        key = configurations.start, configurations.stop
+        if key not in self._parts:
+            self._parts[key] = replace(self, blocks=self.blocks.among(configurations))
+        return self._parts[key]
+
+    @cached_property
+    def to_free(self) -> Array:
+        """(nz, P), from changes of the parameters to those of z."""
+        return np.linalg.pinv(self.free)
+
+    @cached_property
+    def choice(self) -> Integers | None:
+        """The parameter of each free unknown where each moves one parameter alone."""
+        alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
+        return np.argmax(self.free, axis=0) if alone else None
+
+    @cached_property
+    def width(self) -> int:
+        """Columns of an edge's row while it is written: the shared unknowns', where parameters are
+        tied or are axes one for each parameter besides, and one for what is no unknown.
+        """
+        return self.unknowns.count + 1 + (0 if self.choice is not None else self.drawing.size)
+
+    @cached_property
+    def column(self) -> Integers:
+        """Where each parameter's derivatives are written, (P + 1,); the last is no parameter's."""
+        if self.choice is None:
+            return self.unknowns.count + np.arange(self.drawing.size + 1)
+        out = np.full(self.drawing.size + 1, self.unknowns.count)
+        out[self.choice] = np.arange(len(self.choice))
+        return out
+
+    @cached_property
+    def moves_of(self) -> Array:
+        """Frame changes and others (12 + n, nz) that a step of z makes, as far as they can, by
+        least squares at the drawing: what they leave to be added up is small in any case.
+        """
+        by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
+        return self.frames @ np.linalg.pinv(by_moves @ self.frames)
+
+    @cached_property
+    def strips(self) -> StripLayout:
+        """The views as strips."""
+        views, columns = self.blocks.views, self.strip_parameters
+        n_rows = 2 * self.blocks.side.shape[-1]
+        place = n_rows * (views.place % max(self.blocks.present.shape[1], 1))
+        rows = np.where(views.present[..., None], place[..., None] + np.arange(n_rows), -1)
+        return StripLayout(
+            n_shared=self.unknowns.count,
+            n_own=self.layout.own_motion.shape[1],
+            count=len(self.blocks.present),
+            configuration=views.configuration,
+            rows=rows.reshape(len(rows), rows.shape[1] * n_rows),
+            groups=views.groups,
+            columns=columns if self.turn is None else self.turn.columns,
+        )
+
+    @cached_property
+    def strip_parameters(self) -> Integers:
+        """Of each group of views the columns (groups, w) that its edges' derivatives are by: the
+        parameters of both ends, the station, the radii, its camera's, its lines' and its breathing.
+        """
+        u, layout, views = self.unknowns, self.layout, self.blocks.views
+        first = np.array([cut.start for cut in views.groups], dtype=int)
+        leg, station, camera = views.leg[first], views.station[first], views.camera[first]
+        none = self.width - 1
+        radii = np.full((len(first), len(self.own_columns[0])), none)
+        for k, one in enumerate(leg):
+            radii[k, : len(layout.radius[one])] = self.column[layout.radius[one]]
+        lines = np.full((len(first), len(self.own_columns[1])), none)
+        for own, found in zip(lines, self._lines, strict=True):
+            own[: len(found)] = u.shading.start + found
+        parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
+        parts += [numbered(u.stations, station, 6), radii]
+        parts += [numbered(u.optics, camera, u.n_optics), lines]
+        if u.n_breathing:
+            parts.append(numbered(u.breathing, station, 1))
+        return np.concatenate(parts, axis=1)
+
+    @cached_property
+    def _lines(self) -> list[Integers]:
+        """The lines that each group of views sees."""
+        views = self.blocks.views
+        if not self.unknowns.n_lines:
+            return [np.zeros(0, dtype=int) for _ in views.groups]
+        line = np.where(views.present, views.taken(self.blocks.line), -1)
+        return [np.unique(line[cut][line[cut] >= 0]) for cut in views.groups]
+
+    @cached_property
+    def own_columns(self) -> tuple[Array, Array]:
+        """Which of its leg's radii and of its group's lines each row depends on: ones in
+        (radii, N, n) and (lines, N, n).
+        """
+        blocks, views, n_rows = self.blocks, self.blocks.views, 2 * self.blocks.side.shape[-1]
+        radii = max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
+        used = views.taken(blocks.tube) == np.arange(radii)[:, None, None]
+        number = np.zeros((max((len(own) for own in self._lines), default=0), *views.place.shape))
+        for cut, own in zip(views.groups, self._lines, strict=True):
+            if own.size:
+                line = views.taken(blocks.line)[cut]
+                number[: len(own), cut] = line == own[:, None, None]
+        return np.repeat(used.astype(float), n_rows, -1), np.repeat(number, n_rows, -1)
+
+    @cached_property
+    def turn(self) -> _Turn | None:
+        """How strips' columns become unknowns, where parameters are tied or are axes."""
+        if self.choice is not None:
+            return None
+        turn = np.eye(self.width, self.unknowns.count)
+        turn[self.unknowns.count : -1, self.unknowns.machine] = self.free
+        return _Turn.of(self.strip_parameters, turn)
+
+    @cached_property
+    def closure_index(self) -> Integers:
+        """Parameters (E, n) that the closures' derivatives are by; rods on one motor share their
+        noise, so each has those of all.
+        """
+        if self.layout.shares_motors:
+            return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
+        return self.layout.closure_index
+
+    @cached_property
+    def closure_turn(self) -> Array:
+        """(E, n, nz) from the closures' derivatives by those to the ones by the free unknowns."""
+        return np.pad(self.free, ((0, 1), (0, 0)))[self.closure_index]
+
+
+def numbered(part: slice, number: Integers, width: int) -> Integers:
+    """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
+    return part.start + width * number[..., None] + np.arange(width)
