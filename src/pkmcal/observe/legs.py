@@ -14,8 +14,9 @@ forgotten with it, and a few hundred numbers of its edges remain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
 from pkmcal.observe.images import Selected, fitting
+from pkmcal.observe.levels import levels_at
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -111,27 +113,6 @@ class LegPlaces:
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
 
 
-def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
-    """Grey levels of K images at pixels (K, E, ..., 2): (K, E, ...), interpolated."""
-    import cv2
-
-    kind = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
-    # one row an edge: cv2.remap takes at most 32767 rows and columns
-    shape = (*pixel.shape[:2], -1)
-    x, y = (np.array(pixel[..., k], np.float32, order="C").reshape(shape) for k in (0, 1))
-    for place in (x, y):
-        place[~np.isfinite(place)] = -9.0
-    out = np.empty(x.shape, dtype=np.float32)
-    columns: Any
-    rows: Any
-    grey: Any
-    for image, columns, rows, grey in zip(images, x, y, out, strict=True):
-        # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
-        levels = image.astype(np.float32, copy=False)
-        cv2.remap(levels, columns, rows, kind, dst=grey, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(pixel.shape[:-1])
-
-
 def search_legs(
     images: Sequence[Integers],
     tubes: TubeList,
@@ -143,13 +124,16 @@ def search_legs(
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
-    strength = gradient_strength(images, points, reach + TILTS[-1])[0]
-    weight = clear.astype(np.float32)
     steps = np.arange(-reach, reach + 0.5)
+    offsets = np.arange(steps[0] - TILTS[-1], steps[-1] + TILTS[-1] + 0.5)
+    strength = np.zeros((*clear.shape, len(offsets)), np.float32)
+    for k, (image, seen) in enumerate(zip(images, clear, strict=True)):
+        at = points.pixel[k][seen], points.outward[k][seen]
+        strength[k][seen] = gradient_strength(image, *at, offsets)
     place = place_on_leg(points.along, clear, tubes)
-    scores = _by_tilt(strength * weight[..., None], place, TILTS, len(steps), tubes)
+    scores = _by_tilt(strength, place, TILTS, len(steps), tubes)
     legs = range(tubes.leg.max() + 1)
-    total = np.stack([weight[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
+    total = np.stack([clear[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
     points_of = np.array([max(int((tubes.leg == leg).sum()) * clear.shape[2], 1) for leg in legs])
     scores /= np.maximum(total, 1.0)[..., None, None]
     return _choose(scores, total, total / points_of, steps)
@@ -181,32 +165,28 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
     return out
 
 
-def gradient_strength(
-    images: Sequence[Integers], points: EdgePoints, reach: float
-) -> tuple[Array, Array]:
-    """Strength 0..1 of grey-level edges across the predicted ones, (K, E, n, offsets).
+def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Array) -> Array:
+    """Strength 0..1 of a photograph's edges across predicted ones, (n, offsets).
 
-    Also the offsets, whole pixels outward.
+    pixel, outward : (n, 2) of points of these. offsets : whole pixels outward, one by one.
     """
-    offsets = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
-    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
-    wide = wide.astype(np.float32)
-    x, y = (
-        points.pixel[..., None, k].astype(np.float32)
-        + wide * points.outward[..., None, k].astype(np.float32)
-        for k in (0, 1)
-    )
-    pixel = of_components(x, y)
     import cv2
 
-    kernel = cv2.getGaussianKernel(2 * round(4 * SMOOTH) + 1, SMOOTH, cv2.CV_32F)
-    smooth = (cv2.sepFilter2D(im, cv2.CV_32F, kernel, kernel) for im in images)
-    level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
-    slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
+    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]]).astype(np.float32)
+    level = np.sqrt(255.0 * levels_at(image, *_outward_of(pixel, outward, wide), blur=SMOOTH))
+    slope = np.abs(level[:, 2:] - level[:, :-2]) / 2
     about = np.ones((1, 2 * PEAK + 1), np.uint8)
-    peak = cv2.dilate(slope.reshape(-1, slope.shape[-1]), about).reshape(slope.shape)
-    sharp = slope / np.maximum(peak, 1e-6)
-    return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2), offsets
+    sharp = slope / np.maximum(cv2.dilate(slope, about), 1e-6)
+    return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2)
+
+
+def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]:
+    """Columns and rows (..., offsets) of pixels (..., 2) moved so far along unit vectors (..., 2),
+    single precision.
+    """
+    for k in (0, 1):
+        here, way = (v[..., k, None].astype(np.float32) for v in (pixel, outward))
+        yield here + offsets * way
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
@@ -401,12 +381,11 @@ class _Seen:
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
     tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, PLACES)
-    grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
+    full, across = _segment_profiles(photographs, points, clear, half_width)
     return _Seen(tubes, places, full, across)
 
 
@@ -445,37 +424,50 @@ def predicted(
     return tubes, points, clear
 
 
-def _profile_pixels(camera: Camera, points: EdgePoints) -> Array:
-    """Pixels (K, E, PLACES * BETWEEN, offsets, 2) of profiles across the edges.
-
-    Points of an edge lie evenly on a line in space, so those between are interpolated there and
-    projected; the profiles' directions hardly turn from one to the next.
-    """
-    start, step = points.point[..., :1, :], np.diff(points.point[..., :2, :], axis=-2)
-    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
-    along = of_components(*(start[..., k] + fraction * step[..., k] for k in range(3)))
-    pixel = camera.project(along).astype(np.float32)
-    outward = np.repeat(points.outward.astype(np.float32), BETWEEN, axis=-2)
-    away = profiles.profile_offsets().astype(np.float32)
-    return of_components(*(pixel[..., None, k] + away * outward[..., None, k] for k in (0, 1)))
-
-
 def _segment_profiles(
-    grey: Array, clear: Booleans, half_width: Array
+    photographs: Photographs, points: EdgePoints, clear: Booleans, half_width: Array
 ) -> tuple[Booleans, profiles.Profiles]:
     """Mean profiles over each segment's clear samples.
 
     Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
     """
-    k, e, n = clear.shape
-    seen = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
-    count = seen.sum(axis=-1)
-    full = count >= FEWEST_SHARE * seen.shape[-1]
-    kept = grey.reshape(*seen.shape, -1) * seen[..., None]
-    mean = kept.sum(axis=-2)[full] / count[full][:, None]
-    saturated = kept.max(axis=-2)[full] >= profiles.SATURATED
-    cut = profiles.cut_of(saturated, half_width[full])
+    count = BETWEEN * _by_segment(clear).sum(axis=-1)
+    full = count >= FEWEST_SHARE * BETWEEN * PLACES / SEGMENTS
+    seen = np.repeat(_by_segment(clear)[full], BETWEEN, axis=-1)
+    outward = np.repeat(_by_segment(points.outward)[full], BETWEEN, axis=-2)
+    pixel = photographs.camera.project(_between(points, full))
+    offsets = profiles.profile_offsets().astype(np.float32)
+    total = np.empty((len(seen), len(offsets)), np.float32)
+    brightest = np.empty_like(total)
+    parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
+    for image, part in zip(photographs.images, parts, strict=True):
+        mine = slice(*part)
+        x, y = _outward_of(pixel[mine], outward[mine], offsets)
+        rows = len(x), -1
+        grey = levels_at(image, x.reshape(rows), y.reshape(rows), cubic=True).reshape(x.shape)
+        grey *= seen[mine, :, None]
+        total[mine], brightest[mine] = grey.sum(axis=1), grey.max(axis=1)
+    cut = profiles.cut_of(brightest >= profiles.SATURATED, half_width[full])
+    mean = total / count[full][:, None]
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
+
+
+def _by_segment(values: Array | Booleans) -> Any:
+    """Values (K, E, PLACES, ...) of edges' points, (K, E, SEGMENTS, points of one, ...)."""
+    return values.reshape(*values.shape[:2], SEGMENTS, -1, *values.shape[3:])
+
+
+def _between(points: EdgePoints, full: Booleans) -> Array:
+    """Places (N, n, 3) of all profiles in the segments ``full`` (K, E, SEGMENTS).
+
+    Points of an edge lie evenly on a line in space, so those between are interpolated there; the
+    profiles' directions hardly turn from one to the next.
+    """
+    k, e, segment = np.nonzero(full)
+    start, step = points.point[..., 0, :], points.point[..., 1, :] - points.point[..., 0, :]
+    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
+    mine = fraction.reshape(SEGMENTS, -1)[segment]
+    return of_components(*(start[k, e, c, None] + mine * step[k, e, c, None] for c in range(3)))
 
 
 def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList) -> Array:
