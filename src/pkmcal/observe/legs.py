@@ -20,6 +20,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
@@ -153,15 +154,14 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
         ends = towards[..., :1], towards[..., -1:]
         wide = [np.broadcast_to(end, (*end.shape[:-1], beyond)) for end in ends]
         towards = np.concatenate([wide[0], towards, wide[1]], axis=-1)
-    step = np.arange(count, dtype=np.int32) + (room + beyond)
-    row = np.arange(place.size, dtype=np.int32).reshape(place.shape) * towards.shape[-1]
-    flat = towards.ravel()
+    windows = sliding_window_view(towards.reshape(-1, towards.shape[-1]), count, axis=-1)
+    row = np.arange(place.size).reshape(place.shape)
+    legs, first_edge = np.unique(tubes.leg, return_index=True)  # tubes come leg by leg
     out = np.zeros((len(values), tubes.leg.max() + 1, len(tilts), count), values.dtype)
     for i, tilt in enumerate(tilts):
-        first = row + np.rint(tilt * place).astype(np.int32)
-        by_edge = flat.take(first[..., None] + step).sum(axis=2)
-        for leg in range(out.shape[1]):
-            out[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
+        first = np.rint(tilt * place).astype(int) + (room + beyond)
+        by_edge = windows[row, first].sum(axis=2)
+        out[:, legs, i] = np.add.reduceat(by_edge, first_edge, axis=1)
     return out
 
 
@@ -172,7 +172,7 @@ def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Ar
     """
     import cv2
 
-    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]]).astype(np.float32)
+    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
     level = np.sqrt(255.0 * levels_at(image, *_outward_of(pixel, outward, wide), blur=SMOOTH))
     slope = np.abs(level[:, 2:] - level[:, :-2]) / 2
     about = np.ones((1, 2 * PEAK + 1), np.uint8)
@@ -181,12 +181,14 @@ def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Ar
 
 
 def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]:
-    """Columns and rows (..., offsets) of pixels (..., 2) moved so far along unit vectors (..., 2),
-    single precision.
+    """Columns and rows (n, offsets) of pixels (n, 2) moved so far along unit vectors (n, 2), single
+    precision.
     """
+    away = offsets.astype(np.float32)
     for k in (0, 1):
-        here, way = (v[..., k, None].astype(np.float32) for v in (pixel, outward))
-        yield here + offsets * way
+        moved = away * outward[:, k, None].astype(np.float32)
+        moved += pixel[:, k, None].astype(np.float32)
+        yield moved
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
@@ -432,23 +434,25 @@ def _segment_profiles(
     Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
     """
     count = BETWEEN * _by_segment(clear).sum(axis=-1)
-    full = count >= FEWEST_SHARE * BETWEEN * PLACES / SEGMENTS
+    full = count >= FEWEST_SHARE * (BETWEEN * PLACES / SEGMENTS)
     seen = np.repeat(_by_segment(clear)[full], BETWEEN, axis=-1)
+    seen = seen[:, None].astype(np.float32)
     outward = np.repeat(_by_segment(points.outward)[full], BETWEEN, axis=-2)
     pixel = photographs.camera.project(_between(points, full))
-    offsets = profiles.profile_offsets().astype(np.float32)
-    total = np.empty((len(seen), len(offsets)), np.float32)
-    brightest = np.empty_like(total)
+    offsets = profiles.profile_offsets()
+    total = np.empty((len(seen), 1, len(offsets)), np.float32)
+    clipped = np.empty_like(total)
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
     for image, part in zip(photographs.images, parts, strict=True):
         mine = slice(*part)
-        x, y = _outward_of(pixel[mine], outward[mine], offsets)
-        rows = len(x), -1
-        grey = levels_at(image, x.reshape(rows), y.reshape(rows), cubic=True).reshape(x.shape)
-        grey *= seen[mine, :, None]
-        total[mine], brightest[mine] = grey.sum(axis=1), grey.max(axis=1)
-    cut = profiles.cut_of(brightest >= profiles.SATURATED, half_width[full])
-    mean = total / count[full][:, None]
+        across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)
+        # a row a segment: what lies close in the photograph is interpolated together
+        rows = (v.reshape(len(seen[mine]), -1) for v in across)
+        grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
+        np.matmul(seen[mine], grey, out=total[mine])
+        np.matmul(seen[mine], grey >= profiles.SATURATED, out=clipped[mine])
+    cut = profiles.cut_of(clipped[:, 0] > 0, half_width[full])
+    mean = total[:, 0] / count[full][:, None]
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 
@@ -458,7 +462,7 @@ def _by_segment(values: Array | Booleans) -> Any:
 
 
 def _between(points: EdgePoints, full: Booleans) -> Array:
-    """Places (N, n, 3) of all profiles in the segments ``full`` (K, E, SEGMENTS).
+    """Places (N, n, 3) of all n profiles in each of the N segments that are ``full``.
 
     Points of an edge lie evenly on a line in space, so those between are interpolated there; the
     profiles' directions hardly turn from one to the next.

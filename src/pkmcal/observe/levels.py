@@ -27,9 +27,10 @@ def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: floa
     """
     import cv2
 
-    x, y = (np.where(np.isfinite(v), v, 0.0).astype(np.float32, copy=False) for v in (x, y))
     if not x.size:
-        return x
+        return np.zeros(x.shape, np.float32)
+    if not np.isfinite([v.sum() for v in (x, y)]).all():
+        x, y = (np.where(np.isfinite(v), v, 0.0).astype(np.float32) for v in (x, y))
     half = round(FURTHEST * blur)
     height, width = image.shape
     columns, rows = (_span(v, AROUND + half, size) for v, size in ((x, width), (y, height)))
