@@ -47,6 +47,8 @@ pictures hardly tell which is near, least of all of three legs that are alike.""
 SHAKEN, LIKELY = 48, 16
 """Poses beside the best ones that are tried before the last descent, and of how many two steps have
 shown that they may be the best."""
+ALIKE = 4
+"""Of the likeliest places, where all are one, those that are settled without a look beside them."""
 NEARBY = 8
 """Places of each of thirty hypotheses that are settled."""
 HALVES, THIRDS, HALVES_TOLD = 7, 5, 4
@@ -160,18 +162,30 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
         candidates = _random_search(view, T_camera_base, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
-    candidates = descend(view, candidates, more, 5, (5, 4, 4, 3))
-    candidates = _best(view, candidates, more, reach=3, keep=24)
-    candidates = candidates[apart(view, candidates, more)[:4]]
+    distinct = apart(view, candidates, more)
+    if len(apart(view, candidates[: len(candidates) // 2], more)) == 1:
+        candidates = candidates[[*range(ALIKE), *distinct[1:3]]]
+    else:
+        candidates = _best_about(view, candidates, more, rng)
+    candidates, evidence = settle(view, candidates, more, 5, 5)
+    candidates = candidates[np.argsort(-evidence)]
+    return candidates[apart(view, candidates, more)[:3]]
+
+
+def _best_about(
+    view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
+) -> Array:
+    """The likeliest places (H, 4, 4) that candidates descend to, and beside these."""
+    candidates = descend(view, candidates, photographs, 5, (5, 4, 4, 3))
+    candidates = _best(view, candidates, photographs, reach=3, keep=24)
+    candidates = candidates[apart(view, candidates, photographs)[:4]]
     # the picture is rugged: what lies beside a good place may be better
     beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 3, 2)
-    candidates, evidence = settle(view, candidates[np.argsort(-evidence)[:LIKELY]], more, 5, 5)
-    candidates = candidates[np.argsort(-evidence)]
-    return candidates[apart(view, candidates, more)[:3]]
+    candidates, evidence = settle(view, np.concatenate([candidates, turned]), photographs, 3, 2)
+    return candidates[np.argsort(-evidence)[:LIKELY]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
