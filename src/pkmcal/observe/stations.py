@@ -103,10 +103,15 @@ class FoundStation:
 
 
 def find_station(
-    view: StationView, T_camera_base: Array | None, rng: np.random.Generator
+    view: StationView,
+    T_camera_base: Array | None,
+    rng: np.random.Generator,
+    closely: bool = False,
 ) -> FoundStation:
     """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
     of few; what the others say of it decides, each in its turn. Then every photograph takes part.
+
+    closely : look beside the likeliest places in any case, for evidence that is to be compared.
     """
     count = len(view.configuration)
     number = np.arange(count)
@@ -117,12 +122,12 @@ def find_station(
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
         asked = number % folds == fold
         searched, other = np.flatnonzero(~asked), np.flatnonzero(asked)
-        found = _search(view.select(searched), T_camera_base, rng)
+        found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
         if _by_chance(surely) < BY_CHANCE / DECIDED:
             break
-    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
+    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
     candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
@@ -150,7 +155,9 @@ def find_station(
     )
 
 
-def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Generator) -> Array:
+def _search(
+    view: StationView, T_camera_base: Array | None, rng: np.random.Generator, closely: bool
+) -> Array:
     """Up to three places (H, 4, 4), the one with the most evidence first."""
     few, more = view.few(4), view.few(8)
     if T_camera_base is None:
@@ -162,9 +169,10 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
         candidates = _random_search(view, T_camera_base, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
-    distinct = apart(view, candidates, more)
-    if len(apart(view, candidates[: len(candidates) // 2], more)) == 1:
-        candidates = candidates[[*range(ALIKE), *distinct[1:3]]]
+    likelier = candidates[: len(candidates) // 2]
+    if not closely and len(apart(view, likelier, more)) == 1:
+        others = apart(view, candidates, more)[1:3]
+        candidates = candidates[[*range(ALIKE), *others]]
     else:
         candidates = _best_about(view, candidates, more, rng)
     candidates, evidence = settle(view, candidates, more, 5, 5)
