@@ -111,7 +111,8 @@ def find_station(
     """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
     of few; what the others say of it decides, each in its turn. Then every photograph takes part.
 
-    closely : look beside the likeliest places in any case, for evidence that is to be compared.
+    closely : look beside the likeliest places though they are one, as is done of searches from
+    nothing, for evidence that is to be compared.
     """
     count = len(view.configuration)
     number = np.arange(count)
@@ -170,6 +171,7 @@ def _search(
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
+    closely = closely or T_camera_base is None
     if not closely and len(apart(view, likelier, more)) == 1:
         others = apart(view, candidates, more)[1:3]
         candidates = candidates[[*range(ALIKE), *others]]
