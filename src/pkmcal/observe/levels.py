@@ -29,8 +29,7 @@ def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: floa
 
     if not x.size:
         return np.zeros(x.shape, np.float32)
-    if not np.isfinite([v.sum() for v in (x, y)]).all():
-        x, y = (np.where(np.isfinite(v), v, 0.0).astype(np.float32) for v in (x, y))
+    x, y = (_numbers(v.astype(np.float32, copy=False)) for v in (x, y))
     half = round(FURTHEST * blur)
     height, width = image.shape
     columns, rows = (_span(v, AROUND + half, size) for v, size in ((x, width), (y, height)))
@@ -45,6 +44,13 @@ def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: floa
     down: Any = y - np.float32(rows.start)
     found: Any = cv2.remap(levels, across, down, how, borderMode=cv2.BORDER_REPLICATE)
     return found
+
+
+def _numbers(places: Array) -> Array:
+    """Places with 0 for what is no number."""
+    if np.isfinite((places.min(), places.max())).all():  # of any that is none, one is none
+        return places
+    return np.where(np.isfinite(places), places, 0.0)
 
 
 def _span(places: Array, around: int, size: int) -> slice:
