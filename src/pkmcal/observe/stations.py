@@ -171,7 +171,8 @@ def _search(
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
-    closely = closely or T_camera_base is None
+    # of photographs that all took part in the descents none could disagree
+    closely = closely or T_camera_base is None or len(more) == len(few)
     if not closely and len(apart(view, likelier, more)) == 1:
         others = apart(view, candidates, more)[1:3]
         candidates = candidates[[*range(ALIKE), *others]]
