@@ -240,7 +240,7 @@ def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
     found = FoundStation(rough_pose(4), 0.5, 1.0, 0.02, told=True)
     two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(found=found)
 
-    def confirmed(view, _start, _rng):
+    def confirmed(view, _start, _rng, closely):
         return replace(found, by_chance=by_chance)
 
     monkeypatch.setattr(diagnose, "find_station", confirmed)

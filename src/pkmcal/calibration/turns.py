@@ -49,6 +49,9 @@ far."""
 ASTRAY = float(SHIFTS[-1]) / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
+NEARLY_ALL = 0.9
+"""Share of the legs, found where all others put them, above which a second look for the rest would
+hardly move the estimate, from which edges are looked for next."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
@@ -190,7 +193,8 @@ def _first_estimate(
     seen: SeenSession, total: int, told: Progress, lap: Callable[[str], None]
 ) -> Estimate:
     """Of photographs by hand, from what was measured when they were placed; else from legs that are
-    looked for as wholes, where they should be, and again where the first look has put them.
+    looked for as wholes, where they should be, and, unless nearly all were there, again where the
+    first look has put them.
     """
     session, photographs, boards, known = seen
     if all(p.station in known.edges for p in photographs):
@@ -205,14 +209,28 @@ def _first_estimate(
     ):
         done = _counted(told, text, total, share)
         search = partial(_whole_legs, known=known, reach=reach, done=done)
-        measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
+        looks = _each(photographs, search)
+        measurements = measurements_of(session, boards, _edges(looks))
         lap("observe")
         start = start or start_state(known.machine, measurements, known.T_camera_base)
         estimate = bundle(session.machine, measurements, start)
         lap("identify")
+        if _share_agreeing(looks, measurements.edges, estimate) > NEARLY_ALL:
+            break
         start = estimate.state
         known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
     return estimate
+
+
+def _share_agreeing(looks: list[legs.StationEdges], edges: EdgeSet, estimate: Estimate) -> float:
+    """Share of the legs that were looked for, hidden ones too, that were found where all others put
+    them.
+    """
+    missed = sum(len(look.rejected) for look in looks)
+    leg = np.stack([edges.station, edges.configuration, edges.leg], axis=-1)
+    found = len(np.unique(leg, axis=0))
+    elsewhere = len(np.unique(leg[estimate.edge_weights < 0.5], axis=0))
+    return (found - elsewhere) / (found + missed)
 
 
 def _whole_legs(

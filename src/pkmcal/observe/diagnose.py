@@ -139,11 +139,13 @@ def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> 
         if one.by_hand is None or other.by_hand is None:
             continue
         swapped = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
-        swapped = [s._replace(found=find_station(s.view, s.by_hand, rng)) for s in swapped]
+        swapped = [
+            s._replace(found=find_station(s.view, s.by_hand, rng, closely=True)) for s in swapped
+        ]
         if any(station.elsewhere for station in swapped):
             continue
         view = replace(one.view, tables=one.view.tables.mirrored())
-        mirrored = find_station(view, one.by_hand, rng)
+        mirrored = find_station(view, one.by_hand, rng, closely=True)
         if not (mirrored.good and mirrored.likelier(swapped[0].found) > DECIDED):
             return InputError(
                 f"stations {one.name} and {other.name} are mixed up",
@@ -192,8 +194,10 @@ def _likelier(
         return None
     view, found = station.view, station.found
     seen = [h.view() for h in others]
-    searched = [find_station(other, station.by_hand, rng) for other in seen]
-    places = np.stack([found.T_camera_base, *(f.T_camera_base for f in searched)])
+    own, *searched = (
+        find_station(each, station.by_hand, rng, closely=True) for each in (view, *seen)
+    )
+    places = np.stack([f.T_camera_base for f in (found, own, *searched)])
     named = evidence_from(view, places)
     odds = [(evidence_from(other, places) - named) / found.grain for other in seen]
     better = [

@@ -179,15 +179,13 @@ def score(
     chord = end - begin
     direction = view.tables.direction(of_components(-chord[..., 1], chord[..., 0]))
     fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
-    points = of_components(
-        *(begin[..., None, k] + fraction * chord[..., None, k] for k in (0, 1))
-    )  # (H, K, E, n, 2)
-    number = np.arange(len(view.configuration))[photographs][:, None, None]
-    found, inside = view.tables.look(direction[..., None], points, number)
-    cost = np.where(inside & ok[..., None], np.minimum(found, reach) / reach, 1.0)
+    points = begin + fraction[:, None, None, None, None] * chord  # (n, H, K, E, 2)
+    number = np.arange(len(view.configuration))[photographs][:, None]
+    found, inside = view.tables.look(direction, points, number)
+    cost = np.where(inside & ok, np.minimum(found, reach) / reach, 1.0).mean(axis=0)
     weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
     total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
-    return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / total
+    return np.sum(cost * weight, axis=(1, 2)) / total
 
 
 class _Mixture(NamedTuple):

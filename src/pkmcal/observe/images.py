@@ -110,12 +110,11 @@ def _check_depth(data: bytes, label: str) -> None:
 
 def _check_png(data: bytes, label: str) -> None:
     """Raise `InputError` where a PNG file is cut short, or a byte of it is not what it was."""
-    at = PNG_START
+    at, whole = PNG_START, memoryview(data)
     while (end := at + 12 + int.from_bytes(data[at : at + 4])) <= len(data):
-        body = data[at + 4 : end - 4]
-        if zlib.crc32(body) != int.from_bytes(data[end - 4 : end]):
+        if zlib.crc32(whole[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
             raise _broken(label, "a PNG file that is damaged")
-        if body.startswith(b"IEND"):
+        if data[at + 4 : at + 8] == b"IEND":
             return
         at = end
     raise _broken(label, "a PNG file that ends early")

@@ -14,11 +14,13 @@ forgotten with it, and a few hundred numbers of its edges remain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
@@ -28,6 +30,7 @@ from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
 from pkmcal.observe.images import Selected, fitting
+from pkmcal.observe.levels import levels_at
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -111,27 +114,6 @@ class LegPlaces:
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
 
 
-def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
-    """Grey levels of K images at pixels (K, E, ..., 2): (K, E, ...), interpolated."""
-    import cv2
-
-    kind = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
-    # one row an edge: cv2.remap takes at most 32767 rows and columns
-    shape = (*pixel.shape[:2], -1)
-    x, y = (np.array(pixel[..., k], np.float32, order="C").reshape(shape) for k in (0, 1))
-    for place in (x, y):
-        place[~np.isfinite(place)] = -9.0
-    out = np.empty(x.shape, dtype=np.float32)
-    columns: Any
-    rows: Any
-    grey: Any
-    for image, columns, rows, grey in zip(images, x, y, out, strict=True):
-        # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
-        levels = image.astype(np.float32, copy=False)
-        cv2.remap(levels, columns, rows, kind, dst=grey, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(pixel.shape[:-1])
-
-
 def search_legs(
     images: Sequence[Integers],
     tubes: TubeList,
@@ -143,13 +125,16 @@ def search_legs(
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
-    strength = gradient_strength(images, points, reach + TILTS[-1])[0]
-    weight = clear.astype(np.float32)
     steps = np.arange(-reach, reach + 0.5)
+    offsets = np.arange(steps[0] - TILTS[-1], steps[-1] + TILTS[-1] + 0.5)
+    strength = np.zeros((*clear.shape, len(offsets)), np.float32)
+    for k, (image, seen) in enumerate(zip(images, clear, strict=True)):
+        at = points.pixel[k][seen], points.outward[k][seen]
+        strength[k][seen] = gradient_strength(image, *at, offsets)
     place = place_on_leg(points.along, clear, tubes)
-    scores = _by_tilt(strength * weight[..., None], place, TILTS, len(steps), tubes)
+    scores = _by_tilt(strength, place, TILTS, len(steps), tubes)
     legs = range(tubes.leg.max() + 1)
-    total = np.stack([weight[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
+    total = np.stack([clear[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
     points_of = np.array([max(int((tubes.leg == leg).sum()) * clear.shape[2], 1) for leg in legs])
     scores /= np.maximum(total, 1.0)[..., None, None]
     return _choose(scores, total, total / points_of, steps)
@@ -169,44 +154,41 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
         ends = towards[..., :1], towards[..., -1:]
         wide = [np.broadcast_to(end, (*end.shape[:-1], beyond)) for end in ends]
         towards = np.concatenate([wide[0], towards, wide[1]], axis=-1)
-    step = np.arange(count, dtype=np.int32) + (room + beyond)
-    row = np.arange(place.size, dtype=np.int32).reshape(place.shape) * towards.shape[-1]
-    flat = towards.ravel()
+    windows = sliding_window_view(towards.reshape(-1, towards.shape[-1]), count, axis=-1)
+    row = np.arange(place.size).reshape(place.shape)
+    legs, first_edge = np.unique(tubes.leg, return_index=True)  # tubes come leg by leg
     out = np.zeros((len(values), tubes.leg.max() + 1, len(tilts), count), values.dtype)
     for i, tilt in enumerate(tilts):
-        first = row + np.rint(tilt * place).astype(np.int32)
-        by_edge = flat.take(first[..., None] + step).sum(axis=2)
-        for leg in range(out.shape[1]):
-            out[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
+        first = np.rint(tilt * place).astype(int) + (room + beyond)
+        by_edge = windows[row, first].sum(axis=2)
+        out[:, legs, i] = np.add.reduceat(by_edge, first_edge, axis=1)
     return out
 
 
-def gradient_strength(
-    images: Sequence[Integers], points: EdgePoints, reach: float
-) -> tuple[Array, Array]:
-    """Strength 0..1 of grey-level edges across the predicted ones, (K, E, n, offsets).
+def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Array) -> Array:
+    """Strength 0..1 of a photograph's edges across predicted ones, (n, offsets).
 
-    Also the offsets, whole pixels outward.
+    pixel, outward : (n, 2) of points of these. offsets : whole pixels outward, one by one.
     """
-    offsets = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
-    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
-    wide = wide.astype(np.float32)
-    x, y = (
-        points.pixel[..., None, k].astype(np.float32)
-        + wide * points.outward[..., None, k].astype(np.float32)
-        for k in (0, 1)
-    )
-    pixel = of_components(x, y)
     import cv2
 
-    kernel = cv2.getGaussianKernel(2 * round(4 * SMOOTH) + 1, SMOOTH, cv2.CV_32F)
-    smooth = (cv2.sepFilter2D(im, cv2.CV_32F, kernel, kernel) for im in images)
-    level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
-    slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
+    wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
+    level = np.sqrt(255.0 * levels_at(image, *_outward_of(pixel, outward, wide), blur=SMOOTH))
+    slope = np.abs(level[:, 2:] - level[:, :-2]) / 2
     about = np.ones((1, 2 * PEAK + 1), np.uint8)
-    peak = cv2.dilate(slope.reshape(-1, slope.shape[-1]), about).reshape(slope.shape)
-    sharp = slope / np.maximum(peak, 1e-6)
-    return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2), offsets
+    sharp = slope / np.maximum(cv2.dilate(slope, about), 1e-6)
+    return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2)
+
+
+def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]:
+    """Columns and rows (n, offsets) of pixels (n, 2) moved so far along unit vectors (n, 2), single
+    precision.
+    """
+    away = offsets.astype(np.float32)
+    for k in (0, 1):
+        moved = away * outward[:, k, None].astype(np.float32)
+        moved += pixel[:, k, None].astype(np.float32)
+        yield moved
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
@@ -401,12 +383,11 @@ class _Seen:
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
     tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, PLACES)
-    grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
+    full, across = _segment_profiles(photographs, points, clear, half_width)
     return _Seen(tubes, places, full, across)
 
 
@@ -445,37 +426,52 @@ def predicted(
     return tubes, points, clear
 
 
-def _profile_pixels(camera: Camera, points: EdgePoints) -> Array:
-    """Pixels (K, E, PLACES * BETWEEN, offsets, 2) of profiles across the edges.
-
-    Points of an edge lie evenly on a line in space, so those between are interpolated there and
-    projected; the profiles' directions hardly turn from one to the next.
-    """
-    start, step = points.point[..., :1, :], np.diff(points.point[..., :2, :], axis=-2)
-    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
-    along = of_components(*(start[..., k] + fraction * step[..., k] for k in range(3)))
-    pixel = camera.project(along).astype(np.float32)
-    outward = np.repeat(points.outward.astype(np.float32), BETWEEN, axis=-2)
-    away = profiles.profile_offsets().astype(np.float32)
-    return of_components(*(pixel[..., None, k] + away * outward[..., None, k] for k in (0, 1)))
-
-
 def _segment_profiles(
-    grey: Array, clear: Booleans, half_width: Array
+    photographs: Photographs, points: EdgePoints, clear: Booleans, half_width: Array
 ) -> tuple[Booleans, profiles.Profiles]:
     """Mean profiles over each segment's clear samples.
 
     Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
     """
-    k, e, n = clear.shape
-    seen = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
-    count = seen.sum(axis=-1)
-    full = count >= FEWEST_SHARE * seen.shape[-1]
-    kept = grey.reshape(*seen.shape, -1) * seen[..., None]
-    mean = kept.sum(axis=-2)[full] / count[full][:, None]
-    saturated = kept.max(axis=-2)[full] >= profiles.SATURATED
-    cut = profiles.cut_of(saturated, half_width[full])
+    count = BETWEEN * _by_segment(clear).sum(axis=-1)
+    full = count >= FEWEST_SHARE * (BETWEEN * PLACES / SEGMENTS)
+    seen = np.repeat(_by_segment(clear)[full], BETWEEN, axis=-1)
+    seen = seen[:, None].astype(np.float32)
+    outward = np.repeat(_by_segment(points.outward)[full], BETWEEN, axis=-2)
+    pixel = photographs.camera.project(_between(points, full))
+    offsets = profiles.profile_offsets()
+    total = np.empty((len(seen), 1, len(offsets)), np.float32)
+    clipped = np.empty_like(total)
+    parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
+    for image, part in zip(photographs.images, parts, strict=True):
+        mine = slice(*part)
+        across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)
+        # a row a segment: what lies close in the photograph is interpolated together
+        rows = (v.reshape(len(seen[mine]), -1) for v in across)
+        grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
+        np.matmul(seen[mine], grey, out=total[mine])
+        np.matmul(seen[mine], grey >= profiles.SATURATED, out=clipped[mine])
+    cut = profiles.cut_of(clipped[:, 0] > 0, half_width[full])
+    mean = total[:, 0] / count[full][:, None]
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
+
+
+def _by_segment(values: Array | Booleans) -> Any:
+    """Values (K, E, PLACES, ...) of edges' points, (K, E, SEGMENTS, points of one, ...)."""
+    return values.reshape(*values.shape[:2], SEGMENTS, -1, *values.shape[3:])
+
+
+def _between(points: EdgePoints, full: Booleans) -> Array:
+    """Places (N, n, 3) of all n profiles in each of the N segments that are ``full``.
+
+    Points of an edge lie evenly on a line in space, so those between are interpolated there; the
+    profiles' directions hardly turn from one to the next.
+    """
+    k, e, segment = np.nonzero(full)
+    start, step = points.point[..., 0, :], points.point[..., 1, :] - points.point[..., 0, :]
+    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
+    mine = fraction.reshape(SEGMENTS, -1)[segment]
+    return of_components(*(start[k, e, c, None] + mine * step[k, e, c, None] for c in range(3)))
 
 
 def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList) -> Array:

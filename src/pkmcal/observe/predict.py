@@ -198,22 +198,23 @@ def unobstructed(
     outline spoils the point's background. (K, E, n).
     """
     clear = edges.valid & camera.in_image(edges.pixel, margin=4.0)
-    rays = edges.point / np.sqrt(dot(edges.point, edges.point))[..., None]
+    reach = np.sqrt(dot(edges.point, edges.point))
+    rays = edges.point / reach[..., None]
     room = clearance / np.maximum(edges.gain, 1e-9)
     for j in range(machine.n_legs):
         others = machine.values[machine.layout.radius[j]]
         if others.size == 0:
             continue
         a, b, u = (v[:, None, None, j] for v in (legs.a, legs.b, legs.u))
-        cosine = dot(rays, u)
-        sine2 = np.maximum(1 - cosine**2, 1e-9)
-        place = (cosine * dot(rays, a) - dot(u, a)) / sine2
-        foot = a + np.clip(place, 0, np.sqrt(dot(b - a, b - a)))[..., None] * u
-        off = cross(rays, foot)
-        distance = np.sqrt(dot(off, off))
-        depth = dot(rays, foot)
-        nearer = depth < dot(rays, edges.point)
-        spoiled = (depth > 0) & (distance < others.max() + room)
-        spoiled &= nearer | (distance > others.min() - room)
+        length, start = np.sqrt(dot(b - a, b - a)), dot(u, a)
+        cosine, ahead = dot(rays, u), dot(rays, a)
+        # the place on the leg's axis, m from a, that is nearest to the ray; depth is along the ray
+        place = (cosine * ahead - start) / np.maximum(1 - cosine**2, 1e-9)
+        place = np.clip(place, 0, length)
+        depth = ahead + place * cosine
+        distance2 = dot(a, a) + place * (2 * start + place) - depth**2
+        spoiled = (depth > 0) & (distance2 < (others.max() + room) ** 2)
+        within = others.min() - room
+        spoiled &= (depth < reach) | (distance2 > within * np.abs(within))
         clear &= ~(spoiled & (tubes.leg != j)[:, None])
     return clear

@@ -112,7 +112,7 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=2048)
 def _projections(blur: float, half_width: float, cut: int) -> Array:
-    """Orthonormal bases of the model's profiles at each trial position, (shifts, samples, 5).
+    """Orthonormal bases of the model's profiles at each trial position, (5, samples, shifts).
 
     cut : samples at the inner end that are not used; their rows are zero.
     The weak beliefs about the shading are rows below the samples, whose data are zero; only the
@@ -125,7 +125,8 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     beliefs = np.zeros((len(SHIFTS), 2, BRIGHTNESSES))
     beliefs[:, 0, 1] = MODEL_ERROR / SHADING_SLOPE
     beliefs[:, 1, 2] = MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
-    return np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
+    bases = np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
+    return np.ascontiguousarray(bases.T)
 
 
 @dataclass(frozen=True)
@@ -200,9 +201,9 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
         mine = kind == number
         w, cut = divmod(int(number), scaled.shape[1])
         bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
-        part = scaled[mine] @ bases.transpose(1, 0, 2).reshape(bases.shape[1], -1)
-        explained = np.sum(part.reshape(len(part), len(SHIFTS), -1) ** 2, axis=-1)
-        out[mine] = np.sum(scaled[mine] ** 2, axis=1, keepdims=True) - explained
+        part = scaled[mine]
+        out[mine] = np.sum(part**2, axis=1, keepdims=True)
+        out[mine] -= sum((part @ basis) ** 2 for basis in bases)
     return np.maximum(out, 0.0)
 
 

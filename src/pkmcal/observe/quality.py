@@ -9,7 +9,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import SEARCH_SAMPLES, Photographs, predicted, sample, search_legs
+from pkmcal.observe.legs import SEARCH_SAMPLES, Photographs, predicted, search_legs
+from pkmcal.observe.levels import levels_at
 from pkmcal.observe.profiles import SATURATED
 
 BLACK = 8
@@ -80,7 +81,11 @@ def _quality(
 
     def look(outward: Array) -> Array:
         pixel = points.pixel[..., None, :] + outward[..., None] * points.outward[..., None, :]
-        return sample(photographs.images, pixel, cubic=False)
+        flat = pixel.reshape(*pixel.shape[:2], -1, 2)  # a row an edge
+        pairs = zip(photographs.images, flat, strict=True)
+        return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs]).reshape(
+            pixel.shape[:-1]
+        )
 
     inside = look(edge - ACROSS * half_width)
     offsets = np.arange(-REACH, REACH + PITCH / 2, PITCH)

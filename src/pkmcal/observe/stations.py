@@ -47,6 +47,8 @@ pictures hardly tell which is near, least of all of three legs that are alike.""
 SHAKEN, LIKELY = 48, 16
 """Poses beside the best ones that are tried before the last descent, and of how many two steps have
 shown that they may be the best."""
+ALIKE = 4
+"""Of the likeliest places, where all are one, those that are settled without a look beside them."""
 NEARBY = 8
 """Places of each of thirty hypotheses that are settled."""
 HALVES, THIRDS, HALVES_TOLD = 7, 5, 4
@@ -101,10 +103,16 @@ class FoundStation:
 
 
 def find_station(
-    view: StationView, T_camera_base: Array | None, rng: np.random.Generator
+    view: StationView,
+    T_camera_base: Array | None,
+    rng: np.random.Generator,
+    closely: bool = False,
 ) -> FoundStation:
     """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
     of few; what the others say of it decides, each in its turn. Then every photograph takes part.
+
+    closely : look beside the likeliest places though they are one, as is done of searches from
+    nothing, for evidence that is to be compared.
     """
     count = len(view.configuration)
     number = np.arange(count)
@@ -115,12 +123,12 @@ def find_station(
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
         asked = number % folds == fold
         searched, other = np.flatnonzero(~asked), np.flatnonzero(asked)
-        found = _search(view.select(searched), T_camera_base, rng)
+        found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
         if _by_chance(surely) < BY_CHANCE / DECIDED:
             break
-    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
+    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
     candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
@@ -148,7 +156,9 @@ def find_station(
     )
 
 
-def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Generator) -> Array:
+def _search(
+    view: StationView, T_camera_base: Array | None, rng: np.random.Generator, closely: bool
+) -> Array:
     """Up to three places (H, 4, 4), the one with the most evidence first."""
     few, more = view.few(4), view.few(8)
     if T_camera_base is None:
@@ -160,18 +170,33 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
         candidates = _random_search(view, T_camera_base, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
-    candidates = descend(view, candidates, more, 5, (5, 4, 4, 3))
-    candidates = _best(view, candidates, more, reach=3, keep=24)
-    candidates = candidates[apart(view, candidates, more)[:4]]
+    likelier = candidates[: len(candidates) // 2]
+    # of photographs that all took part in the descents none could disagree
+    closely = closely or T_camera_base is None or len(more) == len(few)
+    if not closely and len(apart(view, likelier, more)) == 1:
+        others = apart(view, candidates, more)[1:3]
+        candidates = candidates[[*range(ALIKE), *others]]
+    else:
+        candidates = _best_about(view, candidates, more, rng)
+    candidates, evidence = settle(view, candidates, more, 5, 5)
+    candidates = candidates[np.argsort(-evidence)]
+    return candidates[apart(view, candidates, more)[:3]]
+
+
+def _best_about(
+    view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
+) -> Array:
+    """The likeliest places (H, 4, 4) that candidates descend to, and beside these."""
+    candidates = descend(view, candidates, photographs, 5, (5, 4, 4, 3))
+    candidates = _best(view, candidates, photographs, reach=3, keep=24)
+    candidates = candidates[apart(view, candidates, photographs)[:4]]
     # the picture is rugged: what lies beside a good place may be better
     beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 3, 2)
-    candidates, evidence = settle(view, candidates[np.argsort(-evidence)[:LIKELY]], more, 5, 5)
-    candidates = candidates[np.argsort(-evidence)]
-    return candidates[apart(view, candidates, more)[:3]]
+    candidates, evidence = settle(view, np.concatenate([candidates, turned]), photographs, 3, 2)
+    return candidates[np.argsort(-evidence)[:LIKELY]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:

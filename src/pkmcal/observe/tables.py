@@ -114,10 +114,11 @@ class DistanceTables:
         x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
-        number = self.row[photograph]
-        column = (number // rows * count + direction) * width
-        out = x + column, y + number % rows * height
-        x, y = (np.where(inside, v, 0.0).astype(np.float32) for v in out)
+        # in the single precision of a search, in which columns and rows below 2**15 lose nothing
+        number = self.row[photograph].astype(np.int32)
+        column = ((number // rows * count + direction) * width).astype(np.float32)
+        line = (number % rows * height).astype(np.float32)
+        x, y = (np.where(inside, v, 0.0) for v in (x + column, y + line))
         return x, y, inside
 
     def _looked_up(self, x: Array, y: Array, how: int) -> Array:
@@ -169,7 +170,8 @@ def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
     matter.
     """
     turn = np.arctan2(normal[..., 1], normal[..., 0]) * (count / np.pi)
-    return np.floor(np.nan_to_num(turn)).astype(np.int32) % count
+    with np.errstate(invalid="ignore"):  # what is no number has any
+        return np.floor(turn).astype(np.int32) % count
 
 
 def distances(
