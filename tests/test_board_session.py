@@ -186,7 +186,7 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     session = load_session(folder)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    T = station_poses(session, photographs, boards, np.random.default_rng(0))
+    T = station_poses(session, photographs, boards, np.random.default_rng(1))
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     # without the board too: a pose by hand that shows nothing is only where the search begins
     rngs = [np.random.default_rng(seed) for seed in (0, 1)]

@@ -129,6 +129,8 @@ def search_legs(
     offsets = np.arange(steps[0] - TILTS[-1], steps[-1] + TILTS[-1] + 0.5)
     strength = np.zeros((*clear.shape, len(offsets)), np.float32)
     for k, (image, seen) in enumerate(zip(images, clear, strict=True)):
+        if not seen.any():  # no leg is in the picture
+            continue
         at = points.pixel[k][seen], points.outward[k][seen]
         strength[k][seen] = gradient_strength(image, *at, offsets)
     place = place_on_leg(points.along, clear, tubes)
