@@ -114,6 +114,35 @@ def test_silhouettes_are_where_the_edge_normals_say(a, b, radius, view):
         assert error.std() < 0.05
 
 
+def test_a_pixel_has_the_mean_over_its_area():
+    """As much light as in pixels a quarter as wide, at borders and beside them: of a tube with a
+    highlight and of its shadow.
+    """
+    tube = Material(0.6, gloss=0.3)
+    wall = Box(np.array([0.0, 0.3, 0.0]), np.eye(3), np.array([0.3, 0.01, 0.3]))
+    parts = [
+        ScenePart(between((0.05, 0, -0.2), (-0.03, 0.02, 0.2), 0.02), tube),
+        ScenePart(wall, Material()),
+    ]
+    lamp = Lamp(np.array([0.6, -1.0, 0.4]), radius=0.001, power=0.7, reach=1.3, shadows=True)
+
+    def seen(scale):
+        middle = [100 * scale - 0.5, 75 * scale - 0.5]
+        parameters = np.array([178.0 * scale, 178.0 * scale, *middle, 0, 0, 0, 0, 0])
+        camera = camera_models()["pinhole"]((200 * scale, 150 * scale), parameters)
+        return picture(parts, PixelRays.of(camera), Lighting((lamp,), 0.1, 0.05))
+
+    mean = seen(4).reshape(150, 4, 200, 4).mean(axis=(1, 3))
+    off = seen(1) - mean
+    border = np.abs(np.gradient(mean, axis=1)) > 0.02
+    assert np.count_nonzero(border) > 1000
+    assert np.ptp(mean) > 0.5
+    # points in a border pixel tell its share to one in thirty
+    assert np.abs(off).max() < 0.05 * np.ptp(mean)
+    assert np.sqrt(np.mean(off[border] ** 2)) < 0.006
+    assert abs(off[border].mean()) < 0.001
+
+
 def test_nearer_shapes_hide_farther_ones(view):
     upright, level = between((0, 0, -0.2), (0, 0, 0.2), 0.03), ((-0.2, 0, 0), (0.2, 0, 0))
     middle = tuple(np.rint(CAMERA.project(apply(FRONT, np.zeros(3)))).astype(int)[::-1])

@@ -5,9 +5,10 @@ shapes with a bounding ball in that cone are tried: a leg costs what it covers. 
 first is lit by what the point sees of the lamp.
 
 Each pixel is first looked at once, through its centre. Where the label (shape, face, shadow) of a
-pixel differs from a neighbour's, the pixel is looked at again through points spread over its area,
-so its grey level is the mean over the pixel. Then follow the lens's blur, the sensor's noise
-and 8 bits, linear in the light.
+pixel differs from a neighbour's, the pixel is looked at again, so that its grey level is the mean
+over its area: through its corners where these show what its centre shows, for no border that is
+straight over a pixel passes between them, and through points spread over the area where they do
+not. Then follow the lens's blur, the sensor's noise and 8 bits, linear in the light.
 """
 
 from __future__ import annotations
@@ -259,9 +260,10 @@ def render(scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.G
     origin = -rot @ T_camera_base[:3, 3]
     bounds = Bounds.of([part.shape for part in scene.parts])
     blind = np.isnan(view.centre[0])
-    light, label, seen = _through_centres(scene, bounds, origin, rot, view, blind)
-    border = _borders(label, light) & ~blind
-    light[border] = _over_area(scene, bounds, origin, rot, view, border, seen, rng)
+    hits = _through_centres(scene, bounds, origin, rot, view, blind)
+    light = hits.light
+    border = _borders(hits.label, light) & ~blind
+    light[border] = _over_area(scene, bounds, origin, rot, view, border, hits, rng)
     light[blind] = 0.0
     return light
 
@@ -306,12 +308,12 @@ def _through_centres(
 
 def _over_area(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, border: Booleans,
-    seen: Array, rng: np.random.Generator,
+    hits: RayHits, rng: np.random.Generator,
 ) -> Array:  # fmt: skip
     """Mean light (n,) over the area of each border pixel, in the order of the mask.
 
-    seen : (H, W) of the lamp through the pixels' centres. Where a pixel and all its neighbours see
-    the same whole lamp, or none of it, so does every point between; most borders are such.
+    hits : (H, W) through the pixels' centres. Where a pixel and all its neighbours see the same
+    whole lamp, or none of it, so does every point between; most borders are such.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -321,14 +323,19 @@ def _over_area(
     order = np.lexsort((wanted % width // TILE, wanted // width // TILE))
     at = wanted[order]
     offsets = (_pattern()[None] + rng.random((at.size, 1, 2))) % 1.0
-    out = np.empty(at.size)
     corner = view.corner.reshape(3, -1)
     first = at // width * (width + 1) + at % width
+    label, around = _through_corners(scene, bounds, origin, rot, corner, first, width)
+    # of light that bends evenly over a pixel, a third of what its corners have more is its mean's
+    out = hits.light.ravel()[at]
+    bend = (around.mean(axis=1) - out) / 3
+    out += bend
+    whole = np.all(label == hits.label.ravel()[at, None], axis=1) & (np.abs(bend) < LEAST_STEP)
+    seen = hits.seen
     alike = (maximum_filter(seen, 3) == minimum_filter(seen, 3)).ravel()[at]
     for known in (True, False):
-        part = np.flatnonzero(alike == known)
-        group = part[np.arange(part.size + -part.size % TILE).clip(max=part.size - 1)]
-        for rows in _chunks(group.reshape(-1, TILE)) if part.size else []:
+        part = np.flatnonzero(~whole & (alike == known))
+        for rows in _chunks(_grouped(part, TILE)):
             fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
             c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
             d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
@@ -347,6 +354,36 @@ def _over_area(
     result = np.empty(at.size)
     result[order] = out
     return result
+
+
+def _through_corners(
+    scene: Scene, bounds: Bounds, origin: Array, rot: Array, corner: Array, first: Integers,
+    width: int,
+) -> tuple[Integers, Array]:  # fmt: skip
+    """Labels and light (n, 4) at the corners of pixels, -2 where a corner sees nothing.
+
+    corner : (3, (H + 1) (W + 1)) rays. first : (n,) each pixel's upper left one of these.
+    """
+    # each once, in the order of the pixels that have it first
+    numbers, begins, which = np.unique(
+        first[:, None] + (0, 1, width + 1, width + 2), return_index=True, return_inverse=True
+    )
+    order = np.argsort(begins, kind="stable")
+    seeing = order[np.isfinite(corner[:, numbers[order]]).all(axis=0)]
+    label, light = np.full(numbers.size, -2, dtype=np.int16), np.zeros(numbers.size)
+    for rows in _chunks(_grouped(seeing, TILE * TILE)):
+        found = look(scene, bounds, origin, turned(rot, corner[:, numbers[rows]]))
+        label[rows], light[rows] = found.label, found.light
+    which = which.reshape(-1, 4)
+    return label[which], light[which]
+
+
+def _grouped(numbers: Integers, size: int) -> Integers:
+    """Numbers in rows of so many; the last one is repeated until its row is full."""
+    if not numbers.size:
+        return numbers.reshape(0, size)
+    full = np.arange(numbers.size + -numbers.size % size).clip(max=numbers.size - 1)
+    return numbers[full].reshape(-1, size)
 
 
 def _pattern() -> Array:
