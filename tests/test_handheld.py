@@ -338,8 +338,11 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
     turned = np.einsum("nji,nj->ni", first.edges.basis[mine], turned)[:, 0]
     stated = (first.edges.by_intrinsics[mine] @ p.camera.focal_part)[:, 0] * excess
     assert np.abs(stated).max() > 1e-4
-    slope = (turned @ stated) / (stated @ stated)
-    assert slope == pytest.approx(1.0, abs=0.1)
+    # the slope with the smallest sum of deviations: an edge that takes another highlight counts once
+    slopes = turned / stated
+    order = np.argsort(slopes)
+    share = np.cumsum(np.abs(stated)[order])
+    assert slopes[order][np.searchsorted(share, share[-1] / 2)] == pytest.approx(1.0, abs=0.1)
 
 
 def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
