@@ -338,7 +338,7 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
     turned = np.einsum("nji,nj->ni", first.edges.basis[mine], turned)[:, 0]
     stated = (first.edges.by_intrinsics[mine] @ p.camera.focal_part)[:, 0] * excess
     assert np.abs(stated).max() > 1e-4
-    # the slope with the smallest sum of deviations: an edge that takes another highlight counts once
+    # by least absolute deviations, for an edge may take another highlight the second time
     slopes = turned / stated
     order = np.argsort(slopes)
     share = np.cumsum(np.abs(stated)[order])

@@ -23,7 +23,6 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.scatter import (
-    LEAST,
     PAIR,
     TINY,
     EdgeScatter,
@@ -68,7 +67,7 @@ def edge_noise(
         squares = along[:, own], rest[:, own], size[:, own]
         found.append(_student(*squares, weight[:, own], *begin, tails))
     scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
-    return EdgeScatter(np.maximum(scale, LEAST), shading, tails)
+    return EdgeScatter(scale, shading, tails)
 
 
 def _squares(info: Information) -> tuple[Array, Array, Array]:

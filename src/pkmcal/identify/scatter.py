@@ -15,11 +15,6 @@ from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 
 PAIR = 2
 """Numbers that an edge measures."""
-LEAST = 0.75
-"""Of the stated deviation at least, whatever the data say: what neighbours have in common beside
-what shades them, the parameters take up in part, and residuals come out smaller than errors are.
-How much is no result of theory: on seventeen path-traced sessions errors were as stated with it,
-and with residuals believed as they are, a tenth larger."""
 TINY = 1e-12
 
 
@@ -84,8 +79,7 @@ class EdgeScatter:
         """Deviations as many times as far from another's, with these tails."""
         scale = before.scale * (self.scale / before.scale) ** pace
         shading = before.shading * (self.shading / before.shading) ** pace
-        least = np.maximum(scale, LEAST), np.maximum(shading, OWN_SHADING)
-        return replace(self, scale=least[0], shading=least[1])
+        return replace(self, scale=scale, shading=np.maximum(shading, OWN_SHADING))
 
     def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
         """The edges with this noise."""
