@@ -11,12 +11,11 @@ import shutil
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
-import typer.main
 
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
@@ -41,11 +40,6 @@ class Run:
     def json(self):
         """The one object on stdout."""
         return json.loads(self.out, parse_constant=pytest.fail)
-
-
-# The commands' options are made of their signatures, which takes 20 ms; a person's process does it
-# once, and so does one of tests.
-typer.main.get_command = cache(typer.main.get_command)
 
 
 def run(*words) -> Run:

@@ -65,6 +65,13 @@ def test_help_imports_nothing_heavy():
     assert python("-c", code).stdout == "[]\n"
 
 
+def test_a_command_loads_no_other():
+    ask = "cli.main(['calibrate', '--help'])"
+    tell = "print([m[16:] for m in sys.modules if m[16:] in cli.COMMANDS], file=sys.stderr)"
+    code = f"import sys; from pkmcal.commands import cli; {ask}; {tell}"
+    assert python("-c", code).stderr == "['calibrate']\n"
+
+
 def test_no_arguments_show_the_help():
     done = run()
     assert done == run("--help")

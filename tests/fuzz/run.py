@@ -319,8 +319,6 @@ def warm() -> None:
     import importlib
     import pkgutil
 
-    import typer.main
-
     import pkmcal
     from pkmcal.commands import cli
 
@@ -330,10 +328,8 @@ def warm() -> None:
     for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "plotly.offline", "jinja2",
                  "rich.table", "rich.markup", "rich.text"):  # fmt: skip
         importlib.import_module(name)
-    # Of the time of a refusal the half would go into Typer's reading of all the commands' options.
-    command = typer.main.get_command(cli.app)
-    typer.main.get_command = lambda _: command
+    # Of the time of a refusal the half would go into Typer's reading of the command's options.
     with redirect_stdout(StringIO()):
-        cli.main(["--version"])
+        cli.main(["--help"])
     gc.collect()
     gc.freeze()  # or a case would copy what the collector touches

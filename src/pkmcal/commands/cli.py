@@ -13,29 +13,15 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Annotated, cast
+from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
+from typing import Annotated, Any, cast
 
 import typer
+import typer.core
+import typer.main
 
-from pkmcal.commands import (
-    board,
-    calibrate,
-    camera,
-    check,
-    demo,
-    diff,
-    export,
-    new,
-    plan,
-    reproduce,
-    servo,
-    simulate,
-    study,
-    validate,
-    view,
-    watch,
-)
 from pkmcal.commands.console import print_error
 from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError
@@ -52,35 +38,54 @@ makes 80,000 as it is loaded, which live until it ends."""
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 """The base of all complaints about options; typer gives it no public name."""
 
-COMMANDS: dict[str, Callable[..., int]] = {
-    "demo": demo.demo,
-    "new": new.new,
-    "check": check.check,
-    "view": view.view,
-    "board": board.board,
-    "camera": camera.camera,
-    "plan": plan.plan,
-    "calibrate": calibrate.calibrate,
-    "validate": validate.validate,
-    "servo": servo.servo,
-    "export": export.export,
-    "watch": watch.watch,
-    "diff": diff.diff,
-    "simulate": simulate.simulate,
-    "study": study.study,
-    "reproduce": reproduce.reproduce,
-}
-"""In the order of the help: the order in which a newcomer needs them."""
+COMMANDS = (
+    "demo",
+    "new",
+    "check",
+    "view",
+    "board",
+    "camera",
+    "plan",
+    "calibrate",
+    "validate",
+    "servo",
+    "export",
+    "watch",
+    "diff",
+    "simulate",
+    "study",
+    "reproduce",
+)
+"""In the order of the help: the order in which a newcomer needs them. Each is the function of its
+name in the module of its name."""
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands, each loaded when it is asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*COMMANDS, *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return _made(cmd_name) if cmd_name in COMMANDS else super().get_command(ctx, cmd_name)
+
+
+@cache
+def _made(name: str) -> Any:
+    """One of our commands, as typer has it: to read the options of all takes it 20 ms."""
+    alone = typer.Typer(rich_markup_mode=None, add_completion=False)
+    alone.command(name)(getattr(import_module(f"pkmcal.commands.{name}"), name))
+    return typer.main.get_command(alone)
+
 
 app = typer.Typer(
     name="pkmcal",
+    cls=_Commands,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Begin with: pkmcal demo. With your own machine: pkmcal new my-machine.",
 )
-for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
 
 
 def _show_version(wanted: bool) -> None:
