@@ -51,7 +51,7 @@ class Kit:
 
     def calibrated(self):
         """By the program; its detector is replaced by the corners, as there are no pictures."""
-        with patch("pkmcal.boards.views.detect_in", lambda *_: self.detections):
+        with patch("pkmcal.boards.stations.detect_in", lambda *_: self.detections):
             return calibrate(self.folder)
 
 

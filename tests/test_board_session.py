@@ -13,7 +13,8 @@ import pytest
 from conftest import run
 from faults import replaced
 from pkmcal.boards.prints import Print
-from pkmcal.boards.views import Boards, StationBoard, find_boards
+from pkmcal.boards.stations import find_boards
+from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.calibration.recognise import (
     boards_of,
     check_observable,

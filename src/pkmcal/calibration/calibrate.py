@@ -6,13 +6,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
 from pkmcal.calibration.departures import Departed, departures
 from pkmcal.calibration.diameters import check_radii
@@ -44,7 +43,6 @@ from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
-from pkmcal.identify.bed import bed_of
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import (
@@ -62,6 +60,10 @@ from pkmcal.papers import Method as PaperMethod
 from pkmcal.papers.conditions import conditions
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
+
+if TYPE_CHECKING:
+    from pkmcal.calibration.aside import LeftOut
+    from pkmcal.identify.bed import Bed
 
 Method = Literal["bundle"] | PaperMethod
 METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
@@ -257,6 +259,8 @@ def _estimated(
     """
     out = None
     if holdout:
+        from pkmcal.calibration.aside import LeftOut, chosen, set_aside
+
         region = chosen(drawing, turns.estimate, turns.measurements, holdout)
         out = LeftOut(region, turns.measurements)
         turns = set_aside(drawing, turns, region)
@@ -342,7 +346,11 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
         seen = np.ones_like(seen)
     told = what_data_tell(measurements, estimate)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
-    bed = bed_of(measurements, estimate) if only_heights(estimate) else None
+    bed: Bed | None = None
+    if only_heights(estimate):
+        from pkmcal.identify.bed import bed_of
+
+        bed = bed_of(measurements, estimate)
     return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
 
 

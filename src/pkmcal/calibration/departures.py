@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.boards.poses import size_departure
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.bundle import as_ended
@@ -190,6 +189,8 @@ def _boards(session: Session, measured: Measurements) -> Iterator[Departure]:
     """Boards of another size."""
     for m, mount in enumerate(measured.mounts):
         if mount.name == "board":
+            from pkmcal.boards.poses import size_departure
+
             yield size_departure(measured.poses, m, session.document["board"]["file"])
 
 

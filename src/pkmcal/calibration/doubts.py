@@ -30,8 +30,6 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.hand_eye import start_from_poses
-from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.session.load import Session
 from pkmcal.wording import listed, ratio
 
@@ -191,6 +189,8 @@ def _first_misfit(machine: Machine, measurements: Measurements) -> float:
     """:func:`pose_misfit` where an estimate would start, platform poses by the drawing and the
     readings; infinite where it cannot.
     """
+    from pkmcal.papers.hand_eye import start_from_poses
+
     try:
         assembled = assemble(machine, measurements, default_gauge(machine))
         start = batch_of(machine, assembled, start_from_poses(machine, measurements))
@@ -202,6 +202,8 @@ def _first_misfit(machine: Machine, measurements: Measurements) -> float:
 
 def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
     """The estimate from other measurements, from the drawing unless told; None where it fails."""
+    from pkmcal.papers.hand_eye import start_from_poses
+
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
@@ -605,6 +607,8 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
     motion = session.machine.document.motion
     if motion == "spatial" or not len(poses):
         return []
+    from pkmcal.papers.rotation_axis import rotation_axis
+
     whole = (poses.rows == 6) & on_platform[poses.mount]
     out: list[tuple[bool, str]] = []
     for s in np.unique(poses.station[whole]).tolist():

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.boards.views import Boards, find_boards
+from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
@@ -19,7 +19,6 @@ from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import KEPT, Pictures, fitting
 from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
-from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
 from pkmcal.session.poses import check_lengths
@@ -361,6 +360,8 @@ def _by_poses(session: Session, boards: Boards, known: Array) -> Array:
 
     Raises `InputError`, or `ResultError`, where they tell too little.
     """
+    from pkmcal.papers.hand_eye import start_from_poses
+
     measurements = measurements_of(session, boards)
     try:
         return start_from_poses(session.machine, measurements, known).T_camera_base
@@ -384,10 +385,14 @@ def _tracker_starts(session: Session) -> list[Array | None]:
 
 
 def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
-    """The session's board in its photographs; see :func:`pkmcal.boards.views.find_boards`.
+    """The session's board in its photographs; see :func:`pkmcal.boards.stations.find_boards`.
 
     Photographs that only show the board are decoded one by one, as they are looked at.
     """
+    if session.board is None:  # as most, and what looks for boards takes a while to load
+        return Boards()
+    from pkmcal.boards.stations import find_boards
+
     return find_boards(session, board_images(session, photographs))
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.boards.views import Boards, StationBoard, board_of, station_board
+from pkmcal.boards.stations import board_of, station_board
+from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.calibration.byhand import search_by_hand, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning

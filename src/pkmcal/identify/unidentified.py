@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.identify.bed import Bed
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
@@ -26,6 +25,7 @@ from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
+    from pkmcal.identify.bed import Bed
     from pkmcal.identify.covariance import Direction, Identifiability
     from pkmcal.measurements import EdgeSet, Measurements
 

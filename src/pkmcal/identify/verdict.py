@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import decided_by
@@ -22,6 +22,9 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
 from pkmcal.solver.search import Stop
 from pkmcal.wording import count, listed
+
+if TYPE_CHECKING:
+    from pkmcal.identify.bed import Bed
 
 FAR = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""

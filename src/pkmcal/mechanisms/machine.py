@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
-from pkmcal.mechanisms import assembly_modes, kinematics, velocities, workspace
-from pkmcal.mechanisms.assembly_modes import AssemblyModes
+from pkmcal.mechanisms import kinematics, velocities, workspace
 from pkmcal.mechanisms.carriers.contract import (
     ParameterKind,
     base_carriers,
@@ -30,7 +29,6 @@ from pkmcal.mechanisms.document import (
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_drawing
-from pkmcal.mechanisms.follower import Follower
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
 from pkmcal.mechanisms.layout import LimbLayout, layout_of
 from pkmcal.mechanisms.motors import (
@@ -42,6 +40,10 @@ from pkmcal.mechanisms.motors import (
 )
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import count
+
+if TYPE_CHECKING:
+    from pkmcal.mechanisms.assembly_modes import AssemblyModes
+    from pkmcal.mechanisms.follower import Follower
 
 
 class _Row(NamedTuple):
@@ -234,6 +236,8 @@ class Machine:
 
         start : (4, 4), where the machine is; the home pose when absent.
         """
+        from pkmcal.mechanisms.follower import Follower
+
         begin = self._home if start is None else _checked(start, (4, 4), "start")
         return Follower(self.layout, self.values, begin)
 
@@ -327,10 +331,10 @@ class Machine:
         self, joints: Array, rng: np.random.Generator, most: int = 100_000
     ) -> AssemblyModes:
         """As :meth:`assembly_modes`, with signs, counts and what may be missing; most : starts."""
+        from pkmcal.mechanisms.assembly_modes import assembly_modes
+
         readings = _checked(joints, (self.n_joints,), "joints")
-        return assembly_modes.assembly_modes(
-            self.layout, self.values, readings, self._home, rng, most
-        )
+        return assembly_modes(self.layout, self.values, readings, self._home, rng, most)
 
     def middle_readings(self) -> Array:
         """Readings (m,) at mid-range, zero where the file gives no range."""

@@ -16,7 +16,6 @@ from pkmcal.calibration.results import REPORT, check_output, document_of, texts_
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
 from pkmcal.files import write_folder
-from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
@@ -41,6 +40,7 @@ from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
+    from pkmcal.identify.bed import Bed
     from pkmcal.judge.holdouts import HoldOut
 
 

@@ -169,7 +169,7 @@ class Viewed:
 
     @cached_property
     def _board(self) -> Board | None:
-        from pkmcal.boards.views import board_of
+        from pkmcal.boards.stations import board_of
 
         return board_of(self.session)
 

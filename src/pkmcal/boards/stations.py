@@ -1,0 +1,127 @@
+"""The calibration board of a session, looked for in its stations' photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pkmcal.arrays import Integers, evenly
+from pkmcal.boards.board import Board, Detection, load_board
+from pkmcal.boards.detect import check_boards
+from pkmcal.boards.poses import board_views, detect_again, detect_in, standing
+from pkmcal.boards.views import Boards, StationBoard
+from pkmcal.errors import InputError
+from pkmcal.session.load import Session
+from pkmcal.session.photographs import label_of
+
+ENOUGH = 4
+"""Photographs in which a chessboard that stands still is looked for by slow ways."""
+EXAMINED = 2
+"""Photographs that are examined for another board."""
+
+
+def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> Boards:
+    """The session's board in every station that observes it.
+
+    images : decoded photographs by the station's number. Raises `InputError` where a station's
+    photographs do not show the board, or show that it moved though it is fixed to the base.
+    """
+    board = board_of(session)
+    if board is None:
+        return Boards()
+    found: dict[int, StationBoard] = {}
+    by_hand: dict[str, list[Detection]] = {}
+    for number, station in enumerate(session.stations):
+        if "board" not in station.observe:
+            continue
+        if not station.handheld:
+            found[number] = station_board(session, board, number, images[number])
+            continue
+        # walking round a machine one does not see its board from everywhere
+        one, seen = _board_by_hand(session, board, number, images[number])
+        by_hand.setdefault(station.entry, []).append(one)
+        if seen is not None:
+            found[number] = seen
+    for entry, detections in by_hand.items():
+        _check_shown(entry, board, detections)
+    return Boards(found, session.board_body, board.tolerance)
+
+
+def board_of(session: Session) -> Board | None:
+    """The board that stations of a session observe, from its file; None where none does."""
+    if session.board is None or not any("board" in s.observe for s in session.stations):
+        return None
+    return load_board(session.board, label=label_of(session.folder, session.board))
+
+
+def station_board(
+    session: Session, board: Board, number: int, images: Sequence[Integers]
+) -> StationBoard:
+    """The board in one station's photographs, all of them decoded."""
+    station = session.stations[number]
+    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    moves = session.board_body == "platform"
+    detections = detect_in(images, board, labels)
+    nowhere = not any(detection.found for detection in detections)
+    _check_another(session, board, number, detections)
+    # A board that moves says something new in every photograph; a still one is seen enough.
+    most = len(images) if moves else ENOUGH if nowhere else 0
+    detections = detect_again(images, board, detections, most)
+    _check_shown(station.name, board, detections)
+    rows = np.array([photo.configuration for photo in station.photographs])
+    seen = board_views(number, station.camera, rows, board, detections)
+    stood = None if moves else standing(seen)
+    if not moves and stood is None:
+        raise InputError(
+            "no photograph shows the board well enough for its pose",
+            where=f"session.yaml, stations.{station.name}",
+            found=seen.rejected[0].reason,
+            expected="one at least in which the board is large, sharp and little hidden",
+        )
+    return StationBoard(seen, stood)
+
+
+def _check_shown(name: str, board: Board, detections: Sequence[Detection]) -> None:
+    """Raise `InputError` where no photograph of a station shows the board."""
+    if not any(detection.found for detection in detections):
+        raise InputError(
+            f"the board is in none of the photographs of station {name}",
+            where=detections[0].name,
+            found=detections[0].reason,
+            expected=f"{board.described}, sharp, and not hidden by the machine",
+            next_step="Check the board file, the light and the focus, or write observe: legs for"
+            " this station",
+        )
+
+
+def _board_by_hand(
+    session: Session, board: Board, number: int, images: Sequence[Integers]
+) -> tuple[Detection, StationBoard | None]:
+    """The board in a photograph by hand, and what it tells if it is seen well enough."""
+    station = session.stations[number]
+    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    detections = detect_again(images, board, detect_in(images, board, labels), len(images))
+    if not detections[0].found:
+        return detections[0], None
+    rows = np.array([photo.configuration for photo in station.photographs])
+    seen = board_views(number, station.camera, rows, board, detections)
+    if session.board_body == "platform":
+        return detections[0], StationBoard(seen, None)
+    stood = standing(seen)
+    return detections[0], None if stood is None else StationBoard(seen, stood)
+
+
+def _check_another(
+    session: Session, board: Board, number: int, detections: Sequence[Detection]
+) -> None:
+    """Raise `InputError` where photographs show another board, or more of it than is described."""
+    station = session.stations[number]
+    shown = np.flatnonzero([detection.found for detection in detections])
+    rows = shown if shown.size else np.arange(len(detections))
+    few = rows[evenly(len(rows), EXAMINED)]
+    paths = [station.photographs[k].path for k in few]
+    try:
+        check_boards(paths, [detections[k] for k in few], board)
+    except InputError as error:
+        raise error.located(f"session.yaml, stations.{station.name}") from None
