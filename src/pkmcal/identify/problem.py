@@ -45,7 +45,15 @@ from pkmcal.identify.rows import (
 )
 from pkmcal.identify.structure import Structure, numbered
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.mechanisms.closure import Closure, by_own, closure, dense, on_tangents
+from pkmcal.mechanisms.closure import (
+    Closure,
+    by_own,
+    closure,
+    dense,
+    on_tangents,
+    rod_lengths,
+)
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, scaled_rows, singularity_of
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.solver.elimination import Linear, divisions
 from pkmcal.solver.search import Values, of_runs
@@ -478,16 +486,14 @@ class Problem:
     def _closed(
         self, state: BatchState, trial: BatchState, shared: Array, own: Array
     ) -> BatchState:
-        """The trial with its poses moved to where the closures are what the step meant them to be.
-
-        For machines with cranks or sliders, whose readings are far sharper than a board's poses, or
-        with equations of joints' axes, which are as good as exact: the closures bend over a step by
-        more than they may be wrong, and the search would creep.
+        """The trial with its poses moved to where the closures are what the step meant them to be,
+        where they bend over it by more than they may be wrong: there the search would creep.
         """
         layout = self.layout
-        freedoms = layout.own_motion.shape[1]
-        bends = any(g.carrier.driven for g in layout.base) or len(layout.angles)
-        if layout.n_equations != freedoms or not bends:
+        if layout.n_equations != layout.own_motion.shape[1]:
+            return trial
+        bent = self._bent(state, trial)
+        if not bent.any():
             return trial
         c = self.closure(state)
         change = shared[:, self.unknowns.machine] @ self.free.T
@@ -501,13 +507,33 @@ class Problem:
                 back = np.linalg.solve(by_pose, off)
             except np.linalg.LinAlgError:  # a singular pose among them
                 back = np.linalg.pinv(by_pose) @ off
-            step = back[..., 0] @ layout.own_motion.T
+            step = np.where(bent[..., None], back[..., 0] @ layout.own_motion.T, 0.0)
             trial = replace(
                 trial,
                 T_base_platform=perturb(trial.T_base_platform, step[..., :6]),
                 internal=trial.internal + step[..., 6:],
             )
         return trial
+
+    def _bent(self, state: BatchState, trial: BatchState) -> Booleans:
+        """Configurations (B, K) whose closures bend over a step by more than they may be wrong.
+
+        Readings of cranks and sliders are far sharper than a board's poses, and equations of
+        joints' axes as good as exact, so theirs always do. A leg of length l that is read becomes
+        longer by ``d^2 / 2 l`` where its end goes d across; near a singular pose, where lengths
+        hardly say where the platform is, they would put it far away.
+        """
+        layout, before, after = self.layout, state.T_base_platform, trial.T_base_platform
+        if len(layout.angles) or any(group.carrier.driven for group in layout.base):
+            return np.ones(after.shape[:2], dtype=bool)
+        change = (after - before)[..., :3, :]
+        turned = np.linalg.norm(change[..., :3], axis=(-2, -1)) / np.sqrt(2)
+        way = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
+        length = rod_lengths(layout, self.drawing, self.data.joints)
+        bent = way**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
+        if bent.any():
+            bent &= singularity_of(layout, scaled_rows(self.closure(state))) > NEAR_SINGULAR
+        return bent
 
 
 def _in_rows(parts: Array) -> Array:

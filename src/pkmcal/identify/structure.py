@@ -12,6 +12,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.gauge import move_generators
 from pkmcal.identify.rows import EdgeBlocks
 from pkmcal.identify.unknowns import Unknowns
+from pkmcal.mechanisms.closure import platform_ends
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.solver.strips import StripLayout
 
@@ -103,6 +104,12 @@ class Structure:
         """
         by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
         return self.frames @ np.linalg.pinv(by_moves @ self.frames)
+
+    @cached_property
+    def reach(self) -> float:
+        """How far from the platform's origin the farthest of its joints is drawn, m."""
+        ends = platform_ends(self.layout, self.drawing, np.eye(4))
+        return float(np.linalg.norm(ends.b, axis=-1).max())
 
     @cached_property
     def strips(self) -> StripLayout:
