@@ -31,7 +31,8 @@ from solver import most_megabytes
 import pkmcal
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, what_data_tell
+from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
 from pkmcal.solver.search import minimise
@@ -66,10 +67,14 @@ def of_edges(count: int) -> Iterator[Step]:
     def estimated() -> None:
         made["estimate"] = bundle(machine, measurements, begin)
 
+    def told() -> None:
+        _, info = as_ended(measurements, made["estimate"])
+        identifiability(info, made["estimate"].machine)
+
     yield "edges: assemble", assembled
     yield "edges: solve", solved
     yield "edges: joint estimate, robust", estimated
-    yield "edges: what the data tell", lambda: what_data_tell(measurements, made["estimate"])
+    yield "edges: what the data tell", told
 
 
 def of_table(count: int) -> Iterator[Step]:

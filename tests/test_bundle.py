@@ -10,8 +10,8 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
-from pkmcal.identify.bundle import bundle, machine_told, solve_batch, what_data_tell
-from pkmcal.identify.covariance import identifiability, machine_covariance
+from pkmcal.identify.bundle import as_ended, bundle, machine_told, solve_batch
+from pkmcal.identify.covariance import Information, identifiability, machine_covariance
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
@@ -368,7 +368,7 @@ def test_full_rank_of_a_good_session():
     scene = make_scene(rng)
     assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
     state = batch_of(scene.machine, assembled, scene.state())
-    found = identifiability(assembled.problem, scene.machine, state)
+    found = identifiability(Information(assembled.problem, state), scene.machine)
     assert found.n_frames == 12
     # the common scale of radii against the edge shift is soft, but nothing is lost
     assert found.rank == found.n_parameters - 12
@@ -384,11 +384,14 @@ def test_what_cannot_be_identified_is_named():
     part = replace(full, edges=full.edges.select(~hidden))
     assembled = assemble(scene.machine, part, ThreeCentres())
     state = batch_of(scene.machine, assembled, scene.state())
-    found = identifiability(assembled.problem, scene.machine, state)
+    found = identifiability(Information(assembled.problem, state), scene.machine)
     assert [d.names for d in found.unidentified] == [("legs[4].tubes[2].radius",)]
     result = estimate(scene, part, rng)
     radius = scene.machine.parameters.index("legs[4].tubes[2].radius")
-    assert what_data_tell(part, result).unidentified[0].names == ("legs[4].tubes[2].radius",)
+    _, info = as_ended(part, result)
+    assert identifiability(info, result.machine).unidentified[0].names == (
+        "legs[4].tubes[2].radius",
+    )
     assert result.data_share[radius] == pytest.approx(0, abs=1e-9)
     assert result.state.theta[radius] == pytest.approx(scene.machine.parameters.drawing[radius])
 
@@ -401,7 +404,7 @@ def test_one_configuration_is_singular_and_two_suffice():
         scene = make_scene(rng, configurations=configurations, seen=1.0, machine=machine)
         assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
         state = batch_of(scene.machine, assembled, scene.state())
-        found = identifiability(assembled.problem, scene.machine, state)
+        found = identifiability(Information(assembled.problem, state), scene.machine)
         assert (not found.unidentified) == complete
 
 

@@ -20,6 +20,7 @@ from pkmcal.calibration.saved import load
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.score import Departures, columns_of
 from pkmcal.identify.start import start_state
@@ -77,11 +78,11 @@ def score_tests(drawing, data, where, readings, moved, families=None):
     """
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
-    state = batch_of(estimate.machine, assembled, estimate.state)
+    info = Information(assembled.problem, batch_of(estimate.machine, assembled, estimate.state))
     effects = [Effect(readings=by) for by in readings]
     if moved:
         effects.append(Effect(station=0, since=len(data.joints) // 2))
-    return estimate, Departures(assembled, state, effects, families)
+    return estimate, Departures(assembled, info, effects, families)
 
 
 def scales(data):
@@ -169,7 +170,7 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     state, problem = batch_of(estimate.machine, assembled, estimate.state), assembled.problem
     effects = [Effect(readings=scales(data)[1]), Effect(station=1, since=5)]
     effects.append(Effect(edges=np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)))
-    tests = Departures(assembled, state, effects, [0, 1, 2], singles=True)
+    tests = Departures(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     own, m = problem.linearize(state), data.joints.shape[1]
     shared = own.by_shared[0]
     begin = problem.unknowns.stations.start + 6
@@ -207,7 +208,7 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(known, k)[0], rel=1e-5, abs=1e-6)
     monkeypatch.setattr(elimination, "ROWS", 3 * problem.n_rows)
-    pieces = Departures(assembled, state, effects, [0, 1, 2], singles=True)
+    pieces = Departures(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)
 
@@ -285,9 +286,9 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     start = replace(start_state(machine, data, camera[None]), T_mount=np.eye(4)[None])
     estimate = bundle(machine, data, start, scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(machine))
-    state = batch_of(estimate.machine, assembled, estimate.state)
+    info = Information(assembled.problem, batch_of(estimate.machine, assembled, estimate.state))
     one = size_departure(boards, 0, "board.yaml")
-    fit = Departures(assembled, state, [one.effect]).fitted([0])[0]
+    fit = Departures(assembled, info, [one.effect]).fitted([0])[0]
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 
 

@@ -160,8 +160,8 @@ def test_what_was_found_is_what_counts_afterwards():
     scene = shaded(rng, 0.15, runs=1)
     measurements = scene.measurements(rng)
     estimate = bundle(scene.machine, measurements, scene.state())
-    assembled, state = as_ended(measurements, estimate)
-    found = minimise(assembled.problem, state).state
+    assembled, info = as_ended(measurements, estimate)
+    found = minimise(assembled.problem, info.state).state
     rows = assembled.places.edges.taken(assembled.problem.unweighted(found).edges[0])
     np.testing.assert_allclose(rows, estimate.edge_residuals, atol=0.02)
     alone = replace(measurements, shaded=False)

@@ -7,7 +7,8 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb, rotation_vector
 from pkmcal.identify.assembly import assemble
-from pkmcal.identify.bundle import what_data_tell
+from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends, rod_lengths
@@ -281,7 +282,8 @@ def test_what_the_rods_can_tell():
     rng = np.random.default_rng(6)
     machine = load_mechanism("h4-rods")
     case = papers_case(with_rods(rng), rng)
-    told = what_data_tell(case.measurements, estimated(machine, case, rng))
+    estimate = estimated(machine, case, rng)
+    told = identifiability(as_ended(case.measurements, estimate)[1], estimate.machine)
     assert told.n_parameters - 4 == 78
     assert told.n_frames == 12 + 4
     assert told.rank == 66
@@ -397,5 +399,6 @@ def test_where_a_board_sits_is_no_knowledge_of_the_machine():
     assert rows.shape[0] == 3
     places = np.flatnonzero(rows.any(axis=0)) - problem.unknowns.mounts.start
     assert places.tolist() == [3, 4, 5]
-    told = what_data_tell(case.measurements, estimated(machine, case, rng))
+    estimate = estimated(machine, case, rng)
+    told = identifiability(as_ended(case.measurements, estimate)[1], estimate.machine)
     assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames

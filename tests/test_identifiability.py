@@ -14,8 +14,8 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, what_data_tell
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
 from pkmcal.identify.start import start_state
@@ -54,7 +54,8 @@ def seen_by(session, legs):
 def told(machine, measurements, state):
     """The rank test at a state."""
     assembled = assemble(machine, measurements, default_gauge(machine))
-    return identifiability(assembled.problem, machine, batch_of(machine, assembled, state))
+    info = Information(assembled.problem, batch_of(machine, assembled, state))
+    return identifiability(info, machine)
 
 
 def surprise(machine, found, state):
@@ -76,7 +77,8 @@ def verdict(measurements, found):
     seen = seen_legs(
         measurements.edges, found.edge_weights, measurements.n_stations, found.machine.n_legs
     )
-    return judge(observation, found, explain(what_data_tell(measurements, found), found, seen))
+    told = identifiability(as_ended(measurements, found)[1], found.machine)
+    return judge(observation, found, explain(told, found, seen))
 
 
 def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():

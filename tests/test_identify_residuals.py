@@ -13,7 +13,7 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.covariance import reduced_rows
+from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
@@ -256,11 +256,12 @@ def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():
     assembled, truth = make_scene(rng, configurations=8).batch(rng, use_drawing=False)
     problem, state = assembled.problem, replace(truth, z=0 * truth.z)
     machine = problem.unknowns.machine
-    rows, value = reduced_rows(problem, state, ("machine",), silent=())
+    info = Information(problem, state)
+    rows, value = reduced_rows(info, ("machine",), silent=())
     step = -np.linalg.lstsq(rows, value, rcond=None)[0]
     whole, _ = damped_step(problem.linearize(state), np.zeros(1))
     np.testing.assert_allclose(step, whole[0, machine], atol=1e-7)
-    asked, _ = reduced_rows(problem, state, ("machine",))
+    asked, _ = reduced_rows(info, ("machine",))
     assert len(asked) == len(rows) - problem.prior[:, machine].any(axis=1).sum()
 
 

@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import joint_centres
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import explain
@@ -340,7 +340,8 @@ def test_what_data_leave_open_is_said(machine, calibrated):
     """A centre may slide along its axis, with the arm sliding back: one direction a leg."""
     _, measurements, estimate = calibrated
     assembled = assemble(machine, measurements, default_gauge(machine))
-    told = identifiability(assembled.problem, machine, batch_of(machine, assembled, estimate.state))
+    info = Information(assembled.problem, batch_of(machine, assembled, estimate.state))
+    told = identifiability(info, machine)
     findings = explain(told, estimate, np.ones((3, 6), dtype=bool))
     slides = [sentence for sentence in findings.unidentified if not sentence.matters]
     assert sum(sentence.dimensions for sentence in slides) == 6

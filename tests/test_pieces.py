@@ -10,7 +10,7 @@ from pkmcal.identify.covariance import Information, identifiability, reduced_row
 from pkmcal.identify.noise import components
 from pkmcal.papers import linear
 from pkmcal.solver import elimination
-from pkmcal.solver.elimination import condensed
+from pkmcal.solver.elimination import condensed, stacked
 from test_identify_scene import make_scene
 
 CONFIGURATIONS = 7
@@ -75,20 +75,22 @@ def test_what_weights_do_not_change_is_kept():
 def test_the_rows_of_pieces_say_the_same(in_pieces):
     problem, truth, machine = problem_of()
     names = ("machine", "stations")
-    rows, left = reduced_rows(problem, truth, names)
-    every, value = Information(problem, truth).rows
-    spectrum = identifiability(problem, machine, truth).singular_values
+    whole = Information(problem, truth)
+    rows, left = reduced_rows(whole, names)
+    every, value = stacked(whole.linear, whole.reduced)
+    spectrum = identifiability(whole, machine).singular_values
     in_pieces(problem)
-    few, rest = reduced_rows(problem, truth, names)
+    pieces = Information(problem, truth)
+    few, rest = reduced_rows(pieces, names)
     assert len(few) <= 4 * (problem.unknowns.count + 1) + len(problem.prior)
     for (a, x), (b, y) in (((rows, left), (few, rest)), (
-        (every[0], value[0]), tuple(part[0] for part in Information(problem, truth).rows)),
+        (every[0], value[0]), tuple(part[0] for part in pieces.rows)),
     ):  # fmt: skip
         size = np.abs(a.T @ a).max()
         np.testing.assert_allclose(b.T @ b, a.T @ a, atol=1e-9 * size)
         np.testing.assert_allclose(b.T @ y, a.T @ x, atol=1e-9 * np.abs(a.T @ x).max())
         assert y @ y == pytest.approx(x @ x, rel=1e-9)
-    again = identifiability(problem, machine, truth).singular_values
+    again = identifiability(pieces, machine).singular_values
     np.testing.assert_allclose(again, spectrum, atol=1e-8 * spectrum[0])
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
-from pkmcal.identify.bundle import bundle, what_data_tell
+from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings, explain, seen_legs
 from pkmcal.identify.verdict import LEFT_OPEN, judge
@@ -34,7 +35,7 @@ def judged(scene, *views):
     observation = Observation(
         edges, (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    told = what_data_tell(measurements, estimate)
+    told = identifiability(as_ended(measurements, estimate)[1], estimate.machine)
     seen = seen_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
     findings = explain(told, estimate, seen, conditions(machine, seen))
     return observation, estimate, findings, judge(observation, estimate, findings)

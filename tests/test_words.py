@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
 from pkmcal.identify.sentences import MOST
@@ -81,7 +81,7 @@ def told_of(scene: Scene, *views):
         )  # fmt: skip
     assembled = assemble(scene.machine, measurements, default_gauge(scene.machine))
     state = batch_of(scene.machine, assembled, scene.state())
-    told = identifiability(assembled.problem, scene.machine, state)
+    told = identifiability(Information(assembled.problem, state), scene.machine)
     edges = measurements.edges
     seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
     null = vectors(told.unidentified, machine)

@@ -11,7 +11,7 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.motions import Situation, sizes
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
@@ -38,7 +38,7 @@ def told_of(name, model=None, shape=""):
     estimate = estimated(machine, case, rng)
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     state = batch_of(machine, assembled, estimate.state)
-    told = identifiability(assembled.problem, machine, state)
+    told = identifiability(Information(assembled.problem, state), machine)
     return told, explain(told, estimate, np.ones((1, machine.n_legs), bool)), estimate
 
 
@@ -88,7 +88,8 @@ def test_what_the_advice_holds_leaves_nothing_open():
     estimate = estimated(machine, case, rng)
     machine = replace(machine, parameters=table.with_roles(held, tied))
     assembled = assemble(machine, case.measurements, default_gauge(machine))
-    told = identifiability(assembled.problem, machine, batch_of(machine, assembled, estimate.state))
+    info = Information(assembled.problem, batch_of(machine, assembled, estimate.state))
+    told = identifiability(info, machine)
     before = told_of("h4")[0]
     assert told.unidentified == ()
     assert told.rank == before.rank

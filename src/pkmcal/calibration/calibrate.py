@@ -43,7 +43,8 @@ from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
-from pkmcal.identify.bundle import what_data_tell
+from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import (
     Findings,
@@ -286,11 +287,12 @@ def _judge(
             for k, station in enumerate(session.stations)
         ]
         session = replace(session, stations=tuple(refined))
-    findings = _findings(found.turns.measurements, found.estimate)
+    ended = as_ended(found.turns.measurements, found.estimate)
+    findings = _findings(found.turns.measurements, found.estimate, ended[1])
     departed: tuple[Departed, ...] = ()
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = found.turns
-        departed = departures(session, turns.observation, turns.measurements, found.estimate)
+        departed = departures(session, turns.observation, turns.measurements, found.estimate, ended)
     verdict = judge(
         found.turns.observation,
         found.estimate,
@@ -334,8 +336,11 @@ def _judge(
     )
 
 
-def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
-    """What the data tell of the machine, in words, and the paper's conditions."""
+def _findings(measurements: Measurements, estimate: Estimate, info: Information) -> Findings:
+    """What the data tell of the machine, in words, and the paper's conditions.
+
+    info : of the estimate at its end.
+    """
     seen = seen_legs(
         measurements.edges,
         estimate.edge_weights,
@@ -344,7 +349,7 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
     )
     if not len(measurements.edges):  # of no leg can be said that it was not seen
         seen = np.ones_like(seen)
-    told = what_data_tell(measurements, estimate)
+    told = identifiability(info, estimate.machine)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
     bed: Bed | None = None
     if only_heights(estimate):

@@ -17,8 +17,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import Outline, outlines
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import MOST, Departures, Freed, Score
 from pkmcal.identify.tool import ToolError, tool_error
@@ -80,9 +81,16 @@ class Departed:
 
 
 def departures(
-    session: Session, observation: Observation, measurements: Measurements, estimate: Estimate
+    session: Session,
+    observation: Observation,
+    measurements: Measurements,
+    estimate: Estimate,
+    ended: tuple[Assembled, Information],
 ) -> tuple[Departed, ...]:
-    """What the data show that the model does not have, the surest first."""
+    """What the data show that the model does not have, the surest first.
+
+    ended : the estimate's problem at its end, :func:`pkmcal.identify.bundle.as_ended`.
+    """
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     layout = estimate.machine.layout
     present = scales(layout, estimate.machine.values) / scales(
@@ -100,10 +108,7 @@ def departures(
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    assembled, state = as_ended(measurements, estimate)
-    tests = Departures(
-        assembled, state, [one.effect for one in listed], number.tolist(), singles=True
-    )
+    tests = Departures(*ended, [one.effect for one in listed], number.tolist(), singles=True)
     known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
     found = [*tests.found(LEVEL, [k for k, _ in known]), *known]
     if not found:
@@ -123,7 +128,7 @@ def departures(
         if k < len(listed):
             return listed[k]
         row, m = divmod(k - len(listed), len(columns))
-        name = session.configurations[np.flatnonzero(assembled.seen)[row]]
+        name = session.configurations[np.flatnonzero(ended[0].seen)[row]]
         return readings.wrong_reading(columns[m], units[m], name)
 
     fits = tests.fitted([k for k, _ in found])

@@ -134,8 +134,8 @@ def _wider(measurements: Measurements, estimate: Estimate, drawing: Array) -> tu
     """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary: how far
     the best values are from the estimate's (P,), and a root (P, m) of their covariance.
     """
-    assembled, state = as_ended(measurements, estimate)
-    rows, left = reduced_rows(*assembled.problem.opened(state), ("machine",))
+    _, info = as_ended(measurements, estimate)
+    rows, left = reduced_rows(Information(*info.problem.opened(info.state)), ("machine",))
     table = estimate.machine.parameters
     at = np.zeros(drawing.shape[1])  # the estimate, in the drawing's deviations
     free = table.to_free(estimate.machine.values) / table.tolerances_free()
@@ -149,9 +149,8 @@ def _wider(measurements: Measurements, estimate: Estimate, drawing: Array) -> tu
 
 def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) -> float | None:
     """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
-    assembled, state = as_ended(measurements, estimate)
-    problem = assembled.problem
-    info = Information(problem, state)
+    _, info = as_ended(measurements, estimate)
+    problem, state = info.problem, info.state
     rows = stacked(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0

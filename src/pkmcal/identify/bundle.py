@@ -15,10 +15,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
-    Identifiability,
     Information,
     data_share,
-    identifiability,
     machine_covariance,
     reduced_rows,
 )
@@ -418,10 +416,10 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
-def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled, BatchState]:
+def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled, Information]:
     """The problem of an estimate at its end, with its weights, noise scales and the lines' shading
-    as it found them, and its state there, but for the shading: as far as anything is from its best
-    value a linear step tells.
+    as it found them, and what it says at its state there, but for the shading: as far as anything
+    is from its best value a linear step tells.
     """
     machine, measurements = estimate.machine, estimate.as_found(measurements)
     shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
@@ -432,7 +430,7 @@ def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled,
         estimate.pose_weights / statistics.pose_scale**2,
     )
     assembled = replace(assembled, problem=assembled.trusting(weights))
-    return assembled, batch_of(machine, assembled, estimate.state)
+    return assembled, Information(assembled.problem, batch_of(machine, assembled, estimate.state))
 
 
 def machine_told(measurements: Measurements, estimate: Estimate) -> MachineTold:
@@ -440,20 +438,10 @@ def machine_told(measurements: Measurements, estimate: Estimate) -> MachineTold:
 
     The frames are as little known as by the drawing, about where the estimate has them.
     """
-    assembled, state = as_ended(measurements, estimate)
-    rows, _ = reduced_rows(assembled.problem, state, ("machine",), silent=())
+    _, info = as_ended(measurements, estimate)
+    rows, _ = reduced_rows(info, ("machine",), silent=())
     root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
-    return MachineTold(state.z[0], root)
-
-
-def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
-    """Which combinations of parameters the data fix, at the estimate and with its edge weights.
-
-    For words such as "these two values cannot be told apart": names and weights of what is
-    unidentified, and of what the drawing knows better than the data.
-    """
-    assembled, state = as_ended(measurements, estimate)
-    return identifiability(assembled.problem, estimate.machine, state)
+    return MachineTold(info.state.z[0], root)
 
 
 def _estimate(

@@ -80,16 +80,14 @@ class Information:
         for cut in cuts:
             yield Information(self.problem.among(cut), self.problem.state_among(self.state, cut))
 
-    @property
+    @cached_property
     def rows(self) -> tuple[Array, Array]:
         """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na) and
-        residuals (B, n), those on shared unknowns only last; of several pieces, each condensed.
+        residuals (B, n), those on shared unknowns only last; each piece's condensed.
         """
         parts: list[tuple[Array, Array]] = []
         for piece in self.pieces():
             rows, value = stacked(piece.linear, piece.reduced)
-            if piece is self:
-                return rows, value
             own = rows.shape[1] - len(self.problem.prior)
             if not parts:
                 parts = [(rows[:, own:], value[:, own:])]
@@ -131,14 +129,11 @@ class Information:
 
 
 def reduced_rows(
-    problem: Problem,
-    state: BatchState,
-    keep: tuple[Name, ...],
-    silent: tuple[Name, ...] | None = None,
+    info: Information, keep: tuple[Name, ...], silent: tuple[Name, ...] | None = None
 ) -> tuple[Array, Array]:
     """What the data say of some unknowns whatever the others are: rows A (n, m) by the named ones,
-    in the order of their columns, and residuals y (n,); the problem's first run. Of very many
-    configurations, fewer rows with the same normal matrix, gradient and sum of squares.
+    in the order of their columns, and residuals y (n,); the problem's first run. They are few, with
+    the same normal matrix, gradient and sum of squares as all.
 
     Each configuration's own unknowns are eliminated and what all other shared unknowns can take up
     is projected out, so ``y + A x`` is left of the residuals where the kept ones move by x (their
@@ -147,12 +142,11 @@ def reduced_rows(
 
     For parameters that the problem holds, open it first, as drift tests do::
 
-        wide, there = problem.opened(state)
-        rows, left = reduced_rows(wide, there, ("machine",))
+        rows, left = reduced_rows(Information(*problem.opened(state)), ("machine",))
 
     Frames stay in: their rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
     """
-    rows, value = (part[0] for part in Information(problem, state).rows)
+    problem, (rows, value) = info.problem, (part[0] for part in info.rows)
     kept = problem.unknowns.columns(*keep)
     told = problem.prior[:, kept if silent is None else problem.unknowns.columns(*silent)]
     used = np.append(np.ones(len(rows) - len(told), dtype=bool), ~told.any(axis=1))
@@ -254,17 +248,18 @@ class Identifiability:
         return np.array(vectors).reshape(-1, size)
 
 
-def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:
-    """Rank of the data's own information, drawing left out; the problem's first run.
+def identifiability(info: Information, machine: Machine) -> Identifiability:
+    """Which combinations of parameters the data fix, drawing left out; the problem's first run.
 
     Poses, stations, edge shifts and shading are eliminated, frames taken out, and the columns are
     scaled by the drawing's tolerances.
     """
+    problem, state = info.problem, info.state
     table, nz = machine.parameters, problem.unknowns.n_free
     tolerance = table.tolerances_free()
     # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
     # line by itself would hide the tubes' radii
-    left = reduced_rows(problem, state, ("machine",), silent=("machine", "mounts"))[0] * tolerance
+    left = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)
     moved = move_generators(machine.layout, theta) @ moves
     moved = np.linalg.lstsq(problem.free, moved, rcond=None)[0]

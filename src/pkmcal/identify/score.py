@@ -19,7 +19,7 @@ with r. These few numbers are all that is kept, however many configurations ther
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,8 +27,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
-from pkmcal.identify.covariance import NULL
-from pkmcal.identify.problem import Problem
+from pkmcal.identify.covariance import NULL, Information
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
@@ -70,7 +69,8 @@ class Freed:
 
 
 class Departures:
-    """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run).
+    """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run), of
+    which ``info`` tells.
 
     Departures are numbered: the listed ones in their order, then, with ``singles``, every reading
     of every configuration in the problem by itself, one configuration after the other.
@@ -79,7 +79,7 @@ class Departures:
     def __init__(
         self,
         assembled: Assembled,
-        state: BatchState,
+        info: Information,
         listed: Sequence[Effect],
         families: Sequence[int] | None = None,
         *,
@@ -91,13 +91,12 @@ class Departures:
         has to gain more, and those of other kinds do not pay for it. One family if absent; single
         readings are one of their own.
         """
-        problem = assembled.problem
-        basis = _basis(problem, state)
-        self._made = _products(assembled, state, listed, basis, singles)
+        basis = _basis(info)
+        self._made = _products(assembled, info, listed, basis, singles)
         family = np.zeros(len(listed), dtype=int) if families is None else np.array(families)
         rest = np.full(self._made.single[..., 0].size, family.max(initial=-1) + 1)
         self._family = np.append(family, rest).astype(int)
-        self._moves = -(problem.free @ basis[problem.unknowns.machine])
+        self._moves = -(info.problem.free @ basis[info.problem.unknowns.machine])
 
     def scores(self, freed: Sequence[int] = ()) -> list[Score]:
         """Of all departures, in their order, with some of them free already: these gain nothing."""
@@ -283,22 +282,15 @@ class _Left:
         return np.sum(ways[:, part <= SEEN] ** 2, axis=1)
 
 
-def _basis(problem: Problem, state: BatchState) -> Array:
+def _basis(info: Information) -> Array:
     """B (na, nb): the rows by the shared unknowns times it are orthonormal."""
-    count = problem.unknowns.count
-    root: Array = np.zeros((0, count))
-    for cut, part, at in _cuts(problem, state):
-        linear = part.linearize(at)
-        rows = eliminate(linear).rows[0].reshape(-1, count)
-        before = root if cut.start else linear.shared_by
-        root = np.asarray(np.linalg.qr(np.concatenate([before, rows]), mode="r"))
-    half = inverse_root(root[None], NULL, loose=False)[0]
+    half = inverse_root(info.rows[0][:1], NULL, loose=False)[0]
     return half[:, np.any(half != 0, axis=0)]
 
 
 def _products(
     assembled: Assembled,
-    state: BatchState,
+    info: Information,
     listed: Sequence[Effect],
     basis: Array,
     singles: bool,
@@ -320,9 +312,9 @@ def _products(
     sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
     single, among, known = [np.zeros((0, motors, width))], [np.zeros((0, motors, motors))], 0.0
     throughout = [effect for effect in listed if effect.station is None]
-    columns = columns_of(assembled, state, throughout, singles=singles)
-    for cut, part, at in _cuts(problem, state):
-        linear = part.linearize(at)
+    columns = columns_of(assembled, info.state, throughout, singles=singles)
+    for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+        linear = piece.linear
         rows, value = _eliminated(linear, columns(cut))
         count = problem.unknowns.count
         if not cut.start:
@@ -341,12 +333,6 @@ def _products(
     return _Products(
         tuple(parts), n, sums, np.concatenate(single), np.concatenate(among), np.asarray(known)
     )
-
-
-def _cuts(problem: Problem, state: BatchState) -> Iterator[tuple[slice, Problem, BatchState]]:
-    """Some configurations at a time, with their problem and state."""
-    for cut in divisions(*problem.extent):
-        yield cut, problem.among(cut), problem.state_among(state, cut)
 
 
 def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import pose_difference, skew
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.covariance import reduced_rows
+from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
@@ -225,7 +225,7 @@ def evidence(held: Held, known: Known) -> Evidence:
     covariance, stations = known.covariance, known.stations
     problem, state = held.problem.opened(held.state)
     names = (*held.asked, "stations") if stations else held.asked
-    rows, left = reduced_rows(problem, state, names)
+    rows, left = reduced_rows(Information(problem, state), names)
     if stations:
         rows, left = _at_kept(rows, left, state.T_camera_base[0], n, known)
     n_cameras = rows.shape[1] - n - 6 * len(stations)
