@@ -26,7 +26,7 @@ from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
 from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.robust import anneal, settled_weights
+from pkmcal.identify.robust import anneal, norms, settled_weights
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
@@ -181,11 +181,11 @@ def _settle(
             shading = np.maximum(
                 problem.data.shading * (shading / problem.data.shading) ** PACE, least
             )
-        if by_tube:
-            rows = problem.unweighted(state).edges
-            trust = edges.trust(problem.blocks, np.sum(rows**2, axis=-1))
         if robust:
-            weight = settled_weights(problem, state, scale)
+            rows = problem.unweighted(state)
+            weight = settled_weights(norms(problem, rows), scale)
+            if by_tube:
+                trust = edges.trust(problem.blocks, np.sum(rows.edges**2, axis=-1))
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():

@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
@@ -108,7 +109,16 @@ class Information:
         normal, prior = self.normal, self.problem.prior
         if normal is None:
             normal = self.by_kind.every + prior.T @ prior
+        else:
+            inverse, sure = self._inverse
+            if sure.all():
+                return np.linalg.cholesky(inverse)
         return normal_root(normal, UNKNOWN, loose=False)
+
+    @cached_property
+    def _inverse(self) -> tuple[Array, Booleans]:
+        """The normal matrix's inverse, and where that holds half of the digits."""
+        return normal_inverse(cast(Array, self.normal))
 
     @cached_property
     def covariance(self) -> Array:
@@ -118,11 +128,14 @@ class Information:
         By the normal matrix where it leaves half of the digits, else by the rows, which leave all.
         """
         if self.normal is not None:
-            inverse, sure = normal_inverse(self.normal)
-            rest = np.flatnonzero(~sure)
-            if rest.size < len(sure):
+            inverse, sure = self._inverse
+            if sure.all():
+                return inverse
+            if sure.any():
+                rest = np.flatnonzero(~sure)
                 part = Information(self.problem.select(rest), take(self.state, rest))
-                inverse[rest] = part.covariance if rest.size else 0.0
+                inverse = inverse.copy()
+                inverse[rest] = part.covariance
                 return inverse
         half = inverse_root(self.rows[0], NULL, loose=True)
         return half @ half.mT

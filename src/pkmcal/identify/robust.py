@@ -56,15 +56,15 @@ def as_pairs(kind: Kind) -> Array:
     return FULL / clean_norm(TAIL, kind.count)
 
 
-def norms(problem: Problem, state: BatchState) -> Kinds[Array]:
-    """Mahalanobis norms of each kind by its stated noise, as those of pairs (:func:`as_pairs`),
-    (B, K, G); NaN for padding.
+def norms(problem: Problem, rows: Kinds[Array]) -> Kinds[Array]:
+    """Mahalanobis norms (B, K, G) of each kind's residuals (:meth:`Problem.unweighted`), as those
+    of pairs (:func:`as_pairs`); NaN for padding.
     """
-    parts = zip(problem.kinds, problem.unweighted(state), strict=True)
+    parts = zip(problem.kinds, rows, strict=True)
     return Kinds(
         *(
-            np.where(kind.present, np.sqrt(np.sum(rows**2, axis=-1)) * as_pairs(kind), np.nan)
-            for kind, rows in parts
+            np.where(kind.present, np.sqrt(np.sum(own**2, axis=-1)) * as_pairs(kind), np.nan)
+            for kind, own in parts
         )
     )
 
@@ -88,9 +88,9 @@ def noise_scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array
     return Kinds(*(np.maximum(scale, least) for scale in found))
 
 
-def settled_weights(problem: Problem, state: BatchState, scale: Kinds[Array]) -> Kinds[Array]:
-    """Each kind's weights at a state."""
-    parts = zip(norms(problem, state), scale, strict=True)
+def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]:
+    """Each kind's weights by its :func:`norms`."""
+    parts = zip(distance, scale, strict=True)
     return Kinds(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
 
@@ -101,7 +101,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     """
     state, steps = start, 0
     most = POSE_STEPS if problem.kinds.poses.present.size else 1
-    d = norms(problem, state)
+    d = norms(problem, problem.unweighted(state))
     cut = [4 * WIDE * scale for scale in noise_scales(problem, d, least_scale)]
     for _ in range(STAGES):
         aim = [WIDE * scale for scale in noise_scales(problem, d, least_scale)]
@@ -112,8 +112,8 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         searched = problem.weighted(weight).as_noisy_as_at(state)
         found = minimise(searched, state, max_steps=most)
         state, steps = found.state, steps + int(found.steps.max())
-        d = norms(problem, state)
+        d = norms(problem, problem.unweighted(state))
         if settled:
             break
     scale = noise_scales(problem, d, least_scale)
-    return Anneal(state, settled_weights(problem, state, scale), scale, steps)
+    return Anneal(state, settled_weights(d, scale), scale, steps)

@@ -70,6 +70,7 @@ def middle_pose(poses: Array) -> Array:
 def edge_misfit(machine: Machine, measurements: Measurements, state: State) -> float:
     """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
     assembled = assemble(machine, measurements, default_gauge(machine))
-    distance = norms(assembled.problem, batch_of(machine, assembled, state)).edges
+    rows = assembled.problem.unweighted(batch_of(machine, assembled, state))
+    distance = norms(assembled.problem, rows).edges
     found = distance[np.isfinite(distance)]
     return float(np.median(found)) if found.size else np.inf
