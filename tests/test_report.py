@@ -232,8 +232,16 @@ def test_joints_are_drawn_where_the_camera_sees_them(case):
 
 def test_straight_curves_are_two_points_and_bent_ones_are_kept():
     x = np.linspace(0, 100, 13)
-    assert len(drawn.straightened(np.stack([x, 2 * x], -1))) == 2
-    assert len(drawn.straightened(np.stack([x, 1e-3 * x * x], -1))) == 13
+    line, bent = np.stack([x, 2 * x], -1), np.stack([x, 1e-3 * x * x], -1)
+    begun, point = line.copy(), np.full((13, 2), np.nan)
+    begun[:4], point[7] = np.nan, line[7]
+    curves = np.stack([line, bent, begun, np.where(x[:, None] < 50, bent, np.nan), point])
+    found = drawn.straightened(curves)
+    assert found[0] == line[[0, -1]].tolist()
+    assert found[1] == bent.tolist()
+    assert found[2] == line[[4, -1]].tolist()
+    assert found[3] == bent[x < 50].tolist()
+    assert found[4] == [line[7].tolist()]
 
 
 def album_of(case: Case, **changed) -> pictures.Album:

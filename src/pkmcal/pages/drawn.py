@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -59,12 +60,11 @@ def edge_name(leg: int, tube: int, side: int) -> str:
     return f"leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge"
 
 
-def polyline(leg: int, curve: Array, quiet: bool, tip: str) -> Drawn | None:
-    """What is drawn of a curve (n, 2), where two points of it are seen; leg : from 0."""
-    points = straightened(curve[np.isfinite(curve).all(axis=-1)])
+def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str) -> Drawn | None:
+    """What is drawn through points that are seen, of :func:`straightened`; leg : from 0."""
     if len(points) < 2:
         return None
-    return Drawn(leg + 1, tuple(map(tuple, points.tolist())), quiet, tip)
+    return Drawn(leg + 1, tuple((x, y) for x, y in points), quiet, tip)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,8 @@ def laid_over(
     edges: list[Drawn] = []
     for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
         leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        lines = (polyline(leg, curve[start:stop], False, tip) for start, stop in _runs(seen))
+        parts = (straightened(curve[None, start:stop])[0] for start, stop in _runs(seen))
+        lines = (polyline(leg, part, False, tip) for part in parts)
         edges += [line for line in lines if line]
     ends = machine.ends_at(joints, T_base_platform)
     both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
@@ -203,15 +204,21 @@ def residual_words(shift: float, tilt: float, weight: float) -> str:
     )
 
 
-def straightened(curve: Array) -> Array:
-    """The two ends (2, 2) of a curve (n, 2) that is straight, else the curve."""
-    if len(curve) < 3:
-        return curve
-    chord = curve[-1] - curve[0]
-    off = curve - curve[0]
-    area = chord[0] * off[:, 1] - chord[1] * off[:, 0]
-    straight = np.abs(area).max() <= STRAIGHT * np.hypot(*chord)
-    return curve[[0, -1]] if straight else curve
+def straightened(curves: Array) -> list[list[list[float]]]:
+    """Of each curve (n, m, 2) the points that are seen, which are finite; both ends alone of one
+    that is straight between them.
+    """
+    seen: Booleans = np.asarray(np.isfinite(curves).all(axis=-1))
+    row = np.arange(len(curves))
+    curves = np.where(seen[..., None], curves, np.nan)
+    first = curves[row, np.argmax(seen, axis=1)]
+    last = curves[row, -1 - np.argmax(seen[:, ::-1], axis=1)]
+    chord, off = last - first, curves - first[:, None]
+    area = np.abs(chord[:, :1] * off[..., 1] - chord[:, 1:] * off[..., 0])
+    most = np.max(area, axis=1, where=seen, initial=0.0)
+    straight = (most <= STRAIGHT * np.hypot(*chord.T)) & (seen.sum(axis=1) > 2)
+    ends = np.stack([first, last], axis=1).tolist()
+    return [ends[k] if straight[k] else curves[k, seen[k]].tolist() for k in row]
 
 
 def _spots(pixel: Array, seen: Booleans, width: int) -> tuple[Spot, ...]:

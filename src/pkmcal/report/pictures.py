@@ -30,6 +30,7 @@ from pkmcal.pages.drawn import (
     measured_curves,
     polyline,
     residual_words,
+    straightened,
 )
 from pkmcal.pages.jpegs import small_and_large
 from pkmcal.report.corners import BoardCorners, board_corners
@@ -217,8 +218,8 @@ class _Found:
         """The fitted edges of a station."""
         edges, estimate = self.calibration.observation.edges, self.calibration.estimate
         mine = np.flatnonzero((edges.station == s) & np.isin(edges.configuration, configurations))
-        curves = edge_curves(self.calibration, mine, s)
-        for n, curve in zip(mine.tolist(), curves, strict=True):
+        curves = straightened(edge_curves(self.calibration, mine, s))
+        for n, points in zip(mine.tolist(), curves, strict=True):
             weight = float(estimate.edge_weights[n])
             across, tilt = estimate.edge_residuals[n].tolist()
             leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
@@ -227,7 +228,7 @@ class _Found:
                 f" {number(float(shifts[n]), 2, signed=True)} px outward;"
                 f" {residual_words(across, tilt, weight)}"
             )
-            drawn = polyline(leg, curve, weight < KEPT, tip)
+            drawn = polyline(leg, points, weight < KEPT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
@@ -240,7 +241,8 @@ class _Found:
             return
         legs, tubes = _legs(self.calibration, s, configurations), tubes_of(machine)
         pixel = edge_points(machine, camera, legs, tubes, CURVE).pixel
-        inside = camera.in_image(pixel)
+        inside = np.where(camera.in_image(pixel)[..., None], pixel, np.nan)
+        curves = [straightened(of_photograph) for of_photograph in inside]
         for one in some:
             at = row[one.configuration]
             meant = (tubes.leg == one.leg) & ((one.tube < 0) | (tubes.tube == one.tube))
@@ -248,7 +250,7 @@ class _Found:
             for e in np.flatnonzero(meant).tolist():
                 edge = edge_name(one.leg, int(tubes.tube[e]), int(tubes.side[e]))
                 tip = f"{edge.capitalize()}, not used: {one.reason}"
-                drawn = polyline(one.leg, pixel[at, e][inside[at, e]], True, tip)
+                drawn = polyline(one.leg, curves[at][e], True, tip)
                 if drawn:
                     self.missed[s, one.configuration].append(drawn)
 

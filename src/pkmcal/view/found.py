@@ -25,6 +25,7 @@ from pkmcal.pages.drawn import (
     own_edges,
     polyline,
     residual_words,
+    straightened,
 )
 from pkmcal.view.overlay import placed
 from pkmcal.view.requests import LookRequest
@@ -75,7 +76,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
     seen = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
     judged, reasons = _judged(viewed, look)
     curves, away = _off(pane, seen.edges)
-    for n, curve in enumerate(curves):
+    for n, points in enumerate(straightened(curves)):
         place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
         shift = number(float(away[n]), 2, signed=True)
         tip = f"{edge_name(*place).capitalize()}: {shift} px outward"
@@ -85,7 +86,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
             tip += f"; {residual_words(of.shift, of.tilt, of.weight)}"
         if place in reasons:
             quiet, tip = True, f"{tip}; {reasons[place]}"
-        drawn = polyline(place[0], curve, quiet, tip)
+        drawn = polyline(place[0], points, quiet, tip)
         if drawn:
             out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
     missed = _missed(pane, seen.edges, seen.rejected, reasons)
@@ -156,7 +157,8 @@ def _missed(
     seen = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
     now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
     out: list[dict[str, Any]] = []
-    for e, curve in enumerate(pixel):
+    inside = np.where(pane.camera.in_image(pixel)[..., None], pixel, np.nan)
+    for e, points in enumerate(straightened(inside)):
         place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
         if place in seen:
             continue
@@ -164,7 +166,7 @@ def _missed(
         why = reasons.get(place) or now.get(place) or reasons.get(whole) or now.get(whole)
         why = why or "too little of it is seen"
         tip = f"{edge_name(*place).capitalize()}: {why}"
-        drawn = polyline(place[0], curve[pane.camera.in_image(curve)], True, tip)
+        drawn = polyline(place[0], points, True, tip)
         if drawn:
             out.append({"leg": drawn.leg, "d": drawn.path, "tip": drawn.tip, "reason": why})
     return out

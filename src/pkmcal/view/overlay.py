@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.pages.drawn import CURVE, Drawn, laid_over, polyline
+from pkmcal.pages.drawn import CURVE, Drawn, laid_over, polyline, straightened
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of
 from pkmcal.view.viewed import Pane, Viewed
@@ -113,6 +113,7 @@ def _bare_limbs(pane: Pane) -> list[Drawn]:
     pixel = pane.camera.project(
         apply(pane.T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
     )
-    whole = [(j, curve) for j, curve in zip(bare, pixel, strict=True) if np.isfinite(curve).all()]
-    lines = (polyline(j, curve, True, "") for j, curve in whole)
+    whole = np.isfinite(pixel).all(axis=(1, 2))
+    seen = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
+    lines = (polyline(j, points, True, "") for j, points in seen)
     return [line for line in lines if line]
