@@ -22,7 +22,7 @@ from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import dot, pose, rotation
 from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
-from pkmcal.observe.tables import DIRECTIONS, DistanceTables, about, direction_of, distances
+from pkmcal.observe.tables import DIRECTIONS, DistanceTables, alike, direction_of, distances
 
 PLACES = 642
 """Directions from the machine to the camera: 8 degrees apart."""
@@ -193,9 +193,9 @@ def _chart_tables(
         number = direction_of(np.stack([-chord[:, 1], chord[:, 0]], axis=-1))
         middle = np.rint(cell.mean(axis=1)).astype(int) + HALF
         inside = ((middle >= 0) & (middle < n)).all(axis=1)
-        middle, number = middle[inside], number[inside]
+        place, number = middle[inside] @ (1, n), number[inside]
         for direction, table in enumerate(out[row]):
-            distances(middle[about(number, direction, DIRECTIONS)], table)
+            distances(place[alike(direction, DIRECTIONS).take(number)], table)
     return np.rint(np.minimum(out, REACH)).astype(np.uint8)
 
 

@@ -52,13 +52,14 @@ class DirectionTables:
     """The tables of photographs. What belongs to a direction is worked out when an edge of that
     direction is first looked for: the silhouettes of most machines have half of them.
 
-    pixel, number : of each photograph's edge points, whole pixels (n, 2), x first, and direction
-    numbers (n,). picture : (rows, h, columns, DIRECTIONS, w), in which the n-th photograph's tables
-    lie in row n % rows and column n // rows. chance : (DIRECTIONS, bins) of BIN: how often a place
-    taken anywhere has that distance. ready : (DIRECTIONS,) whether both are worked out.
+    place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
+    direction numbers (n,). picture : (rows, h, columns, DIRECTIONS, w), in which the n-th
+    photograph's tables lie in row n % rows and column n // rows. chance : (DIRECTIONS, bins) of
+    BIN: how often a place taken anywhere has that distance. ready : (DIRECTIONS,) whether both are
+    worked out.
     """
 
-    pixel: tuple[Integers, ...]
+    place: tuple[Integers, ...]
     number: tuple[Integers, ...]
     picture: Array
     chance: Array
@@ -66,16 +67,16 @@ class DirectionTables:
 
     @classmethod
     def of_edges(
-        cls, pixel: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
+        cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
     ) -> DirectionTables:
         """Those of edge points, none ready. shape : DIRECTIONS, h, w."""
         directions, height, width = shape
-        rows = min(len(pixel), MOST_ACROSS // height)
-        columns = -(-len(pixel) // rows)
+        rows = min(len(place), MOST_ACROSS // height)
+        columns = -(-len(place) // rows)
         picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
         chance = np.zeros((directions, round(FURTHEST / BIN)), dtype=np.float32)
         return cls(
-            tuple(pixel), tuple(number), picture, chance, np.zeros(directions, dtype=bool)
+            tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool)
         )
 
     def get_ready(self, direction: Integers) -> None:
@@ -87,11 +88,11 @@ class DirectionTables:
                 self._work_out(k)
 
     def _work_out(self, direction: int) -> None:
-        rows, count = len(self.picture), len(self.ready)
+        rows, taken_in = len(self.picture), alike(direction, len(self.ready))
         counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
-        for n, (pixel, number) in enumerate(zip(self.pixel, self.number, strict=True)):
+        for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
-            distances(pixel[about(number, direction, count)], table)
+            distances(place[taken_in.take(number)], table)
             counted += _counted(table)
         self.chance[direction] = counted / counted.sum() / BIN
         self.ready[direction] = True  # at last, as others may look beside
@@ -99,10 +100,10 @@ class DirectionTables:
     def mirrored(self) -> DirectionTables:
         """With left and right exchanged, none ready."""
         _, height, _, directions, width = self.picture.shape
-        pixel = [p * (-1, 1) + (width - 1, 0) for p in self.pixel]
+        place = [p + width - 1 - 2 * (p % width) for p in self.place]
         # the direction a becomes pi - a
         number = [directions - 1 - n for n in self.number]
-        return self.of_edges(pixel, number, (directions, height, width))
+        return self.of_edges(place, number, (directions, height, width))
 
 
 @dataclass(frozen=True)
@@ -234,22 +235,24 @@ def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
         return np.floor(turn).astype(np.int32) % count
 
 
-def about(number: Integers, direction: int, count: int) -> Booleans:
-    """Of edges' direction numbers (n,), those that a direction's table takes in."""
-    return (number - (direction - 1)) % count < 3
+def alike(direction: int, count: int) -> Booleans:
+    """Which direction numbers, of ``count``, a direction's table takes in: its own and the
+    neighbours'.
+    """
+    return (np.arange(count) - (direction - 1)) % count < 3
 
 
-def distances(pixel: Integers, out: Array) -> None:
-    """Distance (h, w) of every place to the nearest of whole pixels (n, 2), x first; written into
-    ``out``, in single precision and each row in one piece.
+def distances(place: Integers, out: Array) -> None:
+    """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
+    into ``out``, in single precision and each row in one piece.
     """
     import cv2
 
-    if not len(pixel):
+    if not len(place):
         out[...] = NOWHERE
         return
     mask = np.ones(out.shape, dtype=np.uint8)
-    mask[pixel[:, 1], pixel[:, 0]] = 0
+    mask.reshape(-1)[place] = 0
     table: Any = out
     cv2.distanceTransform(mask, cv2.DIST_L2, 3, dst=table)
 
@@ -276,9 +279,9 @@ def distance_tables(
         differs = against != 0
     edges = tuple(map(_edges_of, small, [None] * len(small) if differs is None else differs))
     moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
-    pixel = [e.pixel.astype(int) for e in edges]
+    place = [e.pixel.astype(int) @ (1, across) for e in edges]
     number = [direction_of(e.normal, directions) for e in edges]
-    tables = DirectionTables.of_edges(pixel, number, (directions, height, across))
+    tables = DirectionTables.of_edges(place, number, (directions, height, across))
     return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, against)
 
 
@@ -336,7 +339,7 @@ def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
     edges = cv2.Canny(dx, dy, *CANNY) > 0
     if moving is not None:
         edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    y, x = np.nonzero(edges)
+    y, x = np.divmod(np.flatnonzero(edges), edges.shape[1])  # faster than np.nonzero
     normal = np.stack([dx[y, x], dy[y, x]], axis=-1).astype(float)
     return PictureEdges(
         np.stack([x, y], axis=-1).astype(float),
