@@ -48,7 +48,7 @@ HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 BLURS = np.arange(0.45, 1.5, 0.1)
 """Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
 USUAL_BLUR = 0.7
-"""Blur (px) that is tried first, and assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
+"""Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
 BLURS_BESIDE = 2
 """Blurs to both sides of the best that are tried: the next tell its place between them, and how
 little each profile can leave; with further ones it moves by less than profiles tell it to."""
@@ -205,11 +205,12 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
     width = np.abs(np.log(profiles.half_width)[:, None] - np.log(HALF_WIDTHS)).argmin(axis=1)
     kind = width * scaled.shape[1] + np.minimum(profiles.cut, scaled.shape[1] - 1)
     for number in np.unique(kind):  # a few dozen combinations of width and cut
-        mine = kind == number
+        mine = np.flatnonzero(kind == number)
         w, cut = divmod(int(number), scaled.shape[1])
         bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
         part = scaled[mine]
-        explained = np.square(part @ bases).sum(axis=0)
+        along = part @ bases
+        explained = np.einsum("bns,bns->ns", along, along)
         out[mine] = np.sum(part**2, axis=1, keepdims=True) - explained
     return np.maximum(out, 0.0)
 
@@ -275,19 +276,19 @@ def estimate_blur(profiles: Profiles) -> float:
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
     floor = (GREY_NOISE / profiles.contrast()) ** 2
-    costs: dict[int, Array] = {}
-    best, k = int(np.argmin(np.abs(BLURS - USUAL_BLUR))), -1
-    while best != k:
+    costs = np.full((len(profiles.cut), len(BLURS)), np.inf)  # until they are tried
+    k = int(np.argmin(np.abs(BLURS - USUAL_BLUR)))
+    while True:
+        for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS))):
+            if np.isinf(costs[0, near]):
+                costs[:, near] = residual_curves(profiles, BLURS[near]).min(axis=-1)
+        total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
+        best = int(np.argmin(total))
+        if best == k:
+            break
         k = best
-        for number in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS))):
-            if number not in costs:
-                costs[number] = residual_curves(profiles, BLURS[number]).min(axis=-1)
-        tried = sorted(costs)  # all in a row
-        cost = np.stack([costs[number] for number in tried], axis=-1)
-        total = np.median(cost / (cost.min(axis=-1) + floor)[:, None], axis=0)
-        best = tried[int(np.argmin(total))]
     k = int(np.clip(k, 1, len(BLURS) - 2))
-    left, here, right = total[k - 1 - tried[0] : k + 2 - tried[0]]
+    left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
     return float(BLURS[k] + (BLURS[1] - BLURS[0]) * np.clip((left - right) / (2 * bend), -1, 1))
 

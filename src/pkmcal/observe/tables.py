@@ -75,9 +75,7 @@ class DirectionTables:
         columns = -(-len(place) // rows)
         picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
         chance = np.zeros((directions, round(FURTHEST / BIN)), dtype=np.float32)
-        return cls(
-            tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool)
-        )
+        return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
 
     def get_ready(self, direction: Integers) -> None:
         """Work out what there is not yet of directions (...)."""
