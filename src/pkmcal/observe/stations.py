@@ -38,11 +38,11 @@ SEARCH_ANGLE = np.radians(6.0)
 SEARCH_DISTANCE = 0.06
 """Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
 is 10 degrees and 10 cm."""
-TRIES = 600
+TRIES = 800
 FEWER_TRIES = 160
 """Poses tried where one of thirty hypotheses is looked at."""
 CLOSER = 8
-"""One in so many of the poses tried is worth a closer look: two photographs tell as much."""
+"""One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
 ANYWHERE, LIKELIER = 1200, 300
 """Poses from all round the machine that descend, and how many of them go on: before a descent the
 pictures hardly tell which is near, least of all of three legs that are alike."""
