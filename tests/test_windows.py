@@ -108,7 +108,7 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
     tables = distance_tables(fresh)
     assert (fresh.most, fresh.looks) == (2, len(fresh))
     some = tables.select(np.array([7, 2]))
-    assert np.shares_memory(some.tables, tables.tables)
+    assert np.shares_memory(some.tables.picture, tables.tables.picture)
     place = np.array([100.0, 200.0])
     for k, own in enumerate((7, 2)):
         alike = [t.look(np.array(3), place, np.array(n))[0] for t, n in ((some, k), (tables, own))]

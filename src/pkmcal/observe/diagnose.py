@@ -304,9 +304,12 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
 
 def _best_names(score: Array) -> Integers:
     """The name (n,) of each photograph, each given once, with the largest sum of scores (n, n)."""
-    first = score.argmax(axis=1)
-    if len(np.unique(first)) == len(first):  # as a rule, and SciPy's takes a while to import
-        return first
+    others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
+    gain = np.sort(others - np.diag(score))
+    # two photographs at least have to leave their own names for others; where that loses, as a
+    # rule, all keep theirs, and SciPy's, which takes a while to import, is not asked
+    if gain[-2:].sum() < 0:
+        return np.arange(len(score))
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(-score)[1]

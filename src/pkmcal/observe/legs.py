@@ -79,8 +79,6 @@ BETWEEN = 5
 """Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
-BLUR = 0.7
-"""Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
 CLEARANCE = 5.0
 """Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
@@ -342,7 +340,7 @@ def measure(
     if blur is None:
         few = photographs.spread(photographs.window)
         seen = _seen(photographs.select(few).decoded(), machine, T_camera_base, poses[few])
-        blur = profiles.estimate_blur(seen.across) if seen.full.any() else BLUR
+        blur = profiles.estimate_blur(seen.across) if seen.full.any() else profiles.USUAL_BLUR
         ready = seen if len(few) == len(photographs.images) else None
         del seen
     for part, window in photographs.windows():

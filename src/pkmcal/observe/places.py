@@ -22,7 +22,7 @@ from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import dot, pose, rotation
 from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
-from pkmcal.observe.tables import DIRECTIONS, DistanceTables, direction_of, distances
+from pkmcal.observe.tables import DIRECTIONS, DistanceTables, alike, direction_of, distances
 
 PLACES = 642
 """Directions from the machine to the camera: 8 degrees apart."""
@@ -182,8 +182,8 @@ def _chart_tables(
 ) -> Integers:
     """Distance tables (K, DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
     n = 2 * HALF + 1
-    out = []
-    for k in photographs:
+    out = np.empty((len(photographs), DIRECTIONS, n, n), dtype=np.float32)
+    for row, k in enumerate(photographs):
         edges = tables.edges[k]
         along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
         ends = edges.pixel[:, None] + np.stack([-along, along], axis=1)
@@ -193,8 +193,10 @@ def _chart_tables(
         number = direction_of(np.stack([-chord[:, 1], chord[:, 0]], axis=-1))
         middle = np.rint(cell.mean(axis=1)).astype(int) + HALF
         inside = ((middle >= 0) & (middle < n)).all(axis=1)
-        out.append(distances(middle[inside], number[inside], (DIRECTIONS, n, n)))
-    return np.rint(np.minimum(np.stack(out), REACH)).astype(np.uint8)
+        place, number = middle[inside] @ (1, n), number[inside]
+        for direction, table in enumerate(out[row]):
+            distances(place[alike(direction, DIRECTIONS).take(number)], table)
+    return np.rint(np.minimum(out, REACH)).astype(np.uint8)
 
 
 def _scores(

@@ -38,12 +38,20 @@ TURNED = 3.0
 STEP = 0.5
 SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
+PITCH = 0.05
+"""Pixels from one place to the next at which the model is worked out: in steps and shifts it goes
+without remainder, so that all samples of all trial positions are such places."""
 BRIGHTNESSES = 5
 """Linear unknowns of the model: three inside the limb, two outside."""
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 """Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
 BLURS = np.arange(0.45, 1.5, 0.1)
-"""Blurs (px, standard deviation, lens and pixel and interpolation together) that are tried."""
+"""Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
+USUAL_BLUR = 0.7
+"""Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
+BLURS_BESIDE = 2
+"""Blurs to both sides of the best that are tried: the next tell its place between them, and how
+little each profile can leave; with further ones it moves by less than profiles tell it to."""
 ENOUGH_FOR_BLUR = 500
 """Profiles that tell the blur to a hundredth of a pixel; more only take time."""
 FEWEST_FOR_BLUR = 100
@@ -96,16 +104,15 @@ def profile_offsets() -> Array:
 @lru_cache(maxsize=512)
 def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
     """Places x (px outward of the edge), (n,), and the five brightnesses there, blurred, (n, 5)."""
-    pitch = 0.05
-    place = np.arange(-INSIDE - 8, OUTSIDE + 8, pitch)
+    place = np.arange(-INSIDE - 8, OUTSIDE + 8, PITCH)
     inside = (place < 0).astype(float)
-    inside[np.abs(place) < pitch / 2] = 0.5
+    inside[np.abs(place) < PITCH / 2] = 0.5
     depth = np.clip(-place, 0.0, 2 * half_width)
     root = np.sqrt(depth * (2 * half_width - depth))
     columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
     # an odd count: np.convolve centres an even one half a pitch aside, and the edge with it
-    half = int(np.ceil(5 * blur / pitch))
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * pitch / blur) ** 2)
+    half = int(np.ceil(5 * blur / PITCH))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * PITCH / blur) ** 2)
     smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
     return place, np.stack(smooth, axis=1)
 
@@ -120,7 +127,7 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     """
     place, model = _blurred_model(blur, half_width)
     at = profile_offsets() - SHIFTS[:, None]
-    values = np.stack([np.interp(at, place, column) for column in model.T], axis=-1)
+    values = model[np.rint((at - place[0]) / PITCH).astype(int)]
     values[:, :cut] = 0.0
     beliefs = np.zeros((len(SHIFTS), 2, BRIGHTNESSES))
     beliefs[:, 0, 1] = MODEL_ERROR / SHADING_SLOPE
@@ -198,12 +205,13 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
     width = np.abs(np.log(profiles.half_width)[:, None] - np.log(HALF_WIDTHS)).argmin(axis=1)
     kind = width * scaled.shape[1] + np.minimum(profiles.cut, scaled.shape[1] - 1)
     for number in np.unique(kind):  # a few dozen combinations of width and cut
-        mine = kind == number
+        mine = np.flatnonzero(kind == number)
         w, cut = divmod(int(number), scaled.shape[1])
         bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
         part = scaled[mine]
-        out[mine] = np.sum(part**2, axis=1, keepdims=True)
-        out[mine] -= sum((part @ basis) ** 2 for basis in bases)
+        along = part @ bases
+        explained = np.einsum("bns,bns->ns", along, along)
+        out[mine] = np.sum(part**2, axis=1, keepdims=True) - explained
     return np.maximum(out, 0.0)
 
 
@@ -261,16 +269,25 @@ def estimate_blur(profiles: Profiles) -> float:
 
     Contrast differs by edge, so each profile's residual is taken relative to its best; the
     median over profiles decides, so that half of them may be anything. Those of which least is
-    cut off are looked at.
+    cut off are looked at. From the usual blur on, the next ones are tried towards the best.
     """
     few = min(FEWEST_FOR_BLUR, len(profiles.cut))
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
-    costs = np.stack([residual_curves(profiles, b).min(axis=-1) for b in BLURS], axis=-1)
     floor = (GREY_NOISE / profiles.contrast()) ** 2
-    total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
-    k = int(np.clip(np.argmin(total), 1, len(BLURS) - 2))
+    costs = np.full((len(profiles.cut), len(BLURS)), np.inf)  # until they are tried
+    k = int(np.argmin(np.abs(BLURS - USUAL_BLUR)))
+    while True:
+        for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS))):
+            if np.isinf(costs[0, near]):
+                costs[:, near] = residual_curves(profiles, BLURS[near]).min(axis=-1)
+        total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
+        best = int(np.argmin(total))
+        if best == k:
+            break
+        k = best
+    k = int(np.clip(k, 1, len(BLURS) - 2))
     left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
     return float(BLURS[k] + (BLURS[1] - BLURS[0]) * np.clip((left - right) / (2 * bend), -1, 1))

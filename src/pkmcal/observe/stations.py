@@ -41,6 +41,8 @@ is 10 degrees and 10 cm."""
 TRIES = 800
 FEWER_TRIES = 160
 """Poses tried where one of thirty hypotheses is looked at."""
+CLOSER = 8
+"""One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
 ANYWHERE, LIKELIER = 1200, 300
 """Poses from all round the machine that descend, and how many of them go on: before a descent the
 pictures hardly tell which is near, least of all of three legs that are alike."""
@@ -222,7 +224,7 @@ def _random_search(
     def likely(steps: Array, reach: float, keep: int) -> Array:
         # two photographs and few places tell which of them are not worth a closer look
         first = np.argsort(score(view, moved(steps), few[::2], reach, 3))
-        steps = steps[first[: max(len(steps) // 4, keep)]]
+        steps = steps[first[: max(len(steps) // CLOSER, keep)]]
         return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
 
     steps = rng.normal(size=(tries, 6)) * spread

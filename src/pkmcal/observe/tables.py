@@ -1,8 +1,9 @@
 """Picture edges of one station's photographs, ready to be looked up: how far is the nearest?
 
 Photographs are reduced, picture edges found, and for each of a few directions the distance to
-the nearest edge of about that direction is tabulated. A predicted silhouette then scores by the
-distances under its points, smooth enough to be descended from a hundred pixels away. Where a
+the nearest edge of about that direction is tabulated, as soon as one is asked for. A predicted
+silhouette then scores by the distances under its points, smooth enough to be descended from a
+hundred pixels away. Where a
 station took several photographs, edges that never move are left out: the floor and the wall do
 not say where the machine is.
 """
@@ -31,6 +32,8 @@ CANNY = (20, 40)
 reduced photograph has at most, makes of it; from half of that to the double, little changes."""
 FURTHEST = 32.0
 """Reduced pixels beyond which distances are not told apart."""
+NOWHERE = 1e3
+"""Reduced pixels where a photograph has no edge of a direction."""
 BIN = 0.5
 """Reduced pixels of a bin of the distances that chance gives."""
 MOST_ACROSS = 32_000
@@ -45,28 +48,83 @@ class PictureEdges(NamedTuple):
 
 
 @dataclass(frozen=True)
+class DirectionTables:
+    """The tables of photographs. What belongs to a direction is worked out when an edge of that
+    direction is first looked for: the silhouettes of most machines have half of them.
+
+    place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
+    direction numbers (n,). picture : (rows, h, columns, DIRECTIONS, w), in which the n-th
+    photograph's tables lie in row n % rows and column n // rows. chance : (DIRECTIONS, bins) of
+    BIN: how often a place taken anywhere has that distance. ready : (DIRECTIONS,) whether both are
+    worked out.
+    """
+
+    place: tuple[Integers, ...]
+    number: tuple[Integers, ...]
+    picture: Array
+    chance: Array
+    ready: Booleans
+
+    @classmethod
+    def of_edges(
+        cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
+    ) -> DirectionTables:
+        """Those of edge points, none ready. shape : DIRECTIONS, h, w."""
+        directions, height, width = shape
+        rows = min(len(place), MOST_ACROSS // height)
+        columns = -(-len(place) // rows)
+        picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
+        chance = np.zeros((directions, round(FURTHEST / BIN)), dtype=np.float32)
+        return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
+
+    def get_ready(self, direction: Integers) -> None:
+        """Work out what there is not yet of directions (...)."""
+        if self.ready.take(direction).all():
+            return
+        for k in np.unique(direction):
+            if not self.ready[k]:
+                self._work_out(k)
+
+    def _work_out(self, direction: int) -> None:
+        rows, taken_in = len(self.picture), alike(direction, len(self.ready))
+        counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
+        for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
+            table = self.picture[n % rows, :, n // rows, direction]
+            distances(place[taken_in.take(number)], table)
+            counted += _counted(table)
+        self.chance[direction] = counted / counted.sum() / BIN
+        self.ready[direction] = True  # at last, as others may look beside
+
+    def mirrored(self) -> DirectionTables:
+        """With left and right exchanged, none ready."""
+        _, height, _, directions, width = self.picture.shape
+        place = [p + width - 1 - 2 * (p % width) for p in self.place]
+        # the direction a becomes pi - a
+        number = [directions - 1 - n for n in self.number]
+        return self.of_edges(place, number, (directions, height, width))
+
+
+@dataclass(frozen=True)
 class DistanceTables:
     """Distances in reduced pixels and the reduction factor.
 
-    tables : (rows, h, columns, DIRECTIONS, w), one picture in which the n-th table lies in row
-    n % rows and column n // rows. row : (K,) each photograph's table. edges : of each photograph.
+    row : (K,) each photograph's number in the tables. edges : of each photograph.
     moving : (h, w) share of the photographs in which each place differs from the others; where a
-    single one cannot tell, where it has edges. chance : (DIRECTIONS, bins) of BIN: how often a
-    place taken anywhere has that distance. against : (n, h, w) of each table, 1 where a place is
-    brighter than in the median photograph, -1 darker, 0 much the same, or where there is no median.
+    single one cannot tell, where it has edges. against : (n, h, w) of each in the tables, 1 where a
+    place is brighter than in the median photograph, -1 darker, 0 much the same, or where there is
+    no median.
     """
 
-    tables: Array
+    tables: DirectionTables
     row: Integers
     scale: float
     edges: tuple[PictureEdges, ...]
     moving: Array
-    chance: Array
     against: Integers
 
     def direction(self, normal: Array) -> Integers:
         """Direction number of edges whose image normals are (..., 2)."""
-        return direction_of(normal, self.tables.shape[3])
+        return direction_of(normal, len(self.tables.ready))
 
     def look(
         self, direction: Integers, pixel: Array, photograph: Integers
@@ -110,7 +168,8 @@ class DistanceTables:
         self, direction: Integers, pixel: Array, photograph: Integers
     ) -> tuple[Array, Array, Booleans]:
         """Column and row (...) in the picture of all tables, and whether in the photograph."""
-        rows, height, _, count, width = self.tables.shape
+        self.tables.get_ready(direction)
+        rows, height, _, count, width = self.tables.picture.shape
         x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
@@ -125,7 +184,8 @@ class DistanceTables:
         """The picture of all tables at columns and rows (...)."""
         import cv2
 
-        picture: Any = self.tables.reshape(self.tables.shape[0] * self.tables.shape[1], -1)
+        tables = self.tables.picture
+        picture: Any = tables.reshape(tables.shape[0] * tables.shape[1], -1)
         # cv2.remap takes at most MOST_ACROSS rows and columns
         across = min(x.size, MOST_ACROSS)
         flat = np.zeros((2, -(-x.size // max(across, 1)) * across), dtype=np.float32)
@@ -138,9 +198,10 @@ class DistanceTables:
 
     def by_chance(self, direction: Integers, found: Array) -> Array:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
-        bins = self.chance.shape[1]
+        self.tables.get_ready(direction)
+        bins = self.tables.chance.shape[1]
         number = np.minimum(found / np.float32(BIN), bins - 1).astype(np.int32)
-        return self.chance.take(direction * bins + number)
+        return self.tables.chance.take(direction * bins + number)
 
     def select(self, photographs: Integers) -> DistanceTables:
         """Of some of the photographs; what moves and what chance gives, as all show it."""
@@ -149,18 +210,16 @@ class DistanceTables:
 
     def mirrored(self) -> DistanceTables:
         """Of the photographs with left and right exchanged."""
-        width = self.tables.shape[-1]
-        # the direction a becomes pi - a
+        width = self.moving.shape[1]
         edges = (
             PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
         )
         return DistanceTables(
-            np.ascontiguousarray(self.tables[..., ::-1, ::-1]),
+            self.tables.mirrored(),
             self.row,
             self.scale,
             tuple(edges),
             self.moving[:, ::-1],
-            self.chance[::-1],
             self.against[..., ::-1],
         )
 
@@ -174,29 +233,26 @@ def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
         return np.floor(turn).astype(np.int32) % count
 
 
-def distances(
-    pixel: Integers, number: Integers, shape: tuple[int, ...], out: Array | None = None
-) -> Array:
-    """Distance tables (DIRECTIONS, h, w) of edge points at whole pixels (n, 2), x first.
+def alike(direction: int, count: int) -> Booleans:
+    """Which direction numbers, of ``count``, a direction's table takes in: its own and the
+    neighbours'.
+    """
+    return (np.arange(count) - (direction - 1)) % count < 3
 
-    number : (n,) their directions. shape : of the tables. out : where they are written, in single
-    precision and each row in one piece, if not into a new array.
+
+def distances(place: Integers, out: Array) -> None:
+    """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
+    into ``out``, in single precision and each row in one piece.
     """
     import cv2
 
-    tables = np.empty(shape, dtype=np.float32) if out is None else out
-    count, height, width = shape
-    place = pixel[:, 1] * width + pixel[:, 0]
-    for k in range(count):
-        near = (number - (k - 1)) % count < 3
-        if not near.any():
-            tables[k] = 1e3
-            continue
-        mask = np.ones((height, width), dtype=np.uint8)
-        mask.reshape(-1)[place[near]] = 0
-        table: Any = tables[k]
-        cv2.distanceTransform(mask, cv2.DIST_L2, 3, dst=table)
-    return tables
+    if not len(place):
+        out[...] = NOWHERE
+        return
+    mask = np.ones(out.shape, dtype=np.uint8)
+    mask.reshape(-1)[place] = 0
+    table: Any = out
+    cv2.distanceTransform(mask, cv2.DIST_L2, 3, dst=table)
 
 
 def distance_tables(
@@ -221,17 +277,10 @@ def distance_tables(
         differs = against != 0
     edges = tuple(map(_edges_of, small, [None] * len(small) if differs is None else differs))
     moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
-    rows = min(len(small), MOST_ACROSS // height)
-    columns = -(-len(small) // rows)
-    tables = np.zeros((rows, height, columns, directions, across), dtype=np.float32)
-    count = np.ones((directions, round(FURTHEST / BIN)))  # what no place has is not impossible
-    for k, e in enumerate(edges):
-        table = tables[k % rows, :, k // rows].transpose(1, 0, 2)
-        number = direction_of(e.normal, directions)
-        distances(e.pixel.astype(int), number, table.shape, table)
-        count += _counted(table)
-    chance = (count / count.sum(axis=1, keepdims=True) / BIN).astype(np.float32)
-    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, chance, against)
+    place = [e.pixel.astype(int) @ (1, across) for e in edges]
+    number = [direction_of(e.normal, directions) for e in edges]
+    tables = DirectionTables.of_edges(place, number, (directions, height, across))
+    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, against)
 
 
 def _against_median(small: Integers) -> Integers:
@@ -264,12 +313,12 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
 
 
 def _counted(table: Array) -> Integers:
-    """How often each distance occurs in tables (DIRECTIONS, h, w), (DIRECTIONS, bins); at every
-    other place of every other row.
+    """How often each distance occurs in a table (h, w), (bins,); at every other place of every
+    other row.
     """
     bins = round(FURTHEST / BIN)
-    number = np.minimum(table[:, ::2, ::2] * np.float32(1 / BIN), bins - 1).astype(np.intp)
-    return np.stack([np.bincount(one.ravel(), minlength=bins) for one in number])
+    number = np.minimum(table[::2, ::2] * np.float32(1 / BIN), bins - 1).astype(np.intp)
+    return np.bincount(number.ravel(), minlength=bins)
 
 
 def _levels(image: Any) -> Integers:
@@ -288,7 +337,7 @@ def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
     edges = cv2.Canny(dx, dy, *CANNY) > 0
     if moving is not None:
         edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    y, x = np.nonzero(edges)
+    y, x = np.divmod(np.flatnonzero(edges), edges.shape[1])  # faster than np.nonzero
     normal = np.stack([dx[y, x], dy[y, x]], axis=-1).astype(float)
     return PictureEdges(
         np.stack([x, y], axis=-1).astype(float),
