@@ -5,12 +5,13 @@ mix-ups, refused where it is not, and nothing said of a session that is right.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
 
 from pkmcal.observe import diagnose
-from pkmcal.observe.diagnose import SeenStation, _numbering, mistake
+from pkmcal.observe.diagnose import SeenStation, _best_names, _numbering, mistake
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, find_station
@@ -195,6 +196,18 @@ def test_tables_of_mirrored_photographs_are_mirrored_tables():
         each.get_ready(np.arange(len(each.ready)))
     assert np.mean(np.abs(own.picture - other.picture) < 1.5) > 0.97
     np.testing.assert_allclose(own.chance, other.chance, atol=0.02)
+
+
+def test_names_are_assigned_for_the_largest_sum():
+    rng = np.random.default_rng(0)
+    kept = 0
+    for _ in range(300):
+        score = rng.normal(size=(4, 4)) + rng.uniform(0, 4) * np.eye(4)
+        every = np.array(list(permutations(range(4))))
+        best = every[np.argmax(score[np.arange(4), every].sum(axis=1))]
+        np.testing.assert_array_equal(_best_names(score), best)
+        kept += np.array_equal(best, np.arange(4))
+    assert 100 < kept < 250
 
 
 @pytest.mark.slow

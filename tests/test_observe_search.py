@@ -14,7 +14,7 @@ from pkmcal.observe.legs import REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
 from pkmcal.observe.stations import find_station
-from pkmcal.observe.tables import DIRECTIONS, direction_of, distance_tables
+from pkmcal.observe.tables import BIN, DIRECTIONS, direction_of, distance_tables
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -276,6 +276,23 @@ def test_directions_are_of_lines_not_of_arrows():
     np.testing.assert_array_equal(number, direction_of(-normal))
     np.testing.assert_array_equal(np.unique(number), np.arange(DIRECTIONS))
     assert np.all(np.diff(number[:100]) >= 0)
+
+
+def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
+    image = np.full((480, 640), 200, np.uint8)
+    image[:, :320] = 40
+    tables = distance_tables([image])
+    assert not tables.tables.ready.any()
+    pixel, one = np.array([[200.0, 240.0]]), np.array([3])
+    found, _ = tables.look(one, pixel, np.array(0))
+    np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), one)
+    chance = tables.by_chance(np.array([5]), found)
+    np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), [3, 5])
+    # the same whatever was looked for before
+    tables.tables.get_ready(np.arange(DIRECTIONS))
+    assert tables.look(one, pixel, np.array(0))[0] == found
+    assert tables.by_chance(np.array([5]), found) == chance
+    np.testing.assert_allclose(tables.tables.chance.sum(axis=1) * BIN, 1.0, rtol=1e-5)
 
 
 def test_tables_hold_the_distance_to_an_edge_of_that_direction():

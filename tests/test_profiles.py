@@ -288,7 +288,7 @@ def test_diffuse_light_is_kept():
     assert np.mean(less.cut > made.profiles.cut) < 0.02
 
 
-@pytest.mark.parametrize("blur", [0.55, 0.63, 0.7, 0.85, 1.0])
+@pytest.mark.parametrize("blur", [0.5, 0.55, 0.63, 0.7, 0.85, 1.0, 1.2])
 def test_the_blur_is_recovered(blur):
     """To 0.03 px: half a hundredth of a pixel in the edges' places comes from 0.005 px of it."""
     assert estimate_blur(make(6, 300, blur=blur).profiles) == pytest.approx(blur, abs=0.03)

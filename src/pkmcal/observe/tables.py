@@ -3,9 +3,8 @@
 Photographs are reduced, picture edges found, and for each of a few directions the distance to
 the nearest edge of about that direction is tabulated, as soon as one is asked for. A predicted
 silhouette then scores by the distances under its points, smooth enough to be descended from a
-hundred pixels away. Where a
-station took several photographs, edges that never move are left out: the floor and the wall do
-not say where the machine is.
+hundred pixels away. Where a station took several photographs, edges that never move are left out:
+the floor and the wall do not say where the machine is.
 """
 
 from __future__ import annotations
