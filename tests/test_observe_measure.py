@@ -98,6 +98,17 @@ def test_the_points_lie_on_the_true_edges():
     assert np.abs(off).max() < 3 * FAINT
 
 
+def test_a_photograph_that_shows_no_leg_leaves_the_others_as_they_are():
+    beside = poses().copy()
+    beside[2, :3, 3] += FRONT[0, :3] * 5.0  # its legs far outside the picture
+    usual = measure(taken(), machine(), FRONT, poses(), 0.7).edges
+    found = measure(taken(), machine(), FRONT, beside, 0.7)
+    assert 2 not in found.edges.configuration
+    np.testing.assert_allclose(
+        found.edges.normal, usual.normal[usual.configuration != 2], atol=1e-9
+    )
+
+
 def test_spans_lie_on_the_tubes():
     edges = measure(taken(), machine(), FRONT, poses()).edges
     tubes = tubes_of(machine())

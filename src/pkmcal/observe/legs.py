@@ -447,7 +447,7 @@ def _segment_profiles(
         mine = slice(*part)
         across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)
         # a row a segment: what lies close in the photograph is interpolated together
-        rows = (v.reshape(len(seen[mine]), -1) for v in across)
+        rows = (v.reshape(-1, seen.shape[-1] * len(offsets)) for v in across)
         grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
         np.matmul(seen[mine], grey >= profiles.SATURATED, out=clipped[mine])
