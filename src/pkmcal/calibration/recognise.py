@@ -243,8 +243,8 @@ def _searched(
             return before
         return _better(find_station(view, start, rng), before)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(search, views, starts, before, rngs))
+    # one after the other: arrays about a known pose are so small that threads wait for one another
+    return list(map(search, views, starts, before, rngs))
 
 
 def _anywhere(
