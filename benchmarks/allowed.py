@@ -74,7 +74,7 @@ def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary) / folder.name
         shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(TRUTH))
-        found = calibrate.calibrate(copy, seed=seed)
+        found = calibrate.calibrate_session(copy, seed=seed)
     session, measurements, estimate = found.session, found.measurements, found.estimate
     truth = read_truth(folder, session.machine)
     if isinstance(truth, str):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.calibration.source import load_source
-from pkmcal.export.c import SOURCE, CSource, c_array
+from pkmcal.export.c import C_SOURCE_FILE, CSource, c_array
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue
@@ -108,7 +108,7 @@ def timed(name: str, folder: Path) -> str:
         (folder / file).write_text(text)
     (folder / "main.c").write_text(MAIN % {**arrays, "pairs": PAIRS, "rounds": ROUNDS})
     compiler = os.environ.get("CC", "cc")
-    build = [compiler, "-std=c99", "-O2", "main.c", SOURCE, "-lm", "-o", "timed"]
+    build = [compiler, "-std=c99", "-O2", "main.c", C_SOURCE_FILE, "-lm", "-o", "timed"]
     subprocess.run(build, cwd=folder, check=True)
     return subprocess.run([folder / "timed"], check=True, capture_output=True, text=True).stdout
 

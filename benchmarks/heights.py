@@ -29,9 +29,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import printers
 from pkmcal.arrays import Array
-from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.source import Source
-from pkmcal.export.contract import export
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.source import MachineSource
+from pkmcal.export.contract import make_export
 from pkmcal.identify.bed import Bed, bed_of
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
@@ -146,10 +146,10 @@ def by_us(
         if tolerance is not None:
             text = re.sub("axis: .* deg, scale: .* %", tolerance, text)
         (folder / "kit" / "mechanism.yaml").write_text(text)
-        found = calibrate(folder / "kit")
+        found = calibrate_session(folder / "kit")
     bed = bed_of(found.measurements, found.estimate)
-    source = Source(found.machine, bed=bed.z)
-    (text,) = export(source, "klipper").files.values()
+    source = MachineSource(found.machine, bed=bed.z)
+    (text,) = make_export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")
     each = {
         name: tuple(float(values[f"stepper_{s}"][name][0]) for s in "abc")

@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.calibration.calibrate import Calibration, calibrate
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.session.load import load_session
@@ -70,7 +70,7 @@ def calibrated(lengths: np.ndarray, model: str, noise: float) -> Calibration:
         (folder / "mechanism.yaml").write_text(text, encoding="utf-8")
         (folder / "joints.csv").write_text(csv_text(BELTS, names, lengths), encoding="utf-8")
         (folder / "session.yaml").write_text(yaml_text(document), encoding="utf-8")
-        return calibrate(load_session(folder, model))
+        return calibrate_session(load_session(folder, model))
 
 
 def residuals(calibration: Calibration, lengths: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ def decode_and_canny(paths: list[Path]) -> float:
 def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.pages.page import page_html
     from pkmcal.report.calibration import outcome_of
     from pkmcal.session.load import load_session
@@ -43,8 +43,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(sys.argv[1]) if len(sys.argv) > 1 else simulated(Path(folder) / "session")
         session = load_session(source)
-        first = calibrate(session)
-        runs = [calibrate(session).timings for _ in range(3)]
+        first = calibrate_session(session)
+        runs = [calibrate_session(session).timings for _ in range(3)]
         parts = {name: min(run[name] for run in runs) for name in runs[0]}
         begin = time.perf_counter()
         page_html(outcome_of(first))

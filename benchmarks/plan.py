@@ -20,9 +20,9 @@ from threadpoolctl import threadpool_limits
 from pkmcal.arrays import Integers
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.planning.candidates import Configurations, configurations, neighbours
-from pkmcal.planning.exchange import INDICES, exchanged
+from pkmcal.planning.exchange import PLAN_INDICES, exchanged
 from pkmcal.planning.information import Candidates, information_of
-from pkmcal.planning.plan import CAPTURE, MeasurementPlan, plan
+from pkmcal.planning.plan import CONFIGURATIONS_A_CAPTURE, MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, of_machine
 from pkmcal.simulation import board_for
 from pkmcal.simulation.demo import camera_of_size
@@ -55,7 +55,10 @@ def by_chance(found: MeasurementPlan, rng: np.random.Generator) -> tuple[float, 
     n = len(evenly[0])
     each = []
     for _ in range(DRAWS):
-        rows = [g * n + rng.choice(n, CAPTURE, replace=False) for g in range(len(groups))]
+        rows = [
+            g * n + rng.choice(n, CONFIGURATIONS_A_CAPTURE, replace=False)
+            for g in range(len(groups))
+        ]
         each.append(info.tool(info.covariance(info.of(np.concatenate(rows))))[0])
     return float(np.mean(each)), float(np.min(each))
 
@@ -71,7 +74,8 @@ def long_search(
         drawn = configurations(rig.machine, POOL, rng)
         pool = Candidates.of_all(groups, *drawn)
         start = np.concatenate(
-            [np.flatnonzero(pool.group == g)[rng.permutation(len(drawn.joints))[:CAPTURE]]
+            [np.flatnonzero(pool.group == g)[
+                rng.permutation(len(drawn.joints))[:CONFIGURATIONS_A_CAPTURE]]
              for g in range(len(groups))]
         )  # fmt: skip
         if chosen is not None and searches % 2:  # every other search goes on from the best so far
@@ -79,7 +83,7 @@ def long_search(
         now = pool
         for _ in range(6):
             info = information_of(rig, pool, found.work)
-            now = pool.only(np.sort(exchanged(info, start, INDICES["tool"](info))))
+            now = pool.only(np.sort(exchanged(info, start, PLAN_INDICES["tool"](info))))
             pool, start = joined(now, about(rig.machine, now, rng))
         info = information_of(rig, now, found.work)
         value = info.tool(info.covariance(info.of(np.arange(len(now.group)))))[0]
@@ -127,7 +131,7 @@ def main() -> None:
         for name, case in CASES.items():
             rng = np.random.default_rng(options.seed + 1)
             begun = time.process_time()
-            found = plan(subject_of(*case), seed=options.seed)
+            found = plan_measurements(subject_of(*case), seed=options.seed)
             took = time.process_time() - begun
             # as on average for all, so that only the choice differs
             rig, n = found.subject.rig, len(found.names)

@@ -108,12 +108,12 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
 
 def calibrated(folder: Path, seed: int) -> Outcome:
     """Whether a session in whose photographs the machine was recognised is refused in the end."""
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.errors import PkmcalError
 
     begin = time.process_time()
     try:
-        verdict = calibrate(folder, seed=seed).verdict
+        verdict = calibrate_session(folder, seed=seed).verdict
     except PkmcalError as error:
         return Outcome("refused", str(error), time.process_time() - begin)
     what = "wrong" if verdict.usable else "refused"

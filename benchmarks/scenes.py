@@ -349,7 +349,7 @@ def run(folder: Path, options: argparse.Namespace) -> Row:
             paths = [p.path for s in session.stations for p in s.photographs]
             row = replace(row, photographs=len(paths))
             with patch.object(calibrate, "time", clock):
-                found = calibrate.calibrate(session, seed=options.seed)
+                found = calibrate.calibrate_session(session, seed=options.seed)
         except PkmcalError as error:
             return replace(row, refusal=str(error), seconds=time.process_time() - begin)
         seconds = time.process_time() - begin

@@ -36,12 +36,12 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import NEARLY, bundle
+from pkmcal.identify.bundle import NEARLY_SOLVED_DISTANCE, bundle
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.papers.four_step import solve
+from pkmcal.papers.four_step import solve_from_centres
 from pkmcal.papers.leg_axes import centres_from_axes
 from pkmcal.solver.search import STEP_TOLERANCE, minimise
 from pkmcal.studies import paper_a
@@ -249,7 +249,7 @@ def measured(what: str, count: int) -> dict[str, float]:
         machine, measurements, state, problem, start = session(count)
         per = 1
         if what.startswith("solve"):
-            tolerance = NEARLY if what == "solve-nearly" else STEP_TOLERANCE
+            tolerance = NEARLY_SOLVED_DISTANCE if what == "solve-nearly" else STEP_TOLERANCE
 
             def work() -> Any:
                 return minimise(problem, start, tolerance=tolerance)
@@ -280,13 +280,15 @@ def study(runs: int) -> tuple[Callable[[], Any], Callable[[Any], tuple[float, fl
     setting = paper_a.HexapodByAxes(batch=runs)
     data = setting.draw(batches(setting, runs, seed=0)[0])
     axes = paper_a.measured_axes(data)
-    steps = solve(data.machine, axes, *centres_from_axes(axes, paper_a.STATIONS), "corrected")
+    steps = solve_from_centres(
+        data.machine, axes, *centres_from_axes(axes, paper_a.PAPER_A_STATIONS), "corrected"
+    )
     start = paper_a.Start(paper_a.parameters_of(data.machine, steps), steps.T_camera_base)
 
     def answer(found: paper_a.Fitted) -> tuple[float, float]:
         return found.told["steps"].mean(), found.sigma["parameters"].mean()
 
-    return lambda: paper_a.joint_estimate(data, start), answer, runs
+    return lambda: paper_a.joint_from_readings(data, start), answer, runs
 
 
 def in_turns(what: str, count: int, sources: list[Path]) -> list[dict[str, float]]:

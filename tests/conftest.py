@@ -80,7 +80,7 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True)
 def unhurried(monkeypatch):
     """No line about the progress on stderr, which tests compare, however slow the machine is."""
-    monkeypatch.setattr(console, "EVERY", 3600.0)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 3600.0)
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,9 @@ def told_once(folder: Path, find: Callable[..., Found]) -> Told[Found]:
 @pytest.fixture(scope="session")
 def calibrating(demo, common) -> Told[Calibration]:
     """The demonstration's session, calibrated from Python."""
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.calibration.calibrate import calibrate_session
 
-    return told_once(common / "calibrated", partial(calibrate, demo.session))
+    return told_once(common / "calibrated", partial(calibrate_session, demo.session))
 
 
 @pytest.fixture(scope="session")
@@ -177,7 +177,7 @@ def one_process(monkeypatch):
 def quick_plans():
     """Plans chosen among few candidates, where how good they are is not the question."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
+        patch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
         patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
         yield
 

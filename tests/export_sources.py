@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.cameras.files import camera_text
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.files import json_text
@@ -35,7 +35,7 @@ def with_scales(machine, tolerance):
 
 
 def source_of(machine, **more):
-    return Source(machine, **{"origin": "a test", **more})
+    return MachineSource(machine, **{"origin": "a test", **more})
 
 
 def calibration(folder: Path, machine, *, usable=True, camera=CAMERA, session=True) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from pkmcal.boards.board import Detection
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose, register, rotation
@@ -52,7 +52,7 @@ class Kit:
     def calibrated(self):
         """By the program; its detector is replaced by the corners, as there are no pictures."""
         with patch("pkmcal.boards.stations.detect_in", lambda *_: self.detections):
-            return calibrate(self.folder)
+            return calibrate_session(self.folder)
 
 
 class Error(NamedTuple):

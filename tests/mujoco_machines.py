@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkmcal.files import parse_yaml, validate
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -113,7 +113,9 @@ ALL = [*CATALOGUE, *(f"wrong {n}" for n in CATALOGUE), *MADE, *TURNED]
 
 
 def made(text):
-    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
+    )
 
 
 def machine_of(name):

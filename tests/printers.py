@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.files import parse_yaml, validate
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import MechanismDocument, machine_from_document
 
@@ -66,7 +66,9 @@ def machine(settings, lean=None, scale=(1.0, 1.0, 1.0), endstops=(0.0, 0.0, 0.0)
         "home": {"position": [0.0, 0.0, 0.1]},
     }
     text = json.dumps(drawing, default=float)
-    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
+    )
 
 
 def bed(n, radius=90.0):

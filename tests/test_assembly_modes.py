@@ -8,7 +8,7 @@ import pytest
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import assembly_modes, catalogue, load_mechanism
 from pkmcal.mechanisms.closure import closure
-from test_kinematics import CONVERGED, hexapod, machine_of, tripod, workspace, yawed
+from test_kinematics import CONVERGED_CLOSURE_ERROR, hexapod, machine_of, tripod, workspace, yawed
 
 APART = 1e-6
 
@@ -42,7 +42,7 @@ def search(machine, readings, home, seed, most=100_000):
 def exhaustive(machine, readings, home, seed, starts, monkeypatch):
     """The same search, made to go on to its last start."""
     with monkeypatch.context() as patch:
-        patch.setattr(assembly_modes, "OFTEN", 10**9)
+        patch.setattr(assembly_modes, "RAREST_MODE_FINDS", 10**9)
         return search(machine, readings, home, seed, starts)
 
 
@@ -79,7 +79,7 @@ def test_every_mode_closes_the_machine_once(name):
     readings = machine.inverse(machine.home())
     found = machine.assembly_modes_result(readings, np.random.default_rng(0))
     c = closure(machine.layout, machine.values, readings, found.poses, found.internal)
-    assert np.abs(c.rows.value).max() < CONVERGED
+    assert np.abs(c.rows.value).max() < CONVERGED_CLOSURE_ERROR
     # home is the first, with its own sign
     np.testing.assert_allclose(found.poses[0], machine.home(), atol=1e-6)
     if machine.layout.overdetermined:  # no determinant tells its assemblies apart
@@ -88,7 +88,7 @@ def test_every_mode_closes_the_machine_once(name):
         assert found.sign[0] == 1
         assert set(found.sign) <= {-1, 1}
     assert found.found.sum() == found.closed <= found.starts
-    assert found.found.min() >= assembly_modes.OFTEN
+    assert found.found.min() >= assembly_modes.RAREST_MODE_FINDS
     numbers = np.concatenate(
         [
             found.poses[:, :3].reshape(len(found), -1),

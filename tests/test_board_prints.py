@@ -11,7 +11,7 @@ import pytest
 
 from conftest import run
 from pkmcal.boards.detect import detect_boards
-from pkmcal.boards.prints import PAPERS, sheet_pdf
+from pkmcal.boards.prints import PAPER_SIZES, sheet_pdf
 from pkmcal.errors import InputError
 from pkmcal.simulation.board import board_from_fields
 
@@ -70,13 +70,13 @@ def test_the_printed_board_is_found_with_its_points_in_true_size(kind, tmp_path)
     np.testing.assert_allclose(turn[:2], np.eye(2), atol=2e-4)
 
 
-@pytest.mark.parametrize("paper", [None, *PAPERS])
+@pytest.mark.parametrize("paper", [None, *PAPER_SIZES])
 def test_everything_is_on_the_paper_and_the_rulers_are_as_long_as_they_say(paper):
     board = board_from_fields(BOARDS["chessboard"])
     pdf, name = sheet_pdf(board, paper)
     size, text = content_of(pdf)
     assert name == (paper or "a4")
-    np.testing.assert_allclose(sorted(size), sorted(np.array(PAPERS[name]) * 1e3), atol=0.01)
+    np.testing.assert_allclose(sorted(size), sorted(np.array(PAPER_SIZES[name]) * 1e3), atol=0.01)
     drawn = re.findall(r"([\d.-]+) ([\d.-]+) m ([\d.-]+) ([\d.-]+) l", text)
     lines = np.array(drawn, dtype=float).reshape(-1, 2, 2) * POINT
     boxes = rectangles(text)

@@ -30,7 +30,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Level
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
-from pkmcal.simulation.board import SIZE, board_from_fields
+from pkmcal.simulation.board import BASE_BOARD_DIAGONAL, board_from_fields
 from pkmcal.simulation.scene import discs_of
 from rendered import by_command
 from test_bad_input import only
@@ -134,7 +134,7 @@ def test_a_board_is_made_in_proportion_to_the_machine():
     machine = load_mechanism("gough-stewart")
     board = board_for(machine)
     size = np.hypot(*(np.array(board.document["squares"]) + 1)) * board.document["square"]
-    assert size == pytest.approx(SIZE * discs_of(machine).base_radius, rel=0.02)
+    assert size == pytest.approx(BASE_BOARD_DIAGONAL * discs_of(machine).base_radius, rel=0.02)
 
 
 # stations through the board
@@ -220,9 +220,9 @@ def test_check_reports_the_board(folder, monkeypatch):
 
 
 def test_calibrating_with_the_board(folder):
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.calibration.calibrate import calibrate_session
 
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     assert len(result.measurements.poses) == 2
     assert [(m.name, m.body) for m in result.measurements.mounts] == [("board", "base")]
     assert result.estimate.state.T_mount.shape == (1, 4, 4)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pkmcal.boards.board import PRINTED, board_from_document
+from pkmcal.boards.board import PRINTED_SIZE_TOLERANCE, board_from_document
 from pkmcal.boards.poses import pose_set
 from pkmcal.calibration.doubts import sizes_told
 from pkmcal.errors import InputError
@@ -148,7 +148,7 @@ def test_files_say_how_well_the_size_is_known():
     def board(**more):
         return board_from_document(Document("board.yaml", "board.yaml", fields | more, {}))
 
-    assert board().tolerance == PRINTED
+    assert board().tolerance == PRINTED_SIZE_TOLERANCE
     assert board(tolerance=0).tolerance == 0
     assert board(tolerance=2e-4).document["tolerance"] == 2e-4
     with pytest.raises(InputError, match="tolerance"):

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from conftest import run
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.recognise import boards_of, read_photographs
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
@@ -73,7 +73,7 @@ def test_boards_are_where_they_are(rendered):
 
 
 def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
-    found = calibrate(rendered)
+    found = calibrate_session(rendered)
     corners = board_corners(found.session, found.boards, found.estimate)
     assert len(corners) > 50
     # what the corners' own noise leaves, a few hundredths of a pixel
@@ -89,7 +89,7 @@ def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
 
 
 def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     truth = load_truth(rendered, result.session.machine)
     s = result.estimate.statistics
     assert s.n_edges > 100
@@ -106,7 +106,7 @@ def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
 
 def test_the_board_alone(folder):
     change(folder, lambda station: station.update(observe="board"))
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     assert len(result.observation.edges) == 0
     assert result.estimate.statistics.pose_scale < 1.6
     assert result.boards.stations[0].seen.usable.sum() > 7
@@ -134,7 +134,7 @@ def test_cameras_are_refined_with_the_board(rendered, folder):
     document["covariance"] = np.diag(sigma**2).tolist()
     path.write_text(yaml.safe_dump(document))
     change(folder, lambda station: station.update(observe="board"))
-    result = calibrate(folder, refine_camera=True)
+    result = calibrate_session(folder, refine_camera=True)
     camera = result.cameras.result(result.estimate, result.cameras.files[0])
     spread = np.sqrt(np.diag(camera.covariance))[:2]
     assert np.all(spread < 0.5 * sigma[:2])
@@ -145,7 +145,7 @@ def test_a_photograph_of_another_configuration_is_let_go(folder):
     images = folder / "images" / "station1"
     names = sorted(path.name for path in images.iterdir())
     shutil.copy(images / names[3], images / names[5])
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     lost = result.estimate.pose_weights < 0.5
     assert result.observation.poses.configuration[lost].tolist() == [5]
     assert any(
@@ -167,7 +167,7 @@ def test_a_missing_board_file_and_another_camera(folder):
 
 def test_the_method_of_paper_c_says_nothing_of_the_size(rendered, tmp_path, monkeypatch):
     """It estimates none, so none is told, though board.yaml's tolerance makes it unsure."""
-    monkeypatch.setattr(methods, "REPETITIONS", 12)  # of its deviations nothing is asked
+    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 12)  # of its deviations nothing is asked
     done = run("calibrate", rendered, "-o", tmp_path / "out", "--method", "inverse-kinematic")
     assert done.code in (0, 1)
     target = json.loads((tmp_path / "out" / "calibration.json").read_text())["targets"][0]

@@ -9,7 +9,7 @@ import pytest
 
 import pkmcal
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare
+from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.estimate import State
@@ -44,7 +44,7 @@ def errors_in_sigmas(calibration, folder):
 
 def check_found(found, folder, centre):
     """The joint centres come from millimetres to ``centre``, and the deviations say how far off."""
-    errors = compare(found, folder)
+    errors = compare_with_truth(found, folder)
     assert errors.drawing.centre > 1e-3
     assert errors.calibrated.centre < centre
     assert errors.calibrated.orientation < errors.drawing.orientation / 5
@@ -74,7 +74,7 @@ def test_slim_bare_rods_are_told_honestly(tmp_path):
     """
     folder = photographed(tmp_path / "session", seed=5)
     found = pkmcal.calibrate(folder)
-    result = compare(found, folder)
+    result = compare_with_truth(found, folder)
     assert result.calibrated.centre < result.drawing.centre / 5
     assert np.sqrt(np.mean(errors_in_sigmas(found, folder) ** 2)) < 1.2
 
@@ -111,8 +111,11 @@ def test_start_from_a_bad_drawing(demo, calibrated):
     table = replace(table, drawing=table.drawing + off, tolerance=loose)
     machine = replace(session.machine, parameters=table, values=table.drawing)
     found = pkmcal.calibrate(replace(session, machine=machine))
-    errors = compare(found, demo.session).calibrated
-    assert errors.centre < 1.5 * compare(calibrated, demo.session).calibrated.centre + 0.05e-3
+    errors = compare_with_truth(found, demo.session).calibrated
+    assert (
+        errors.centre
+        < 1.5 * compare_with_truth(calibrated, demo.session).calibrated.centre + 0.05e-3
+    )
 
 
 @pytest.mark.parametrize("stations", [1, pytest.param(3, marks=pytest.mark.slow)])
@@ -149,8 +152,8 @@ def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, meth
     """They run on the same edges and come nowhere near; the verdict names the better method."""
     found = pkmcal.calibrate(demo.session, method=method)
     assert found.method == method
-    worse = compare(found, demo.session).calibrated.centre
-    assert worse > 3 * compare(calibrated, demo.session).calibrated.centre
+    worse = compare_with_truth(found, demo.session).calibrated.centre
+    assert worse > 3 * compare_with_truth(calibrated, demo.session).calibrated.centre
     if not found.verdict.usable:
         assert any("bundle" in reason for reason in found.verdict.reasons)
     assert np.all(np.diag(found.estimate.covariance) >= 0)
@@ -177,7 +180,7 @@ def test_cameras_are_refined(demo, calibrated):
     stations = tuple(replace(s, camera=wrong) for s in session.stations)
     held = pkmcal.calibrate(replace(session, stations=stations))
     found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
-    spoilt, mended = (compare(c, demo.session).calibrated for c in (held, found))
+    spoilt, mended = (compare_with_truth(c, demo.session).calibrated for c in (held, found))
     # the readings' scales, unsure to their tolerance, leave the size of everything, and with
     # it positions, open by as much
     assert mended.centre < spoilt.centre / 1.5

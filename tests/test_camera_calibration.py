@@ -92,7 +92,7 @@ def alone(monkeypatch, model):
     """Fit this model only: of one that is asked for, others tell no more than whether they fit
     better.
     """
-    monkeypatch.setattr("pkmcal.boards.camera.TERMS", (model,))
+    monkeypatch.setattr("pkmcal.boards.camera.DISTORTION_CANDIDATES", (model,))
 
 
 @pytest.fixture(params=TRUE)

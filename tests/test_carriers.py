@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
-from pkmcal.files import parse_yaml, validate
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.mechanisms.carriers.bars import Bar, HingedBar
@@ -250,7 +250,9 @@ legs:
 
 
 def read(text):
-    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
+    )
 
 
 def test_motors_are_the_readings_columns():

@@ -13,8 +13,8 @@ import pytest
 
 import pkmcal
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare
-from pkmcal.files import parse_yaml, validate
+from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import State
@@ -181,7 +181,9 @@ def test_built_machines_move_as_drawn(machine):
 
 def loads_back(built):
     """A built machine is one that a file could hold: in its plane, with axes of length one."""
-    document = validate(parse_yaml(mechanism_text(built), Path("built.yaml")), MechanismDocument)
+    document = validated_document(
+        parse_yaml(mechanism_text(built), Path("built.yaml")), MechanismDocument
+    )
     return np.array_equal(machine_from_document(document).values, built.values)
 
 
@@ -281,7 +283,7 @@ def test_photographs_calibrate(name, tmp_path):
     found = pkmcal.calibrate(tmp_path / "s")
     assert found.verdict.usable
     truth = load_truth(tmp_path / "s", drawing)
-    errors = compare(found, tmp_path / "s")
+    errors = compare_with_truth(found, tmp_path / "s")
     assert errors.calibrated.position < errors.drawing.position / 5
     assert errors.calibrated.orientation < errors.drawing.orientation / 5
     assert np.sqrt(np.mean(in_sigmas(drawing, found.estimate, truth) ** 2)) < 1.6

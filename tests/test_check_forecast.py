@@ -18,8 +18,8 @@ from pkmcal.check import advice as words
 from pkmcal.check.check import check_session
 from pkmcal.check.forecast import Forecast, LegForecast, forecast
 from pkmcal.check.pictures import (
-    BAR,
-    GAP,
+    CAPTION_BAR_HEIGHT,
+    PANE_GAP,
     leg_colours,
     picture_names,
     with_pictures,
@@ -216,9 +216,9 @@ def test_pictures_of_all_photographs(found, tmp_path):
     station = found.look.stations[0]
     width, height = station.photographs.camera.image_size
     drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))
-    assert drawn.shape == (height + BAR, 2 * width + GAP, 3)
+    assert drawn.shape == (height + CAPTION_BAR_HEIGHT, 2 * width + PANE_GAP, 3)
     # beside the lines the photograph is as it was, and all legs' colours are in it
-    after = drawn[BAR:, width + GAP :]
+    after = drawn[CAPTION_BAR_HEIGHT:, width + PANE_GAP :]
     plain = cv2.cvtColor(station.photographs.images[0], cv2.COLOR_GRAY2BGR)
     assert np.mean(np.any(after != plain, axis=-1)) < 0.2
     for colour in leg_colours()[:6]:  # thin lines are blended with what they cross
@@ -227,14 +227,14 @@ def test_pictures_of_all_photographs(found, tmp_path):
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the photograph changes; under those by hand, that are off, it does less."""
-    from pkmcal.check.pictures import overlay
+    from pkmcal.check.pictures import drawing_over_photograph
 
     def strength(T_camera_base, k):
         image = station.photographs.images[k].astype(np.float32)
         slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
-        for edge in overlay(found.look, station, T_camera_base, k)[0]:
+        for edge in drawing_over_photograph(found.look, station, T_camera_base, k)[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
         return float(np.median(slope[mask > 0]))
 
@@ -243,10 +243,10 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
 
 
 def test_each_number_stands_once_and_apart(found):
-    from pkmcal.check.pictures import overlay
+    from pkmcal.check.pictures import drawing_over_photograph
 
     station = found.look.stations[0]
-    _, spots = overlay(found.look, station, station.found, 0)
+    _, spots = drawing_over_photograph(found.look, station, station.found, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
@@ -301,14 +301,16 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr("pkmcal.check.pictures.overlay", never)
+    monkeypatch.setattr("pkmcal.check.pictures.drawing_over_photograph", never)
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before
 
 
 def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.pictures.BAR", -1)  # fails in the first picture
+    monkeypatch.setattr(
+        "pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1
+    )  # fails in the first picture
     with pytest.raises(ValueError, match="negative"):
         write_pictures(found.look, tmp_path / "pictures")
     assert list(tmp_path.iterdir()) == []

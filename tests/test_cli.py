@@ -67,7 +67,9 @@ def test_help_imports_nothing_heavy():
 
 def test_a_command_loads_no_other():
     ask = "cli.main(['calibrate', '--help'])"
-    tell = "print([m[16:] for m in sys.modules if m[16:] in cli.COMMANDS], file=sys.stderr)"
+    tell = (
+        "print([m[16:] for m in sys.modules if m[16:] in cli.COMMANDS_IN_ORDER], file=sys.stderr)"
+    )
     code = f"import sys; from pkmcal.commands import cli; {ask}; {tell}"
     assert python("-c", code).stderr == "['calibrate']\n"
 
@@ -182,8 +184,10 @@ def test_demo(demo):
 
 def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
     monkeypatch.setattr("pkmcal.simulation.simulate_session", lambda *_, **_more: None)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", lambda *_, **_more: calibrated)
-    monkeypatch.setattr("pkmcal.commands.demo.SESSION", str(demo.session))
+    monkeypatch.setattr(
+        "pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: calibrated
+    )
+    monkeypatch.setattr("pkmcal.commands.demo.DEMO_SESSION_NAME", str(demo.session))
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     monkeypatch.setattr("pkmcal.commands.console.can_show", lambda: True)
@@ -402,7 +406,7 @@ def test_calibrate(session, demo):
 
 def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate",
+        "pkmcal.calibration.calibrate.calibrate_session",
         lambda *_, seed, **_more: replace(calibrated, seed=seed),
     )
     out = shutil.copytree(demo.calibration, tmp_path / "result")
@@ -437,7 +441,9 @@ def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
 
 def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
     """Barely enough for them: told apart as comparison, or refused with [A]'s own condition."""
-    monkeypatch.setattr("pkmcal.papers.methods.REPETITIONS", 12)  # asked: the verdict, no deviation
+    monkeypatch.setattr(
+        "pkmcal.papers.methods.SIGMA_REPETITIONS", 12
+    )  # asked: the verdict, no deviation
     done = run("calibrate", session, "--method", "four-step", "--json")
     assert done.code == 1
     if (session / "calibration").exists():
@@ -453,7 +459,7 @@ def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch
     doubts = ("Somebody ran into the machine.",)
     verdict = judge(found.observation, found.estimate, found.findings, doubts=doubts)
     found = replace(found, verdict=verdict)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", lambda *_, **_more: found)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: found)
     done = run("calibrate", session)
     assert done.code == 1
     assert "This calibration should not be used" in done.out

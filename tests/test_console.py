@@ -31,7 +31,7 @@ class Heard:
 
 
 def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
-    monkeypatch.setattr(console, "EVERY", 0.01)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     with redirect_stderr(Heard()) as heard, console.progress() as told:
         told("Finding the legs: 3 of 9 photographs", 0.35)
         assert heard.written.wait(60)
@@ -41,7 +41,7 @@ def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
 
 
 def test_nobody_speaks_where_nothing_is_wanted(monkeypatch):
-    monkeypatch.setattr(console, "EVERY", 0.01)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     count = threading.active_count()
     with redirect_stderr(Heard()) as heard, console.progress(quiet=True) as told:
         told("Finding the legs", 0.35)
@@ -56,7 +56,7 @@ def test_a_short_run_says_nothing():
 
 
 def test_nothing_is_said_before_there_is_anything_to_say(monkeypatch):
-    monkeypatch.setattr(console, "EVERY", 0.01)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     with redirect_stderr(Heard()) as heard, console.progress():
         assert not heard.written.wait(0.2)
 
@@ -70,8 +70,8 @@ def test_a_calibration_tells_what_it_does(demo, calibrating, tmp_path, monkeypat
                 time.sleep(0.005)
         return calibrating.found
 
-    monkeypatch.setattr(console, "EVERY", 0.01)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", again)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", again)
     said = run("calibrate", demo.session, "-o", tmp_path / "told")
     assert said.code == 0
     steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in said.err.splitlines())
@@ -86,8 +86,8 @@ def test_what_is_to_be_silent_is(demo, calibrated, tmp_path, monkeypatch):
         time.sleep(0.2)
         return calibrated
 
-    monkeypatch.setattr(console, "EVERY", 0.01)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", long)
+    monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", long)
     words = ("calibrate", demo.session, "-o", tmp_path / "out")
     assert "Finding the legs" in run(*words).err
     for silent in ("--json", "--quiet"):

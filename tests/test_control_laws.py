@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.control.laws import (
-    LAWS,
+    CONTROL_LAWS,
     direction_interaction,
     edge_interaction,
     joint_velocities,
@@ -179,7 +179,7 @@ def test_matrix_of_each_law_is_the_derivative_of_its_error():
     seen = before("gough-stewart")
     poses, joints = poses_of(seen, 4)
     goal = np.roll(true_edges(seen, poses), 1, axis=0)
-    for law, kind in LAWS.items():
+    for law, kind in CONTROL_LAWS.items():
         legs = legs_at(seen, poses)
         task = task_of(law, seen, true_edges(seen, poses), goal, legs)
         for k in range(6):
@@ -235,7 +235,7 @@ def test_control_by_image_needs_no_platform():
     wrong = seen.machine.values.copy()
     wrong[[k for k, name in enumerate(table.names) if ".platform." in name]] += 0.05
     other = replace(seen, machine=seen.machine.with_values(wrong))
-    for law in LAWS:
+    for law in CONTROL_LAWS:
         speeds = [joint_velocities(law, s, n, n[[1, 2, 0]], joints, 1.0) for s in (seen, other)]
         np.testing.assert_allclose(*speeds, atol=1e-13)
 
@@ -243,7 +243,7 @@ def test_control_by_image_needs_no_platform():
 # ------------------------------------------------------------------ laws
 
 
-@pytest.mark.parametrize("law", sorted(LAWS))
+@pytest.mark.parametrize("law", sorted(CONTROL_LAWS))
 @pytest.mark.parametrize(
     "name", ["gough-stewart", "6-rus", "delta", "3-rps", "h4", "constant-legs", "3-rpr"]
 )
@@ -293,7 +293,7 @@ def test_common_shift_of_the_base_changes_nothing_by_directions():
     change = {
         law: np.abs(np.subtract(*(joint_velocities(law, s, n, wanted, joints, 1.0)
                                   for s in (seen, shifted)))).max()
-        for law in LAWS
+        for law in CONTROL_LAWS
     }  # fmt: skip
     assert change["directions"] < 1e-13
     assert change["edges"] > 1e-3
@@ -396,6 +396,6 @@ def test_rotation_of_the_base_frame_changes_nothing():
         machine=seen.machine.with_values(values),
         T_camera_base=seen.T_camera_base @ inverse(E),
     )
-    for law in LAWS:
+    for law in CONTROL_LAWS:
         speeds = [joint_velocities(law, s, n, wanted, joints, 1.0) for s in (seen, moved)]
         np.testing.assert_allclose(*speeds, atol=1e-12)

@@ -13,7 +13,7 @@ import yaml
 from conftest import run
 from pkmcal import calibrate
 from pkmcal.boards.poses import pose_set, size_departure
-from pkmcal.calibration.departures import LEVEL
+from pkmcal.calibration.departures import FALSE_DEPARTURE_CHANCE
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import outlines
 from pkmcal.calibration.saved import load
@@ -27,13 +27,13 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.planning.subject import of_machine
-from pkmcal.session.moved import FEWEST
+from pkmcal.session.moved import FEWEST_BESIDE_MOVEMENT
 from pkmcal.simulation import simulate_edges
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver import elimination
-from pkmcal.wording import ratio
+from pkmcal.wording import ratio_in_per_cent
 from test_identify_scene import exact
 
 NOISE = EdgeNoise(0.1, 0.1)
@@ -98,7 +98,7 @@ def plays(data):
 def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate():
     drawing, data, where = measured(1, scale=(2, 2e-3))
     estimate, tests = score_tests(drawing, data, where, scales(data), False)
-    found = tests.found(LEVEL)
+    found = tests.found(FALSE_DEPARTURE_CHANCE)
     assert found[0][0] == 2
     fit = tests.fitted([2])[0]
     assert abs(fit.value[0] - 2e-3) < 4 * fit.sigma[0]
@@ -121,7 +121,7 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
     drawing = load_mechanism("gough-stewart")
     drawing, data, where = measured(1, scale=(2, 1e-2), machine=drawing)
     estimate, tests = score_tests(drawing, data, where, scales(data), False)
-    assert tests.found(LEVEL)[0][0] == 2
+    assert tests.found(FALSE_DEPARTURE_CHANCE)[0][0] == 2
     fit = tests.fitted([2])[0]
     row = drawing.parameters.index("legs[3].scale")
     present = estimate.machine.values[row]
@@ -134,12 +134,12 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
 def test_play_and_a_pushed_camera_are_told_from_each_other():
     drawing, data, where = measured(2, play=(4, 4e-4))
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.found(LEVEL)] == [6 + 4]
+    assert [k for k, _ in tests.found(FALSE_DEPARTURE_CHANCE)] == [6 + 4]
     assert tests.fitted([10])[0].value[0] == pytest.approx(4e-4, rel=0.2)
     step = np.array([0.0, 0.0, 0.0, 6e-4, -5e-4, 4e-4])
     drawing, data, where = measured(3, turned=step)
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.found(LEVEL)] == [12]
+    assert [k for k, _ in tests.found(FALSE_DEPARTURE_CHANCE)] == [12]
     fit = tests.fitted([12])[0]
     off = fit.value - step
     assert np.all(np.abs(off) < 4 * fit.sigma + 0.05 * np.abs(step))
@@ -148,7 +148,7 @@ def test_play_and_a_pushed_camera_are_told_from_each_other():
 def test_two_departures_are_found_one_after_the_other():
     drawing, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert {k for k, _ in tests.found(LEVEL)} == {0, 6 + 3}
+    assert {k for k, _ in tests.found(FALSE_DEPARTURE_CHANCE)} == {0, 6 + 3}
     one, other = tests.fitted([0, 9])
     assert one.value[0] == pytest.approx(4e-3, rel=0.3)
     assert other.value[0] == pytest.approx(5e-4, rel=0.3)
@@ -157,7 +157,7 @@ def test_two_departures_are_found_one_after_the_other():
 def test_nothing_is_found_twice():
     drawing, data, where = measured(7, scale=(1, 6e-3))
     _, tests = score_tests(drawing, data, where, scales(data)[1:3], False, [0, 1])
-    found = [k for k, _ in tests.found(LEVEL)]
+    found = [k for k, _ in tests.found(FALSE_DEPARTURE_CHANCE)]
     assert found[0] == 0
     assert len(found) == len(set(found))
 
@@ -207,7 +207,7 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     scores = tests.scores(freed)
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(known, k)[0], rel=1e-5, abs=1e-6)
-    monkeypatch.setattr(elimination, "ROWS", 3 * problem.n_rows)
+    monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 3 * problem.n_rows)
     pieces = Departures(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)
@@ -224,7 +224,7 @@ def false_alarms(seeds):
 
 def test_right_sessions_have_chances_like_dice():
     chances = false_alarms(range(100, 112))
-    assert chances.min() > LEVEL / chances.shape[1] / 10
+    assert chances.min() > FALSE_DEPARTURE_CHANCE / chances.shape[1] / 10
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
 
@@ -232,7 +232,7 @@ def test_right_sessions_have_chances_like_dice():
 def test_right_sessions_have_chances_like_dice_often():
     chances = false_alarms(range(500))
     count = chances.shape[1]
-    alarms = np.mean(chances.min(axis=1) < LEVEL / count)
+    alarms = np.mean(chances.min(axis=1) < FALSE_DEPARTURE_CHANCE / count)
     assert alarms < 0.015
     assert abs(np.mean(chances < 0.1) - 0.1) < 0.02
 
@@ -245,7 +245,7 @@ def test_what_no_data_see_is_not_tested():
     offset[:, 1] = 1.0
     _, tests = score_tests(drawing, data, where, [nothing, offset], False)
     assert [score.dof for score in tests.scores()] == [0, 1]
-    assert tests.found(LEVEL) == []
+    assert tests.found(FALSE_DEPARTURE_CHANCE) == []
     none, some = tests.fitted([0, 1])
     assert none.sigma[0] == np.inf
     offsets = np.flatnonzero(drawing.parameters.of_kind("offset"))
@@ -264,8 +264,8 @@ def test_what_is_seen_beside_what_is_not_keeps_its_deviation():
 
 
 def test_a_ratio_without_a_deviation_is_told_roughly():
-    assert ratio(-0.0042, np.inf) == "some 0.4 %"
-    assert ratio(0.00952, 0.0011) == "0.95 ± 0.11 %"
+    assert ratio_in_per_cent(-0.0042, np.inf) == "some 0.4 %"
+    assert ratio_in_per_cent(0.00952, 0.0011) == "0.95 ± 0.11 %"
 
 
 def test_boards_of_another_size_show_where_readings_give_the_scale():
@@ -316,7 +316,7 @@ def outlined(seed, lines_off):
     session = SimpleNamespace(
         machine=drawing, station_names=("one", "two"), document={"mechanism": "mechanism.yaml"}
     )
-    told = list(outlines(session, data, estimate, LEVEL))
+    told = list(outlines(session, data, estimate, FALSE_DEPARTURE_CHANCE))
     return told, 1e3 * np.median(away) if away.size else 0.0
 
 
@@ -426,7 +426,7 @@ def test_a_frozen_reading_is_named(session):
 
 def test_a_right_session_names_nothing(calibrated):
     assert calibrated.departures == ()
-    assert len(calibrated.session.stations[0].photographs) < 2 * FEWEST
+    assert len(calibrated.session.stations[0].photographs) < 2 * FEWEST_BESIDE_MOVEMENT
 
 
 def test_edges_answer_to_their_cameras_parameters(calibrated):

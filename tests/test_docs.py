@@ -12,7 +12,7 @@ import pytest
 from conftest import run
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
-from pkmcal.files import parse_yaml, read_json, validate
+from pkmcal.files import parse_yaml, read_json, validated_document
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.session.schema import SessionDocument
 
@@ -114,10 +114,10 @@ def test_runnable_examples_are_where_readers_look():
 
 def test_example_files_are_valid(tmp_path):
     session, mechanism, camera = blocks(text_of("docs/files.md"), "yaml")
-    validate(parse_yaml(session, Path("session.yaml")), SessionDocument)
+    validated_document(parse_yaml(session, Path("session.yaml")), SessionDocument)
     document = parse_yaml(mechanism, Path("mechanism.yaml"))
     document.data["legs"] *= 6  # the page shows one leg
-    machine = machine_from_document(validate(document, MechanismDocument))
+    machine = machine_from_document(validated_document(document, MechanismDocument))
     assert machine.parameters.fixed
     assert machine.parameters.tied
     (tmp_path / "camera.yaml").write_text(camera)

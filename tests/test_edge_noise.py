@@ -13,7 +13,7 @@ from pkmcal.identify.assembly import assemble, crowd, lines
 from pkmcal.identify.bundle import as_ended, bundle, solve_batch
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.rows import EdgeData
-from pkmcal.measurements import ALIKE, OWN_SHADING, concatenate
+from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, concatenate
 from pkmcal.solver.search import minimise
 from test_identify_scene import make_scene
 
@@ -32,7 +32,9 @@ def shaded(rng, own, runs=8, configurations=8, n_stations=2):
             mine = np.flatnonzero(line == number)
             normal = scene.normal[run, mine]
             angle = np.arccos(np.clip(normal @ normal.T, -1, 1))
-            root = np.linalg.cholesky(np.exp(-angle / ALIKE) + 1e-9 * np.eye(len(mine)))
+            root = np.linalg.cholesky(
+                np.exp(-angle / SHADING_ALIKE_ANGLE) + 1e-9 * np.eye(len(mine))
+            )
             drawn = root @ rng.normal(size=len(mine))
             shift[run, mine] += own * drawn
     return replace(scene, shading=shift)
@@ -125,7 +127,7 @@ def test_a_crowd_is_the_sum_over_its_line():
     expected = np.empty(len(edges))
     for k in range(len(edges)):
         near = edges.normal[number == number[k]] @ edges.normal[k]
-        expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / ALIKE).sum()
+        expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / SHADING_ALIKE_ANGLE).sum()
     np.testing.assert_allclose(crowd(measurements, number), expected, rtol=0.05)
     same = replace(edges, normal=np.broadcast_to(edges.normal[0], edges.normal.shape))
     counted = np.bincount(number)[number]

@@ -16,7 +16,7 @@ from pkmcal.cameras.files import load_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
-from pkmcal.export.contract import Difference, export, exporters
+from pkmcal.export.contract import Difference, exporters, make_export
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -57,9 +57,9 @@ def test_a_format_expresses_a_machine_or_says_that_it_does_not(name):
         source = source_of(load_mechanism(machine))
         if machine not in EXPRESSED[name]:
             with pytest.raises(InputError, match=REFUSALS[name]):
-                export(source, name)
+                make_export(source, name)
             continue
-        made = export(source, name)
+        made = make_export(source, name)
         assert made.differences
         assert not any(d.beyond for d in made.differences)
         for text in made.files.values():
@@ -112,9 +112,12 @@ def test_samples_of_a_machine_without_ranges(tmp_path):
     poses, joints = samples(machine)
     assert len(poses) > 30
     np.testing.assert_allclose(machine.inverse(poses), joints, atol=1e-12)
-    made = export(source_of(machine), "c")
+    made = make_export(source_of(machine), "c")
     assert "-HUGE_VAL" in made.files["pkmcal_kinematics.c"]
-    assert "MIN_LIMIT" not in export(source_of(machine), "linuxcnc").files["pkmcal_kinematics.ini"]
+    assert (
+        "MIN_LIMIT"
+        not in make_export(source_of(machine), "linuxcnc").files["pkmcal_kinematics.ini"]
+    )
 
 
 # Carriers as elementary joints
@@ -164,7 +167,7 @@ def test_calibrated_values_are_exported(tmp_path):
     folder = calibration(tmp_path, machine)
     source = load_source(folder)
     np.testing.assert_array_equal(source.machine.values, machine.values)
-    text = export(source, "yaml").files["mechanism.yaml"]
+    text = make_export(source, "yaml").files["mechanism.yaml"]
     found = yaml.safe_load(text)["legs"][3]["base"]["center"]
     k = machine.parameters.index("legs[4].base.center.x")
     assert found == machine.values[k : k + 3].tolist()
@@ -172,7 +175,7 @@ def test_calibrated_values_are_exported(tmp_path):
     assert f"{sigma:.3g}" in text
     assert "Calibrated: well." in text
     assert "three centres: legs 1, 3, 5" in text
-    document = json.loads(export(source, "json").files["machine.json"])
+    document = json.loads(make_export(source, "json").files["machine.json"])
     np.testing.assert_array_equal(document["covariance"], source.covariance)
     assert document["parameters"][k]["sigma"] == sigma
     assert document["calibrated"]
@@ -279,7 +282,7 @@ def test_the_session_must_be_one(tmp_path):
 
 def test_ros_gets_cameras_and_where_they_stand(tmp_path):
     source = load_source(calibration(tmp_path, built("gough-stewart")))
-    made = export(source, "ros")
+    made = make_export(source, "ros")
     assert set(made.files) == {
         "static_transforms.launch.yaml",
         "camera_info_front.yaml",
@@ -308,16 +311,18 @@ def test_a_tampered_transform_is_found(tmp_path):
 
 def test_a_camera_that_is_not_found_is_named(tmp_path):
     folder = calibration(tmp_path / "a", built("gough-stewart"), session=False)
-    made = export(load_source(folder), "ros")
+    made = make_export(load_source(folder), "ros")
     assert list(made.files) == ["static_transforms.launch.yaml"]
     assert "No camera_info for front and left side" in made.notes[0].text
     there = calibration(tmp_path / "b", built("gough-stewart")).parent
-    assert len(export(load_source(folder, there), "ros").files) == 3
+    assert len(make_export(load_source(folder, there), "ros").files) == 3
 
 
 def test_a_mirror_has_no_camera_info(tmp_path):
     mirror = Unified((640, 480), np.array([300.0, 300, 320, 240, 0.9, 0, 0, 0, 0]))
-    made = export(load_source(calibration(tmp_path, built("gough-stewart"), camera=mirror)), "ros")
+    made = make_export(
+        load_source(calibration(tmp_path, built("gough-stewart"), camera=mirror)), "ros"
+    )
     assert list(made.files) == ["static_transforms.launch.yaml"]
     assert "ROS has no model for mirrors" in made.notes[0].text
 

@@ -15,8 +15,8 @@ from conftest import run
 from export_sources import built, calibration, source_of
 from pkmcal.calibration.source import load_source
 from pkmcal.errors import InputError
-from pkmcal.export.c import END, FOLDER, CSource
-from pkmcal.export.contract import export
+from pkmcal.export.c import C_SOURCE_FOLDER, MACHINE_NUMBERS_END, CSource
+from pkmcal.export.contract import make_export
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -52,7 +52,7 @@ class Report(ctypes.Structure):
 
 def compiled(machine, folder, *flags):
     """A machine's source as a library, its functions on NumPy arrays."""
-    made = export(source_of(machine), "c")
+    made = make_export(source_of(machine), "c")
     for name, text in made.files.items():
         (folder / name).write_text(text)
     sources = [str(folder / n) for n in ("pkmcal_kinematics.c", "pkmcal_selftest.c")]
@@ -154,15 +154,15 @@ def test_the_files_of_the_repository_compile_as_they_stand(tmp_path):
     """They are a built-in machine's export, so that the C is read and compiled where it lies."""
     program = tmp_path / "selftest"
     flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
-    sources = sorted(FOLDER.glob("*.c"))
+    sources = sorted(C_SOURCE_FOLDER.glob("*.c"))
     subprocess.run([COMPILER, *flags, *sources, "-o", program, "-lm"], check=True)
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert "PASS: 12 reference poses of gough-stewart" in done.stdout
     # behind the numbers, whose last digits are the processor's, every file is the same text
     for name, text in CSource().files(load_source("gough-stewart")).items():
-        there = (FOLDER / name).read_text(encoding="utf-8")
-        assert text.partition(END)[2] == there.partition(END)[2]
+        there = (C_SOURCE_FOLDER / name).read_text(encoding="utf-8")
+        assert text.partition(MACHINE_NUMBERS_END)[2] == there.partition(MACHINE_NUMBERS_END)[2]
         assert text.count("\n") == there.count("\n"), f"write {name} anew: its numbers are old"
 
 
@@ -298,7 +298,7 @@ def test_as_many_equations_as_unknowns(tmp_path):
 
 
 def test_notes_say_what_is_left_out():
-    notes = export(source_of(load_mechanism("6-spu-passive")), "c").notes
+    notes = make_export(source_of(load_mechanism("6-spu-passive")), "c").notes
     assert any("Passive legs (7)" in note.text for note in notes)
-    notes = export(source_of(load_mechanism("h4-rods")), "c").notes
+    notes = make_export(source_of(load_mechanism("h4-rods")), "c").notes
     assert any("no pkmcal_inverse_jacobian" in note.text for note in notes)

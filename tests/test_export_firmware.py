@@ -10,8 +10,8 @@ import pytest
 from export_sources import built, source_of
 from pkmcal.errors import InputError
 from pkmcal.export import klipper, linuxcnc, reprap
-from pkmcal.export.contract import export, exporters
-from pkmcal.export.delta import DEGREE, MM, Freedoms, delta_of, fitted, reach
+from pkmcal.export.contract import exporters, make_export
+from pkmcal.export.delta import DEGREES_A_RADIAN, MM_A_METRE, Freedoms, delta_of, nearest_fit, reach
 from pkmcal.export.linuxcnc import linear_joints, rotary_joints
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb, rotation
@@ -39,7 +39,7 @@ def ideal_linear(radius=0.11, angles=(211.0, 328.5, 90.7), rods=(0.27, 0.2712, 0
     """Parallel towers on a circle, in a base frame that is tilted and shifted."""
     machine, tilt = load_mechanism("linear-delta"), rotation(SMALL)
     for leg, (angle, rod) in enumerate(zip(angles, rods, strict=True), start=1):
-        out = np.array([np.cos(angle / DEGREE), np.sin(angle / DEGREE), 0.0])
+        out = np.array([np.cos(angle / DEGREES_A_RADIAN), np.sin(angle / DEGREES_A_RADIAN), 0.0])
         at = tilt @ ((radius + 0.035) * out + [0, 0, 1e-3 * leg]) + [0.002, -0.001, 0.003]
         machine = put(
             machine,
@@ -56,7 +56,7 @@ def ideal_rotary(radius=0.052, angles=(90.4, 209.5, 330.8)):
     """Arms in vertical planes through one axis, each of its own length and height."""
     machine = load_mechanism("delta")
     for leg, angle in enumerate(angles, start=1):
-        out = np.array([np.cos(angle / DEGREE), np.sin(angle / DEGREE), 0.0])
+        out = np.array([np.cos(angle / DEGREES_A_RADIAN), np.sin(angle / DEGREES_A_RADIAN), 0.0])
         machine = put(
             machine,
             leg,
@@ -72,13 +72,15 @@ def ideal_rotary(radius=0.052, angles=(90.4, 209.5, 330.8)):
 
 def test_an_ideal_linear_delta_is_recovered():
     machine = ideal_linear()
-    fit = fitted(delta_of(machine, "x"), klipper.LINEAR)
+    fit = nearest_fit(delta_of(machine, "x"), klipper.KLIPPER_LINEAR_FREEDOMS)
     assert fit.largest < 1e-4
     assert fit.radius == pytest.approx(110, abs=1e-3)
     # turned by the base frame's tilt about z, to first order
-    np.testing.assert_allclose(fit.angle, np.array([211, 328.5, 90.7]) + 0.002 * DEGREE, atol=2e-3)
+    np.testing.assert_allclose(
+        fit.angle, np.array([211, 328.5, 90.7]) + 0.002 * DEGREES_A_RADIAN, atol=2e-3
+    )
     np.testing.assert_allclose(fit.rod, [270, 271.2, 269.5], atol=1e-3)
-    text = export(source_of(machine), "klipper").files["pkmcal_printer.cfg"]
+    text = make_export(source_of(machine), "klipper").files["pkmcal_printer.cfg"]
     found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
     found.read_string(text)
     assert found.getfloat("stepper_b", "arm_length") == pytest.approx(271.2, abs=1e-3)
@@ -87,7 +89,7 @@ def test_an_ideal_linear_delta_is_recovered():
 
 def test_an_ideal_rotary_delta_is_recovered():
     machine = ideal_rotary()
-    fit = fitted(delta_of(machine, "x"), Freedoms(reprap.NOMINAL))
+    fit = nearest_fit(delta_of(machine, "x"), Freedoms(reprap.REPRAP_TOWER_ANGLES))
     assert fit.largest < 1e-4
     assert fit.order.tolist() == [1, 2, 0]
     assert fit.radius == pytest.approx(52, abs=1e-3)
@@ -95,7 +97,7 @@ def test_an_ideal_rotary_delta_is_recovered():
     np.testing.assert_allclose(fit.arm, [101, 101.5, 100.5], atol=1e-3)
     np.testing.assert_allclose(fit.rod, [220.6, 220.9, 220.3], atol=1e-3)
     # Klipper has one height for all, so that it cannot follow
-    made = export(source_of(machine), "klipper")
+    made = make_export(source_of(machine), "klipper")
     assert made.notes[0].level is Level.DOUBTFUL
     assert "tilted arms" in made.notes[0].text
 
@@ -104,13 +106,13 @@ def test_an_ideal_rotary_delta_is_recovered():
 @pytest.mark.parametrize("to", FIRMWARES)
 def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
     machine = built(name, seed=4)
-    made = export(source_of(machine), to)
+    made = make_export(source_of(machine), to)
     (difference,) = made.differences
     assert "off by" in made.notes[0].text
     assert not difference.beyond
     # what is said is what happens, not a multiple of it
     assert difference.largest > 0.9 * (difference.limit - 2e-6) / 1.02
-    drawn = export(source_of(load_mechanism(name)), to)
+    drawn = make_export(source_of(load_mechanism(name)), to)
     assert drawn.differences[0].largest < 5e-5
     assert drawn.notes[0].level is Level.NOTE
 
@@ -118,8 +120,8 @@ def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
 def test_parallel_towers_are_followed_where_leaning_ones_are_not():
     leaning = put(ideal_linear(), 1, base__axis=[0.004, 0.0, 1.0])
     for to in ("reprap", "klipper"):
-        assert export(source_of(ideal_linear()), to).differences[0].largest < 1e-6
-        made = export(source_of(leaning), to)
+        assert make_export(source_of(ideal_linear()), to).differences[0].largest < 1e-6
+        made = make_export(source_of(leaning), to)
         assert made.notes[0].level is Level.DOUBTFUL
         assert "towers that are not parallel" in made.notes[0].text
         assert 5e-5 < made.differences[0].largest < 5e-3
@@ -153,10 +155,10 @@ def test_reprap_carriages_at_home():
     words = reprap.read_words(text)
     homed = 300 + np.sqrt(np.array([250, 251, 252]) ** 2 - 100.0**2) + [1, -1, 0.5]
     np.testing.assert_allclose(reprap.homed_carriages(words), homed)
-    middle = reprap.linear_motors(words, np.array([[0.0, 0.0, 300.0]]))[0]
+    middle = reprap.reprap_carriage_heights(words, np.array([[0.0, 0.0, 300.0]]))[0]
     np.testing.assert_allclose(middle, homed - [1, -1, 0.5])
     # towards the X tower, at the front left, its carriage rises
-    left = reprap.linear_motors(words, np.array([[-10.0, -10 / np.sqrt(3), 300.0]]))[0]
+    left = reprap.reprap_carriage_heights(words, np.array([[-10.0, -10 / np.sqrt(3), 300.0]]))[0]
     assert left[0] > middle[0]
     assert left[1] < middle[1]
 
@@ -167,7 +169,7 @@ def test_arms_of_all_programs_in_the_middle():
     text = "M669 K10 U100:100:100 L200:200:200 H300:300:300 R40 A-60:30 B80 X0 Y0 Z0"
     words = reprap.read_words(text)
     point = np.array([[0.0, 0.0, 300 - below], [0.0, 0.0, 320 - below]])
-    found = reprap.rotary_motors(words, point)
+    found = reprap.reprap_arm_angles(words, point)
     np.testing.assert_allclose(found[0], 0, atol=1e-12)
     assert (found[1] > 1).all()  # upwards counts up
     config = ConfigParser(delimiters=(":",))
@@ -179,17 +181,19 @@ def test_arms_of_all_programs_in_the_middle():
             for n, a in zip("abc", (210, 330, 90), strict=True)
         )
     )
-    np.testing.assert_allclose(klipper.rotary_motors(config, point), found, atol=1e-9)
+    np.testing.assert_allclose(klipper.klipper_arm_angles(config, point), found, atol=1e-9)
     side = np.array([[20.0, -10.0, 150.0]])
     np.testing.assert_allclose(
-        klipper.rotary_motors(config, side), reprap.rotary_motors(words, side), atol=1e-9
+        klipper.klipper_arm_angles(config, side), reprap.reprap_arm_angles(words, side), atol=1e-9
     )
     pins = {"platformradius": 50.0, "footradius": 10.0, "thighlength": 100.0, "shinlength": 200.0}
     mid = rotary_joints(pins, point - [0, 0, 300])
     np.testing.assert_allclose(mid, -found, atol=1e-9)
     # joint 0 at -90 degrees, 1 at 30: the arm that the tool goes to goes up, its angle falls
     for k, angle in enumerate((-90, 30, 150)):
-        p = np.array([[20 * np.cos(angle / DEGREE), 20 * np.sin(angle / DEGREE), -150.0]])
+        p = np.array(
+            [[20 * np.cos(angle / DEGREES_A_RADIAN), 20 * np.sin(angle / DEGREES_A_RADIAN), -150.0]]
+        )
         assert np.argmin(rotary_joints(pins, p)[0]) == k
 
 
@@ -203,10 +207,10 @@ def test_genhexkins_angles_are_roll_pitch_yaw():
     machine = built("gough-stewart")
     poses = samples(machine, 8)[0]
     found = linuxcnc.world(poses)
-    for T, (a, b, c) in zip(poses, found[:, 3:] / DEGREE, strict=True):
+    for T, (a, b, c) in zip(poses, found[:, 3:] / DEGREES_A_RADIAN, strict=True):
         rot = rotation(np.array([0, 0, c])) @ rotation(np.array([0, b, 0]))
         np.testing.assert_allclose(rot @ rotation(np.array([a, 0, 0])), T[:3, :3], atol=1e-12)
-    made = export(source_of(machine), "linuxcnc")
+    made = make_export(source_of(machine), "linuxcnc")
     assert "setp genhexkins.max-error 29" in made.files["pkmcal_kinematics.hal"]
     offset = machine.values[machine.parameters.index("legs[2].length.offset")]
     ini = made.files["pkmcal_kinematics.ini"]
@@ -224,7 +228,7 @@ def test_ranges_are_needed(tmp_path):
     text = catalogue()["linear-delta"].read_text().replace(", range: [0.25, 0.55]", "")
     (tmp_path / "m.yaml").write_text(text)
     with pytest.raises(InputError, match="gives no range for a motor"):
-        export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
+        make_export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
 
 
 def test_towers_lean_too_much():
@@ -242,7 +246,7 @@ def test_arms_swing_sideways():
 def test_a_machine_that_no_settings_follow_is_refused():
     machine = put(load_mechanism("linear-delta"), 1, base__axis=[0.1, 0.1, 1.0])
     with pytest.raises(InputError, match=r"RepRapFirmware cannot follow this machine.*found \d+"):
-        export(source_of(machine), "reprap")
+        make_export(source_of(machine), "reprap")
 
 
 def test_four_towers_are_no_delta(tmp_path):
@@ -258,14 +262,14 @@ def test_arms_beyond_the_arc_sine(tmp_path):
     text = catalogue()["delta"].read_text().replace("range: [-0.6, 1.3]", "range: [-0.6, 1.6]")
     (tmp_path / "m.yaml").write_text(text)
     with pytest.raises(InputError, match="takes arms up to 90 degrees"):
-        export(source_of(load_mechanism(tmp_path / "m.yaml")), "reprap")
+        make_export(source_of(load_mechanism(tmp_path / "m.yaml")), "reprap")
 
 
 def test_klipper_end_switch_without_a_height(tmp_path):
     text = catalogue()["delta"].read_text().replace("constant: 0.22", "constant: 0.13")
     (tmp_path / "m.yaml").write_text(text.replace("-0.22]", "-0.1]"))
     with pytest.raises(InputError, match="none belongs to it; found an arm that reaches"):
-        export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
+        make_export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
 
 
 def test_nothing_closes_within_the_ranges():
@@ -286,4 +290,4 @@ def test_the_reach_is_within_the_ranges():
         q = machine.inverse(perturb(machine.home(), shift))
         low, high = machine.joint_ranges.T
         assert bool(((q >= low - 1e-4) & (q <= high + 1e-4)).all()) is inside
-    assert 0.1 * MM < radius * MM < 150
+    assert 0.1 * MM_A_METRE < radius * MM_A_METRE < 150

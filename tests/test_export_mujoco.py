@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machine_of, made
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
 from pkmcal.export.home import home_state
-from pkmcal.export.mujoco_read import read
+from pkmcal.export.mujoco_read import read_mujoco
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
@@ -28,7 +28,7 @@ PLACE, TURN = 1e-12, 1e-11
 
 
 def exported(machine, **of):
-    source = Source(machine, origin="a test", **of)
+    source = MachineSource(machine, origin="a test", **of)
     found = exporters()["mujoco"].files(source)
     ((name, text),) = found.items()
     assert name.endswith(".xml")
@@ -198,7 +198,7 @@ def test_joints_that_move_another_way_are_found(name, old, new):
 
 @pytest.mark.parametrize("name", ["3-upu", "h4", "h4-rods", "3-spr", "rpr-and-spu"])
 def test_what_is_read_again_closes_from_beside(name):
-    model = read(exported(machine_of(name))[1])
+    model = read_mujoco(exported(machine_of(name))[1])
     rng = np.random.default_rng(0)
     away = model.key + 0.1 * rng.normal(size=(3, model.key.size))
     assert np.abs(model.gaps(away)).max(axis=1).min() > 1e-3
@@ -221,7 +221,7 @@ def test_the_header_says_what_it_is():
     for word in ("Better than the drawing.", "sigma 1.5e-05 m", "T_base_platform",
                  "PLACEHOLDERS", "legs[3].length.constant = 0.22 m"):  # fmt: skip
         assert word in header
-    assert exporters()["mujoco"].notes(Source(drawing))
+    assert exporters()["mujoco"].notes(MachineSource(drawing))
 
 
 def test_a_name_cannot_break_the_text():

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from export_sources import built, calibration
 from mujoco_machines import ALL, LOUD, machine_of, made
-from pkmcal.calibration.source import Source, load_source
+from pkmcal.calibration.source import MachineSource, load_source
 from pkmcal.export import sdf_read, urdf_read
 from pkmcal.export.contract import exporters
 from pkmcal.export.home import home_state
@@ -24,15 +24,15 @@ from pkmcal.mechanisms import catalogue
 CLOSED = 1e-9
 """m and rad, of joint values that were solved to 1e-12; 8e-14 was the largest of all machines."""
 READERS = {
-    "urdf": lambda files: urdf_read.read(*files.values()),
-    "sdf": lambda files: sdf_read.read(*files.values()),
+    "urdf": lambda files: urdf_read.read_urdf(*files.values()),
+    "sdf": lambda files: sdf_read.read_sdf(*files.values()),
 }
 
 
 @cache
 def exported(name, to):
     """A machine's source, its files in a format, and these read again."""
-    source = Source(machine_of(name), origin="a test")
+    source = MachineSource(machine_of(name), origin="a test")
     files = exporters()[to].files(source)
     return source, files, READERS[to](files)
 
@@ -330,7 +330,7 @@ def test_what_is_not_known_is_said(to):
 @pytest.mark.parametrize("to", READERS)
 def test_a_machine_without_ranges_has_no_limits_of_its_motors(to):
     text = re.sub(r", range: \[[^\]]*\]", "", catalogue()["delta"].read_text(encoding="utf-8"))
-    source = Source(made(text), origin="a test")
+    source = MachineSource(made(text), origin="a test")
     files = exporters()[to].files(source)
     tree = fromstring(next(iter(files.values())))
     (motor,) = (n for n in tree.iter("joint") if n.get("name") == "leg1" and len(n))

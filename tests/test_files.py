@@ -20,7 +20,7 @@ from pkmcal.files import (
     read_json,
     read_yaml,
     shown,
-    validate,
+    validated_document,
     yaml_text,
 )
 from pkmcal.wording import listed
@@ -235,7 +235,7 @@ BASE = "name: m\ncount: 2\n"
 
 
 def check(tmp_path, text):
-    return validate(read_yaml(written(tmp_path / "a.yaml", text)), Machine)
+    return validated_document(read_yaml(written(tmp_path / "a.yaml", text)), Machine)
 
 
 def test_a_valid_document_becomes_the_model(tmp_path):
@@ -302,7 +302,9 @@ def test_a_validators_own_sentence_is_kept(tmp_path):
         inner: Ordered
 
     document = read_yaml(written(tmp_path / "a.yaml", "inner:\n  low: 2\n  high: 1\n"))
-    assert fault(validate, document, Outer) == ("a.yaml, line 1, inner: low should be below high.")
+    assert fault(validated_document, document, Outer) == (
+        "a.yaml, line 1, inner: low should be below high."
+    )
 
 
 # words
@@ -328,7 +330,7 @@ def test_numbers_that_no_quantity_has(tmp_path, text):
     with pytest.raises(
         InputError, match=r"^a\.yaml, line 3, values\[2\]: this number is too large"
     ):
-        validate(read_yaml(tmp_path / "a.yaml"), Numbers)
+        validated_document(read_yaml(tmp_path / "a.yaml"), Numbers)
 
 
 class Numbers(Schema):

@@ -8,8 +8,8 @@ import pytest
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.mechanisms.follower import SQUARE, rods_of
-from pkmcal.mechanisms.kinematics import CONVERGED
+from pkmcal.mechanisms.follower import POSES_BETWEEN_SQUARINGS, rods_of
+from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR
 
 SLOW = {"3-rps", "3-upu", "four-belt", "h4-rods"}
 """Axes' equations, a hinge, more rows than freedoms: for these the search is asked."""
@@ -58,10 +58,12 @@ def test_rounding_does_not_add_up():
     machine = load_mechanism("gough-stewart")
     readings = path(machine, 120)
     follow = machine.follower()
-    for k in range(2 * SQUARE):
+    for k in range(2 * POSES_BETWEEN_SQUARINGS):
         found = follow(readings[k % 120])
     np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(machine.inverse(found), readings[k % 120], atol=CONVERGED)
+    np.testing.assert_allclose(
+        machine.inverse(found), readings[k % 120], atol=CONVERGED_CLOSURE_ERROR
+    )
 
 
 def test_a_leap_is_searched():

@@ -396,7 +396,7 @@ def test_the_bundle_starts_from_the_steps(name):
 @pytest.mark.parametrize("name", ["3-rpr", "3-rps", "6-spu-passive"])
 def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     """``--method four-step``: deviations by repetition, residuals, a mechanism that can be read."""
-    monkeypatch.setattr(methods, "REPETITIONS", 20)
+    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 20)
     rng = np.random.default_rng(14)
     scene = make_scene(name, rng, 24)
     board = perturb(np.eye(4), rng.normal(size=(1, 6)))

@@ -14,7 +14,7 @@ from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.papers import four_step_checks as checks
 from pkmcal.papers.conditions import Condition, conditions
 from pkmcal.papers.four_step import four_step
-from pkmcal.papers.legs import legs_of
+from pkmcal.papers.legs import legs_as_drawn
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,
@@ -159,7 +159,7 @@ def test_a_passive_leg_that_does_not_turn():
 def test_lengths_that_the_distances_do_not_tell():
     """A platform that only shifts with parallel legs: a common length is free (errata)."""
     scene = make_scene("constant-legs", np.random.default_rng(6), 12)
-    legs = legs_of(scene.drawing)
+    legs = legs_as_drawn(scene.drawing)
     # a parallelogram: all legs alike in every configuration, platform and base congruent
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
@@ -182,7 +182,7 @@ def test_lengths_that_the_distances_do_not_tell():
 
 def test_a_length_that_collapsed_is_told():
     drawing = exact("constant-legs")
-    legs = legs_of(drawing)
+    legs = legs_as_drawn(drawing)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
     with pytest.raises(ResultError, match="leg 3 of constant length shrank"):
         checks.not_collapsed(legs, q0[0])

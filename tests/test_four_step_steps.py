@@ -19,8 +19,8 @@ from pkmcal.papers.four_step_base import (
     with_signs,
 )
 from pkmcal.papers.four_step_platform import (
-    deviations,
-    offsets,
+    joint_distance_deviations,
+    joint_distance_offsets,
     passive_centres,
     platform_axes,
     platform_by_distances,
@@ -35,7 +35,7 @@ from pkmcal.papers.leg_axes import (
     plane_normals,
     revolute_axes,
 )
-from pkmcal.papers.registration import fixes_pose, laid, loose
+from pkmcal.papers.registration import fixes_pose, loose, poses_laying_items
 from test_four_step_machines import make_scene
 
 SPATIAL, PLANAR, TRANSLATION = np.eye(6), np.eye(6)[:, [2, 3, 4]], np.eye(6)[:, 3:]
@@ -137,7 +137,7 @@ def base_views(rng, seen, directions_seen, noise=0.0):
 
 def laid_on(found, truth, T_found, T_true):
     """Both forms fix the base only up to its frame: compare after laying one on the other."""
-    e = laid(found, truth, np.ones(found.shape[:2]))
+    e = poses_laying_items(found, truth, np.ones(found.shape[:2]))
     np.testing.assert_allclose(T_true @ e[:, None], T_found, atol=1e-8)
     return e, apply(e[:, None], found)
 
@@ -198,7 +198,7 @@ def test_products_leave_the_depth_of_coplanar_centres_open_and_axes_close_it():
         items = with_signs(items, T[..., :3, :3])
         for join in (base_by_products, base_by_registration):
             found = join(items, _frame_rows(items)).centres
-            e = laid(found, base, np.ones(found.shape[:2]))
+            e = poses_laying_items(found, base, np.ones(found.shape[:2]))
             worst.append(np.abs(apply(e[:, None], found) - base).max())
     printed, corrected, printed_with_axis, corrected_with_axis = worst
     assert printed > 5e-4
@@ -274,9 +274,9 @@ def test_offsets_keep_the_distances(form):
     rng = np.random.default_rng(11)
     axes, base, _, _, q0 = body_axes(rng)
     a = np.broadcast_to(base[:, None], axes.u.shape)
-    np.testing.assert_allclose(offsets(axes, a, np.zeros(4), form), q0, atol=1e-9)
+    np.testing.assert_allclose(joint_distance_offsets(axes, a, np.zeros(4), form), q0, atol=1e-9)
     passive = replace(axes, seen=axes.seen & [True, True, True, False])
-    found = offsets(passive, a, np.array([0, 0, 0, 0.7]), form)
+    found = joint_distance_offsets(passive, a, np.array([0, 0, 0, 0.7]), form)
     np.testing.assert_allclose(found[:, :3], q0[:, :3], atol=1e-9)
     np.testing.assert_array_equal(found[:, 3], 0.7)
 
@@ -288,11 +288,12 @@ def test_slopes_of_the_distances(form):
     axes = replace(axes, seen=rng.random(axes.seen.shape) < 0.8)
     a = np.broadcast_to(base[:, None], axes.u.shape)
     for at in (q0, q0 + 0.05, 0 * q0 - 1.0):
-        value, slope = deviations(axes, a, at, form)
+        value, slope = joint_distance_deviations(axes, a, at, form)
         for j in range(4):
             step = 1e-6 * np.eye(4)[j]
             numeric = (
-                deviations(axes, a, at + step, form)[0] - deviations(axes, a, at - step, form)[0]
+                joint_distance_deviations(axes, a, at + step, form)[0]
+                - joint_distance_deviations(axes, a, at - step, form)[0]
             ) / 2e-6
             np.testing.assert_allclose(slope[..., j], numeric, atol=1e-8)
         assert value.shape == slope.shape[:-1]
@@ -324,9 +325,11 @@ def test_constant_lengths_and_their_false_minimum():
     start = machine.parameters.drawing[rod]
     truth = machine.values[rod]
     for form in ("corrected", "printed"):
-        np.testing.assert_allclose(offsets(axes, a, start, form)[0], truth, atol=1e-8)
+        np.testing.assert_allclose(
+            joint_distance_offsets(axes, a, start, form)[0], truth, atol=1e-8
+        )
     struts = replace(axes, seen=axes.seen & (machine.layout.actuated < 0))
-    value, _ = deviations(struts, a, np.zeros((1, 6)), "corrected")
+    value, _ = joint_distance_deviations(struts, a, np.zeros((1, 6)), "corrected")
     np.testing.assert_allclose(value, 0, atol=1e-15)
 
 
@@ -343,7 +346,8 @@ def test_printed_differences_collapse_on_a_smooth_path():
     path = replace(axes, u=u, readings=length - q0[:, None], station=0 * axes.station)
     a = np.broadcast_to(base[:, None], u.shape)
     bias = {
-        form: np.mean(offsets(path, a, np.zeros(4), form) - q0) for form in ("corrected", "printed")
+        form: np.mean(joint_distance_offsets(path, a, np.zeros(4), form) - q0)
+        for form in ("corrected", "printed")
     }
     assert abs(bias["printed"]) > 5 * abs(bias["corrected"])
 
@@ -365,7 +369,7 @@ def test_platform_centres_by_registration_and_by_distances():
         platform_by_registration(b, axes.seen, drawing, gauge),
         platform_by_distances(b, axes.seen, axes.station, drawing, gauge),
     ):
-        e = laid(found, np.broadcast_to(body, found.shape), np.ones(found.shape[:2]))
+        e = poses_laying_items(found, np.broadcast_to(body, found.shape), np.ones(found.shape[:2]))
         np.testing.assert_allclose(
             apply(e[:, None], found), np.broadcast_to(body, found.shape), atol=1e-9
         )
@@ -396,7 +400,7 @@ def test_a_platform_that_moves_less_needs_fewer_legs(motion):
     rows[3:] = np.eye(3)[:, None]
     gauge = motion.T @ rows.reshape(6, 12)
     found = platform_by_registration(b[:, fixed], seen[fixed], drawing, gauge, motion)
-    e = laid(found, body, np.ones((2, 4)), motion=motion)
+    e = poses_laying_items(found, body, np.ones((2, 4)), motion=motion)
     np.testing.assert_allclose(apply(e[:, None], found), body, atol=1e-9)
     if motion is TRANSLATION:
         np.testing.assert_array_equal(e[:, :3, :3], np.broadcast_to(np.eye(3), (2, 3, 3)))

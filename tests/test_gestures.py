@@ -9,7 +9,7 @@ from pkmcal.cameras import camera_models
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.view.gestures import PIN, aimed, farther, pinned, rolled, turned
+from pkmcal.view.gestures import PINNED_JOINT_SIGMA, aimed, farther, pinned, rolled, turned_as_ball
 
 CAMERAS = {
     "pinhole": [705.0, 706.0, 402.3, 297.8, -0.11, 0.09, 0.0004, -0.0003, 0.0],
@@ -52,7 +52,7 @@ def test_what_is_pulled_stays_under_the_mouse(camera):
 
 
 def test_a_turn_follows_the_mouse_and_leaves_the_middle(camera, points):
-    middle, done = points.mean(axis=0), turned(camera, T, points, START, END)
+    middle, done = points.mean(axis=0), turned_as_ball(camera, T, points, START, END)
     np.testing.assert_allclose(apply(done, middle), apply(T, middle), atol=1e-12)
     ray = apply(T, middle) / np.linalg.norm(apply(T, middle))
     near = apply(inverse(T), apply(T, middle) - 0.1 * ray)  # on the side of the camera
@@ -84,7 +84,7 @@ def test_joints_come_to_their_places(camera, points, count):
     places = seen(camera, truth, pins)
     done = pinned(camera, T, points, pins, places)
     # exactly; where all freedoms move, the pose by hand weighs in, within what a hand can do
-    near = 1e-4 if count < 3 else PIN
+    near = 1e-4 if count < 3 else PINNED_JOINT_SIGMA
     np.testing.assert_allclose(seen(camera, done, pins), places, atol=near)
     if count == 5:  # fewer joints fit from several places
         error = pose_difference(inverse(done), inverse(truth))
@@ -99,4 +99,4 @@ def test_a_pull_outside_the_picture_of_a_mirror_moves_nothing(points):
     outside = np.array([5000.0, 0.0])
     assert np.isnan(camera.ray(outside)).all()
     np.testing.assert_array_equal(aimed(camera, T, START, outside), T)
-    np.testing.assert_array_equal(turned(camera, T, points, outside, END), T)
+    np.testing.assert_array_equal(turned_as_ball(camera, T, points, outside, END), T)

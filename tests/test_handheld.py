@@ -12,12 +12,17 @@ import pytest
 from faults import fault, replaced
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand, closely
-from pkmcal.calibration.byhand import GIVEN_UP, TURNED, misplaced, without_misplaced
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.byhand import (
+    CAMERA_TURNED_REASON,
+    EDGES_DISAGREE_REASON,
+    misplaced,
+    without_misplaced,
+)
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
-from pkmcal.calibration.results import document_of
+from pkmcal.calibration.results import calibration_document
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.files import Exif, read_exif, with_exif
@@ -31,10 +36,10 @@ from pkmcal.observe import legs, surroundings
 from pkmcal.observe.alone import Alone, find_alone, turned_about
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import decode
-from pkmcal.observe.stations import DOUBT
+from pkmcal.observe.stations import SECOND_PLACE_DOUBT
 from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
-from pkmcal.observe.tubes import DIRECTIONS, WORTH, tube_chart
+from pkmcal.observe.tubes import PAIR_DIRECTIONS, RARITY_STEPS, tube_chart
 from pkmcal.session.exif import camera_by_exif
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
@@ -291,7 +296,7 @@ def breathed(simulated, tmp_path_factory):
     )
     with pytest.MonkeyPatch.context() as patch:
         at_truth(patch, folder)
-        return calibrate(folder), load_truth(folder, load_mechanism("gough-stewart"))
+        return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
 
 
 def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
@@ -300,7 +305,7 @@ def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
     folder, machine = tmp_path / "session", load_mechanism("gough-stewart")
     rendered(folder, machine, camera_of_size((480, 360)), settings, seed=7)
     at_truth(monkeypatch, folder)
-    calibration = calibrate(folder, holdout=1)
+    calibration = calibrate_session(folder, holdout=1)
     assert len(calibration.session.stations) == 4
     assert calibration.session.warnings == ()
     assert calibration.estimate.configurations.sum() == 3
@@ -308,7 +313,7 @@ def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
 
 def test_focal_lengths_are_found_within_their_deviations(breathed):
     calibration, truth = breathed
-    stations = document_of(calibration)["stations"]
+    stations = calibration_document(calibration)["stations"]
     found = np.array([station["focal_scale"] for station in stations])
     sigma = np.array([station["sigma_focal_scale"] for station in stations])
     assert np.all(sigma <= BREATHING_SIGMA)  # no data take away what is known beforehand
@@ -415,7 +420,7 @@ def found_with(monkeypatch, truth, doubts, textured=False):
     nowhere = Alone(np.eye(4)[None], np.zeros(1), 1.0)
     monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)
     monkeypatch.setattr(byhand, "look_closer", look)
-    monkeypatch.setattr(byhand, "WORKERS", 1)
+    monkeypatch.setattr(byhand, "CALIBRATION_THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
         monkeypatch.setattr(surroundings, "texture_of", lambda _image, _camera: empty)
@@ -503,19 +508,21 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     weights[measurements.edges.station == 1] *= 0.4
     given_up = replace(estimate, edge_weights=weights)
     wrong = misplaced(session, measurements, given_up, T)
-    assert wrong == {1: GIVEN_UP}
+    assert wrong == {1: EDGES_DISAGREE_REASON}
     # nor do three legs, none of which another one contradicts
     edges = measurements.edges
     fewer = edges.select((edges.station != 2) | (edges.leg < 3))
     mine = (edges.station != 2) | (edges.leg < 3)
     of_three = replace(estimate, edge_weights=estimate.edge_weights[mine])
-    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == {2: GIVEN_UP}
+    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == {
+        2: EDGES_DISAGREE_REASON
+    }
     # a board that agrees tells its place
     shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
     with_board = replace(given_up, pose_weights=np.ones(1))
     assert misplaced(session, shown, with_board, T) == {}
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
-    assert misplaced(session, measurements, estimate, perturb(T, turn)) == {2: TURNED}
+    assert misplaced(session, measurements, estimate, perturb(T, turn)) == {2: CAMERA_TURNED_REASON}
     photographs = read_photographs(session)
     known = KnownScene.as_drawn(session.machine, T, session.joints)
     seen = SeenSession(session, photographs, Boards(), known)
@@ -536,9 +543,9 @@ def test_tubes_stand_out_of_a_chart():
     chart = tube_chart(image, camera_of_size((400, 300)))
     clear = chart.rarity.max(axis=(2, 3))
     wide = int(chart.width_number(np.array(10.0)))
-    normal = round(np.arctan2(200, 140) % np.pi * DIRECTIONS / np.pi)
-    assert clear[wide, normal] > WORTH * np.log(20)
-    assert clear[wide, (normal + DIRECTIONS // 2) % DIRECTIONS] == 0
+    normal = round(np.arctan2(200, 140) % np.pi * PAIR_DIRECTIONS / np.pi)
+    assert clear[wide, normal] > RARITY_STEPS * np.log(20)
+    assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
 
 
 def test_one_photograph_is_found_from_nothing(looked):
@@ -549,7 +556,7 @@ def test_one_photograph_is_found_from_nothing(looked):
     view = view_of(session, p, poses)
     found = find_alone(view, p.images[0])
     off = pose_difference(found.T_camera_base[0], truth.T_camera_base[k])
-    assert found.doubt < DOUBT
+    assert found.doubt < SECOND_PLACE_DOUBT
     assert np.degrees(np.linalg.norm(off[:3])) < 4
     assert np.linalg.norm(off[3:]) < 0.1
 
@@ -631,9 +638,9 @@ def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     found = Alone(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
     monkeypatch.setattr(closely, "bundle", counted)
     one, asked = look_closer(session, at[2], known, found, true)
-    assert estimated == [1] * len(closely.LATER)
+    assert estimated == [1] * len(closely.LOOKS_BY_TOLD_MACHINE)
     again, both = look_closer(session, at[2], known, found, true, asked)
-    assert estimated == [1] * len(closely.LATER)
+    assert estimated == [1] * len(closely.LOOKS_BY_TOLD_MACHINE)
     assert len(both.paid) == len(asked.paid)
     np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 

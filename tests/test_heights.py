@@ -12,12 +12,12 @@ import pytest
 import printers
 from conftest import run
 from pkmcal.boards.board import load_board
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved import load
-from pkmcal.calibration.source import Source, load_source
+from pkmcal.calibration.source import MachineSource, load_source
 from pkmcal.errors import InputError
 from pkmcal.export import reprap
-from pkmcal.export.contract import export
+from pkmcal.export.contract import make_export
 from pkmcal.export.klipper import Klipper
 from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import pose
@@ -82,7 +82,7 @@ def test_the_session_says_what_the_printer_felt(kit, true):
     there = true.forward(1e-3 * printer.touches.carriages)[:, :3, 3]
     np.testing.assert_allclose(1e3 * there[:, :2], printers.bed(19), atol=1e-4)
     assert np.std(there[:, 2]) == pytest.approx(1e-3 * NOISE, rel=0.5)
-    assert calibrate(kit).session.heights_alone
+    assert calibrate_session(kit).session.heights_alone
 
 
 def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
@@ -102,7 +102,7 @@ def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
 
 def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
     """Flat where nobody probed, and neither tilted nor high: as well as the noise lets it be."""
-    made = export(load_source(kit / "calibration"), "klipper")
+    made = make_export(load_source(kit / "calibration"), "klipper")
     (text,) = made.files.values()
     before, after = flat(true, SAYS), flat(true, pasted(text))
     assert np.sqrt(np.mean(before**2)) > 0.3
@@ -112,12 +112,12 @@ def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
     assert np.std(after) < 2.2 * sigma
     assert any("Measure the bed's mesh anew" in note.text for note in made.notes)
     assert any("Z is 0 on the bed" in note.text for note in made.notes)
-    (lines,) = export(load_source(kit / "calibration"), "reprap").files.values()
+    (lines,) = make_export(load_source(kit / "calibration"), "reprap").files.values()
     assert re.search(r"^M665 L[\d.:]+ R105\.", lines, re.MULTILINE)
 
 
 def test_a_level_bed_stays_level(kit):
-    found = calibrate(kit)
+    found = calibrate_session(kit)
     up = found.estimate.state.T_camera_base[0, :3, 2]
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
     text = (kit / "session.yaml").read_text()
@@ -126,7 +126,7 @@ def test_a_level_bed_stays_level(kit):
     for name in ("mechanism.yaml", "joints.csv", "poses.csv"):
         (other / name).write_text((kit / name).read_text())
     (other / "session.yaml").write_text(text.replace("level: true", "level: false"))
-    free = calibrate(other)
+    free = calibrate_session(other)
     # end switches off by a millimetre on a circle of 105 mm
     assert np.linalg.norm(free.estimate.state.T_camera_base[0, :2, 2]) > 2e-3
 
@@ -146,9 +146,9 @@ def test_deviations_of_the_bed_hold(tmp_path):
         readings = printers.felt(true, printers.bed(13), 0.02, rng)
         (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
         write_printer_session(tmp_path / str(run_), tmp_path / "printer.cfg")
-        found = calibrate(tmp_path / str(run_))
+        found = calibrate_session(tmp_path / str(run_))
         bed = found.findings.bed
-        (text,) = Klipper().files(Source(found.machine, bed=bed.z)).values()
+        (text,) = Klipper().files(MachineSource(found.machine, bed=bed.z)).values()
         z = 1e-3 * flat(true, pasted(text))
         bend.append(np.std(z) / bed.sigma)
         xy = printers.bed(30)
@@ -168,10 +168,10 @@ def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
     readings[9] += 0.3
     (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
     write_printer_session(tmp_path / "kit", tmp_path / "printer.cfg")
-    found = calibrate(tmp_path / "kit")
+    found = calibrate_session(tmp_path / "kit")
     assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [9]
     bed = found.findings.bed
-    (text,) = Klipper().files(Source(found.machine, bed=bed.z)).values()
+    (text,) = Klipper().files(MachineSource(found.machine, bed=bed.z)).values()
     assert np.std(flat(true, pasted(text))) < 2.2e3 * bed.sigma
     assert found.verdict.usable
 
@@ -203,8 +203,8 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
         readings[n // 2] += 0.3
         (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
         write_printer_session(tmp_path / str(n), tmp_path / "printer.cfg")
-        found = calibrate(tmp_path / str(n))
-        (text,) = Klipper().files(Source(found.machine, bed=found.findings.bed.z)).values()
+        found = calibrate_session(tmp_path / str(n))
+        (text,) = Klipper().files(MachineSource(found.machine, bed=found.findings.bed.z)).values()
         bent[n] = float(np.std(flat(true, pasted(text))))
         assert found.verdict.usable
         assert (found.estimate.pose_weights < 0.5).sum() == (n == 13)
@@ -407,7 +407,7 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
     (path,) = (tmp_path / "kit" / "export-reprap").iterdir()
     words = reprap.read_words(path.read_text())
     told = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
-    travel = reprap.homed_carriages(words) - reprap.linear_motors(words, told)
+    travel = reprap.homed_carriages(words) - reprap.reprap_carriage_heights(words, told)
     there = 1e3 * true.forward(1e-3 * (SAYS.homed - travel))[:, 2, 3]
     assert np.abs(z).max() > 0.3
     assert np.sqrt(np.mean(there**2)) < NOISE
@@ -508,7 +508,7 @@ def test_only_a_bed_is_level(kit, tmp_path):
     rows = "".join(f"{k + 1:03d},0,0,0\n" for k in range(19))
     (folder / "poses.csv").write_text("configuration,x,y,z\n" + rows)
     with pytest.raises(InputError, match="only of heights can be said that the bed is level"):
-        calibrate(folder)
+        calibrate_session(folder)
 
 
 def test_what_calibrate_tells_programs(kit):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import parse_yaml, validate
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import perturb, pose, rotation, rotation_vector
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -22,7 +22,7 @@ from pkmcal.mechanisms import (
 )
 from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.closure import closure, dense
-from pkmcal.mechanisms.kinematics import CONVERGED, NEAR_SINGULAR
+from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR, NEAR_SINGULAR
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=8, deadline=None)
@@ -36,7 +36,9 @@ def machine_of(motion, legs, more=""):
         f"    length: {{{length}}}\n"
         for a, b, length in legs
     )
-    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
+    )
 
 
 def planar():
@@ -137,7 +139,9 @@ def test_forward_undoes_inverse(machine, seed):
     assert found.converged.all()
     assert found.singularity.min() > 0.1
     np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-11)
-    np.testing.assert_allclose(machine.inverse(found.T_base_platform), readings, atol=CONVERGED)
+    np.testing.assert_allclose(
+        machine.inverse(found.T_base_platform), readings, atol=CONVERGED_CLOSURE_ERROR
+    )
 
 
 def joint_distances(machine, T):
@@ -279,7 +283,7 @@ def test_forward_near_a_singular_pose_is_honest(short):
     assert found.converged.any()
     assert np.all(found.singularity < NEAR_SINGULAR)
     closed = np.abs(machine.inverse(found.T_base_platform) - readings).max(axis=-1)
-    np.testing.assert_array_equal(found.converged, found.error < CONVERGED)
+    np.testing.assert_array_equal(found.converged, found.error < CONVERGED_CLOSURE_ERROR)
     np.testing.assert_allclose(found.error, closed, atol=1e-15)
     # the two yaws that belong to these readings are 90 -+ short; where they merge, an error of
     # 1e-12 m in the readings is one of its root in the pose
@@ -312,7 +316,7 @@ def assert_modes(machine, readings, modes):
     driven = machine.layout.actuated >= 0
     offsets = machine.values[machine.layout.rod[driven]]
     wanted = np.tile(readings + offsets, (len(modes), 1))
-    np.testing.assert_allclose(lengths[:, driven], wanted, atol=CONVERGED)
+    np.testing.assert_allclose(lengths[:, driven], wanted, atol=CONVERGED_CLOSURE_ERROR)
     gaps = np.abs(modes[:, None] - modes[None, :]).max(axis=(-1, -2)) + np.eye(len(modes))
     assert gaps.min() > 1e-3
 
@@ -390,7 +394,7 @@ def test_a_planar_machine_stays_in_its_plane():
     found = machine.forward(readings)
     np.testing.assert_array_equal(found[:, 2], np.tile([0, 0, 1, 0], (50, 1)))
     np.testing.assert_array_equal(found[:, :2, 2], 0)
-    np.testing.assert_allclose(machine.inverse(found), readings, atol=CONVERGED)
+    np.testing.assert_allclose(machine.inverse(found), readings, atol=CONVERGED_CLOSURE_ERROR)
 
 
 def test_a_translational_machine_does_not_turn_and_its_rods_keep_their_length():
@@ -400,8 +404,10 @@ def test_a_translational_machine_does_not_turn_and_its_rods_keep_their_length():
     found = machine.forward(readings)
     np.testing.assert_array_equal(found[:, :3, :3], np.tile(np.eye(3), (50, 1, 1)))
     lengths = np.array([joint_distances(machine, T) for T in found])
-    np.testing.assert_allclose(lengths[:, 1], 0.45, atol=CONVERGED)
-    np.testing.assert_allclose(lengths[:, [0, 2]] - [0, -0.02], readings, atol=CONVERGED)
+    np.testing.assert_allclose(lengths[:, 1], 0.45, atol=CONVERGED_CLOSURE_ERROR)
+    np.testing.assert_allclose(
+        lengths[:, [0, 2]] - [0, -0.02], readings, atol=CONVERGED_CLOSURE_ERROR
+    )
 
 
 # Batches
@@ -439,7 +445,7 @@ def test_machines_broadcast_too(machine):
     if machine.layout.shares_motors:  # a pose of one machine's rods is not another's
         theta = np.broadcast_to(machine.values, theta.shape)
     machines = [machine.with_values(row[0]) for row in theta]
-    readings = kinematics.inverse(machine.layout, theta, poses)
+    readings = kinematics.readings_at_poses(machine.layout, theta, poses)
     assert readings.shape == (3, 5, machine.n_joints)
     tight = {"rtol": 0, "atol": 1e-13 if machine.layout.shares_motors else 0.0}
     np.testing.assert_allclose(readings, [m.inverse(poses) for m in machines], **tight)

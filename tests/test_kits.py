@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
-from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.source import Source
-from pkmcal.export.contract import export
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.source import MachineSource
+from pkmcal.export.contract import make_export
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import report_of
@@ -154,7 +154,7 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
     """Of a kit whose towers lean by a third of a degree: the bed flat all the same, all deviations
     larger by what the model leaves out, and nothing lost in the firmware's values."""
     kit = probe_kit(tmp_path / "session", n=25)
-    found = calibrate(load_session(tmp_path / "session", model="firmware"))
+    found = calibrate_session(load_session(tmp_path / "session", model="firmware"))
     table = found.machine.parameters
     held = [
         table.index(f"legs[{j}].{what}") for j in (1, 2, 3) for what in ("scale", "base.axis.x")
@@ -162,8 +162,8 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
     assert np.array_equal(found.machine.values[held], table.drawing[held])
     assert found.verdict.usable
     assert flatness(kit, found.machine) < 0.2 * flatness(kit, kit.drawing)
-    source = Source(found.machine, bed=found.findings.bed.z)
-    (note, *_) = export(source, "klipper").notes
+    source = MachineSource(found.machine, bed=found.findings.bed.z)
+    (note, *_) = make_export(source, "klipper").notes
     off = re.search(r"off by ([\d.]+) mm at most", note.text)
     assert off
     assert float(off[1]) < 0.005

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
-from pkmcal.files import parse_yaml, validate
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -19,7 +19,7 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.mechanisms.carriers.contract import base_carriers, by_pose, platform_carriers
-from pkmcal.mechanisms.document import MOTIONS, ActuatedLength, ConstantLength
+from pkmcal.mechanisms.document import MOTION_DIRECTIONS, ActuatedLength, ConstantLength
 
 
 @pytest.fixture(params=sorted(catalogue()), scope="module")
@@ -28,7 +28,9 @@ def machine(request):
 
 
 def read(text):
-    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
+    )
 
 
 # The catalogue
@@ -430,7 +432,7 @@ def refused(source):
             "m.yaml, line 5, legs[1].platform",
             platform_carriers(),
         ),
-        ("motion: planar", "motion: flat", "m.yaml, line 2, motion", MOTIONS),
+        ("motion: planar", "motion: flat", "m.yaml, line 2, motion", MOTION_DIRECTIONS),
     ],
 )
 def test_kinds_that_are_not_known_are_told_with_those_that_are(

@@ -18,7 +18,7 @@ import test_carriers
 import test_catalogue
 from export_sources import source_of
 from pkmcal.errors import InputError
-from pkmcal.export.contract import export
+from pkmcal.export.contract import make_export
 from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
@@ -33,9 +33,9 @@ from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
-from pkmcal.report.scene import scene_of, views
+from pkmcal.report.scene import plane_projections, scene_of
 from pkmcal.simulation import with_forearms
-from pkmcal.simulation.drives import PIECES, drives_of
+from pkmcal.simulation.drives import BENT_GUIDE_PIECES, drives_of
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box
 from pkmcal.simulation.surfaces import SmoothNoise
@@ -372,7 +372,7 @@ def test_it_is_drawn(machine, calibrated):
         assert any(np.allclose(box.centre, (a + foot) / 2, atol=1e-9) for box in boxes)
     session = SimpleNamespace(machine=machine)
     centres = joint_centres(machine, estimate.machine, estimate.covariance)
-    for view in views(scene_of(session, estimate, centres)):
+    for view in plane_projections(scene_of(session, estimate, centres)):
         assert len(view.marks) == 12
 
 
@@ -380,11 +380,11 @@ def test_a_way_that_bends_is_drawn_in_pieces(arcs):
     drives = drives_of(arcs)
     assert drives.guides.all()
     for j, way in enumerate(drives.ways):
-        assert len(way) == PIECES + 1
+        assert len(way) == BENT_GUIDE_PIECES + 1
         from_axis = way - arcs.base_centers()[j]
         assert np.ptp(np.linalg.norm(from_axis[:, :2], axis=1)) > 1e-3
     rails = [box for box in boxes_of(arcs) if box.half[1] == box.half[2]]
-    assert len(rails) == 3 * PIECES
+    assert len(rails) == 3 * BENT_GUIDE_PIECES
     for box in boxes_of(arcs):
         np.testing.assert_allclose(box.rot @ box.rot.T, np.eye(3), atol=1e-12)
 
@@ -402,11 +402,11 @@ def boxes_of(machine):
 
 @pytest.mark.parametrize("target", ["c", "mujoco"])
 def test_it_is_exported_as_the_joint_of_its_chain(machine, target):
-    made = export(source_of(machine), target)
+    made = make_export(source_of(machine), target)
     assert made.files
 
 
 @pytest.mark.parametrize("target", ["c", "mujoco"])
 def test_what_has_no_chain_is_not_exported(arcs, target):
     with pytest.raises(InputError, match="arc"):
-        export(source_of(arcs), target)
+        make_export(source_of(arcs), target)

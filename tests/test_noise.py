@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.kinds import EDGES, READINGS
-from pkmcal.identify.noise import FEWEST, Components, components
+from pkmcal.identify.kinds import EDGE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.noise import LEAST_NOISE_FREEDOM, Components, components
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism
@@ -48,15 +48,18 @@ def test_sums_of_squares_are_as_their_traces_say(factor):
     problem, truth = batch(1, factor * 4e-5, 4e-5, runs=100, machine=machine)
     result = solve_batch(problem, truth, robust=False, scale_noise=False)
     found = components(result.info, result.weight)
-    own = found.square[:, READINGS, READINGS]
-    assert own.mean() > FEWEST  # they do say something of it
-    expected = found.freedom[:, READINGS] + (factor**2 - 1) * own
-    ratio = found.chi2[:, READINGS] / expected
+    own = found.square[:, READING_ROWS_KIND, READING_ROWS_KIND]
+    assert own.mean() > LEAST_NOISE_FREEDOM  # they do say something of it
+    expected = found.freedom[:, READING_ROWS_KIND] + (factor**2 - 1) * own
+    ratio = found.chi2[:, READING_ROWS_KIND] / expected
     assert ratio.mean() == pytest.approx(1, abs=4 * ratio.std() / np.sqrt(100))
-    beside = found.freedom[:, EDGES] + (factor**2 - 1) * found.square[:, EDGES, READINGS]
-    assert np.mean(found.chi2[:, EDGES] / beside) == pytest.approx(1, abs=0.01)
+    beside = (
+        found.freedom[:, EDGE_ROWS_KIND]
+        + (factor**2 - 1) * found.square[:, EDGE_ROWS_KIND, READING_ROWS_KIND]
+    )
+    assert np.mean(found.chi2[:, EDGE_ROWS_KIND] / beside) == pytest.approx(1, abs=0.01)
     if factor == 1:
-        spread = np.std(found.chi2[:, READINGS] - found.freedom[:, READINGS])
+        spread = np.std(found.chi2[:, READING_ROWS_KIND] - found.freedom[:, READING_ROWS_KIND])
         assert spread == pytest.approx(np.sqrt(2 * own.mean()), rel=0.3)
 
 
@@ -67,7 +70,7 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     problem, truth = batch(2, true, stated)
     right = replace(problem, joint_noise=np.array([true]))
     found, best = (solve_batch(p, truth) for p in (problem, right))
-    low, high = components(found.info, found.weight).interval(READINGS)
+    low, high = components(found.info, found.weight).interval(READING_ROWS_KIND)
     scale = found.reading_scale * stated / true  # of the noise in use, to the true one
     assert np.all((low * scale < 1) & (high * scale > 1))
     assert np.all(found.reading_scale != 1)
@@ -91,15 +94,15 @@ def test_where_the_data_cannot_tell_nothing_is_claimed():
     problem, truth = batch(4, 3e-6, 3e-8)
     found = solve_batch(problem, truth)
     np.testing.assert_array_equal(found.reading_scale, 1.0)
-    low, high = components(found.info, found.weight).interval(READINGS)
+    low, high = components(found.info, found.weight).interval(READING_ROWS_KIND)
     assert np.all(low == 0)
     assert np.all(high > 100)
 
 
 def test_too_few_degrees_of_freedom_tell_nothing():
     nothing = Components(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3, 3)))
-    assert nothing.interval(READINGS) == (0.0, np.inf)
-    assert not nothing.contradicts(READINGS)
+    assert nothing.interval(READING_ROWS_KIND) == (0.0, np.inf)
+    assert not nothing.contradicts(READING_ROWS_KIND)
 
 
 def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
@@ -112,7 +115,7 @@ def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
     assert wrong != text
     for content, told in ((text, 0), (wrong, 1)):
         (folder / "session.yaml").write_text(content, encoding="utf-8")
-        found = calibrate(folder)
+        found = calibrate_session(folder)
         said = [w for w in found.verdict.warnings if "stations.tracker.tracker.noise" in w]
         assert len(said) == told
         assert found.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
@@ -165,4 +168,4 @@ def test_traces_are_those_of_the_hat_matrix(name):
     freedom = np.array([np.trace(left[i][i]) for i in range(3)])
     np.testing.assert_allclose(found.freedom[0], freedom, atol=1e-5)
     np.testing.assert_allclose(found.square[0], square, atol=1e-5)
-    assert freedom[READINGS] > 1e-3  # the data do say something of each kind
+    assert freedom[READING_ROWS_KIND] > 1e-3  # the data do say something of each kind

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
-from pkmcal.observe.complaints import listening
+from pkmcal.observe.complaints import decoded_and_fault
 from pkmcal.observe.images import Pictures, Selected, decode
 
 SIZE = (64, 48)
@@ -175,7 +175,7 @@ def test_what_others_write_meanwhile_is_passed_on(capfd):
         os.write(2, next(lines, b"libpng error: y\n"))
         return 3
 
-    assert listening(decode_and_speak) == (3, "y")
+    assert decoded_and_fault(decode_and_speak) == (3, "y")
     assert capfd.readouterr().err == "half a bar\nand a half"
 
 

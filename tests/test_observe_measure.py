@@ -7,7 +7,13 @@ import pytest
 
 from pkmcal.observe.legs import Photographs, measure
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.observe.profiles import FAINT, FLOOR, HALVES, edge_set, fit_edges
+from pkmcal.observe.profiles import (
+    EDGE_SIGMA_FLOOR,
+    FAINT_EDGE_SIGMA,
+    MEASUREMENTS_AN_EDGE,
+    edge_set,
+    fit_edges,
+)
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -94,8 +100,8 @@ def test_the_points_lie_on_the_true_edges():
     outward = moved / np.linalg.norm(moved, axis=1, keepdims=True)
     off = outward_to(normal, found.points[:, None], outward[:, None], camera)[:, 0]
     assert rms(off) < 0.06
-    # a place supports an edge within three of its sigmas, which reach FAINT
-    assert np.abs(off).max() < 3 * FAINT
+    # a place supports an edge within three of its sigmas, which reach FAINT_EDGE_SIGMA
+    assert np.abs(off).max() < 3 * FAINT_EDGE_SIGMA
 
 
 def test_a_photograph_that_shows_no_leg_leaves_the_others_as_they_are():
@@ -199,15 +205,15 @@ def test_positions_on_a_highlight_do_not_pull_the_edge():
 
 def test_an_edge_counts_as_two_measurements_however_many_its_places():
     """Positions that err together, as shading has it: the shift's sigma is the place's over
-    the root of HALVES, and errors that are common to an edge stay within it."""
+    the root of MEASUREMENTS_AN_EDGE, and errors that are common to an edge stay within it."""
     rng = np.random.default_rng(1)
     sigma = 0.1
-    common = sigma / np.sqrt(HALVES) * rng.normal(size=(6, 24, 1))
+    common = sigma / np.sqrt(MEASUREMENTS_AN_EDGE) * rng.normal(size=(6, 24, 1))
     own = 0.02 * rng.normal(size=(6, 24, SAMPLES))
     _, points = predicted()
     _, edges = fitted(common + own, sigma)
     shift = np.sqrt(edges.covariance[:, 0, 0]) / np.abs(edges.shift[:, 0])
-    expected = np.hypot(sigma, FLOOR) / np.sqrt(HALVES)
+    expected = np.hypot(sigma, EDGE_SIGMA_FLOOR) / np.sqrt(MEASUREMENTS_AN_EDGE)
     # tilt and shift are not quite independent, and weights differ a little along an edge
     np.testing.assert_allclose(shift, expected, rtol=0.15)
     turn = np.einsum("nij,ni->nj", edges.basis, edges.normal - points.normal.reshape(-1, 3))

@@ -10,11 +10,16 @@ from scipy.ndimage import gaussian_filter
 
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.observe.evidence import StationView
-from pkmcal.observe.legs import REACH, Photographs, search, search_legs
+from pkmcal.observe.legs import LEG_SEARCH_REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
 from pkmcal.observe.stations import find_station
-from pkmcal.observe.tables import BIN, DIRECTIONS, direction_of, distance_tables
+from pkmcal.observe.tables import (
+    CHANCE_DISTANCE_BIN,
+    EDGE_DIRECTIONS,
+    direction_of,
+    distance_tables,
+)
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -87,7 +92,7 @@ def test_a_leg_that_is_not_there_is_not_found():
 def test_a_leg_beyond_the_search_is_not_found():
     """All edges moved sideways by more than the reach: the place at its end is no place. A few
     legs meet their neighbours' edges instead."""
-    far = int(REACH) + 6
+    far = int(LEG_SEARCH_REACH) + 6
     moved = [np.roll(image, far, axis=1) for image in images()]
     assert looked_for(machine(), moved)[0].clear.mean() < 0.35
 
@@ -274,7 +279,7 @@ def test_directions_are_of_lines_not_of_arrows():
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     number = direction_of(normal)
     np.testing.assert_array_equal(number, direction_of(-normal))
-    np.testing.assert_array_equal(np.unique(number), np.arange(DIRECTIONS))
+    np.testing.assert_array_equal(np.unique(number), np.arange(EDGE_DIRECTIONS))
     assert np.all(np.diff(number[:100]) >= 0)
 
 
@@ -289,10 +294,12 @@ def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
     chance = tables.by_chance(np.array([5]), found)
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), [3, 5])
     # the same whatever was looked for before
-    tables.tables.get_ready(np.arange(DIRECTIONS))
+    tables.tables.get_ready(np.arange(EDGE_DIRECTIONS))
     assert tables.look(one, pixel, np.array(0))[0] == found
     assert tables.by_chance(np.array([5]), found) == chance
-    np.testing.assert_allclose(tables.tables.chance.sum(axis=1) * BIN, 1.0, rtol=1e-5)
+    np.testing.assert_allclose(
+        tables.tables.chance.sum(axis=1) * CHANCE_DISTANCE_BIN, 1.0, rtol=1e-5
+    )
 
 
 def test_tables_hold_the_distance_to_an_edge_of_that_direction():

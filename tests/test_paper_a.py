@@ -16,21 +16,21 @@ from pkmcal.papers.axis_measurements import (
 )
 from pkmcal.studies import engine
 from pkmcal.studies.paper_a import (
-    BOUND,
-    EFFECTOR,
-    GROUPS,
-    JOINT,
-    METHODS,
+    END_EFFECTOR_QUANTITIES,
+    PAPER_A_BOUND,
+    PAPER_A_JOINT,
+    PAPER_A_METHODS,
+    PAPER_A_PARAMETER_GROUPS,
     HexapodByAxes,
     converged,
-    groups,
-    joint_estimate,
+    hexapod_with_held_radii,
+    joint_from_readings,
+    parameters_by_group,
     start_off_drawing,
-    study_machine,
     thirty,
 )
 from pkmcal.studies.simulated import Noise
-from pkmcal.studies.statistics import covered, mean, rms
+from pkmcal.studies.statistics import covered, mean, rms_over_runs
 from pkmcal.studies.tasks import Batch
 
 
@@ -44,7 +44,7 @@ def reduced():
 
 
 def millimetres(accuracy):
-    return 1e3 * np.array([accuracy[name].value for name in GROUPS])
+    return 1e3 * np.array([accuracy[name].value for name in PAPER_A_PARAMETER_GROUPS])
 
 
 def test_joint_estimate_reaches_its_bound(reduced):
@@ -57,7 +57,7 @@ def test_joint_estimate_reaches_its_bound(reduced):
 
 
 def test_chi2_is_its_degrees_of_freedom(reduced):
-    chi2 = reduced.values("chi2", JOINT)
+    chi2 = reduced.values("chi2", PAPER_A_JOINT)
     assert chi2.mean() == pytest.approx(1, abs=0.02)
     assert 0.95 < np.median(chi2) < 1.05
     assert converged(reduced) == 75
@@ -65,7 +65,7 @@ def test_chi2_is_its_degrees_of_freedom(reduced):
 
 def test_what_it_states_is_what_it_errs_by(reduced):
     """Intervals of 95 % hold 95 of 100 errors, and smaller ones as many as they promise."""
-    found = reduced.samples[JOINT,]
+    found = reduced.samples[PAPER_A_JOINT,]
     errors, sigma = found.values["parameters"], found.sigma["parameters"]
     assert sigma.shape == errors.shape == (75, 30)
     for share in (0.5, 0.95):
@@ -108,7 +108,7 @@ def test_end_effector(reduced):
 
 def test_the_bound_has_its_own_end_effector(reduced):
     """Errors drawn from the bound move the end-effector as far as the joint estimate's."""
-    joint, bound = (reduced.of(name)["displacement"] for name in (JOINT, BOUND))
+    joint, bound = (reduced.of(name)["displacement"] for name in (PAPER_A_JOINT, PAPER_A_BOUND))
     assert abs(joint.value - bound.value) < 3 * np.hypot(joint.error, bound.error)
     assert bound.error < 0.75 * joint.error
 
@@ -123,8 +123,8 @@ def test_depth_as_printed_is_the_drawings(reduced):
 
 def test_standard_errors_are_the_scatter_of_studies():
     """Eight small studies scatter as each one's standard error says."""
-    studies = [study(runs=12, poses=6, seed=seed).of(JOINT) for seed in range(8)]
-    names = (*GROUPS, *EFFECTOR)
+    studies = [study(runs=12, poses=6, seed=seed).of(PAPER_A_JOINT) for seed in range(8)]
+    names = (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     found = np.array([[s[name].value for name in names] for s in studies])
     said = np.array([[s[name].error for name in names] for s in studies]).mean(axis=0)
     ratio = found.std(axis=0, ddof=1) / said
@@ -140,7 +140,7 @@ def test_the_result_does_not_depend_on_workers(monkeypatch):
         results.append(engine.run(setting, 10, 3, told=lambda _text, share: told.append(share)))
     assert [r.workers for r in results] == [1, 3]
     assert told == pytest.approx(2 * [1 / 3, 2 / 3, 1])
-    for name in METHODS:
+    for name in PAPER_A_METHODS:
         assert results[0].of(name) == results[1].of(name)
         assert len(results[0].values("parameters", name)) == 10
 
@@ -154,14 +154,14 @@ def test_a_batch_depends_on_its_own_seed_alone():
     last = pickle.loads(pickle.dumps(engine.batches(setting, 7, 3)[-1]))
     data = setting.draw(last)
     again = setting.judge(last, data, setting.solve(last, data))
-    for name in METHODS:
+    for name in PAPER_A_METHODS:
         found = again[name,].values["parameters"]
         np.testing.assert_array_equal(found, whole.values("parameters", name)[6:])
 
 
 def test_the_thirty_parameters():
     """Frames by centres 1, 3 and 5: their six coordinates vanish, and distances remain."""
-    machine = study_machine()
+    machine = hexapod_with_held_radii()
     found = thirty(machine)
     assert len(set(found.names)) == 30
     assert {"A3 x", "A5 y", "B5 x", "q6"} <= set(found.names)
@@ -178,14 +178,16 @@ def test_the_thirty_parameters():
 
 def test_groups_of_parameters():
     """An error of one group shows in that one only."""
-    machine = study_machine()
+    machine = hexapod_with_held_radii()
     names = thirty(machine).names
     errors = np.zeros((4, 30))
     errors[:, [names.index(n) for n in ("B2 z", "B4 z", "B6 z")]] = 1e-3
-    found = {name: rms(errors[:, at]) for name, at in groups(machine).items()}
-    assert list(found) == list(GROUPS)
+    found = {
+        name: rms_over_runs(errors[:, at]) for name, at in parameters_by_group(machine).items()
+    }
+    assert list(found) == list(PAPER_A_PARAMETER_GROUPS)
     assert [s.value for s in found.values()] == pytest.approx([0, 0, 0, 1e-3, 0])
-    assert rms(errors).value == pytest.approx(1e-3 * np.sqrt(3 / 30))
+    assert rms_over_runs(errors).value == pytest.approx(1e-3 * np.sqrt(3 / 30))
     assert max(s.error for s in found.values()) == 0
 
 
@@ -199,10 +201,10 @@ def test_thirty_of_thirty_starts(near, error):
     """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
     found = study(runs=30, start_error=error, seed=5)
     assert converged(found) == 30
-    for name in (*GROUPS, *EFFECTOR):
+    for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES):
         there, here = (s.of("joint")[name] for s in (found, near))
         assert there.value == pytest.approx(here.value, rel=1e-5)
-    assert near.of(JOINT)["steps"].value < found.of(JOINT)["steps"].value
+    assert near.of(PAPER_A_JOINT)["steps"].value < found.of(PAPER_A_JOINT)["steps"].value
 
 
 def test_accuracy_grows_with_the_square_root_of_the_poses():
@@ -225,7 +227,7 @@ def test_noise_free_measurements_give_the_truth():
     data = tiny.draw(Batch("hexapod", 3, np.random.SeedSequence(8)))
     stated = replace(data, noise=Noise(3e-6, axis=AxisNoise().sigma()))
     start = start_off_drawing(stated, np.zeros_like(data.theta))
-    np.testing.assert_allclose(joint_estimate(stated, start).theta, data.theta, atol=2e-9)
+    np.testing.assert_allclose(joint_from_readings(stated, start).theta, data.theta, atol=2e-9)
 
 
 def test_axis_coordinates_round_trip():

@@ -9,7 +9,7 @@ import pytest
 
 import pkmcal
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare
+from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.papers import linear
@@ -81,7 +81,7 @@ def errors(method, share, runs=12):
             place = rng.integers(0, normal.shape[1], len(bad))
             wrong[leg, bad], noise_of[leg, bad] = normal[other, place], noise[other, place]
         radius, present = np.full(wrong.shape[:2], RADIUS), np.ones(wrong.shape[:2])
-        found, _, _ = linear.solve(wrong, radius, present, noise_of, method, rng)
+        found, _, _ = linear.solve_regressions(wrong, radius, present, noise_of, method, rng)
         squares.append(np.mean(np.sum((found - centres) ** 2, axis=-1)))
     return float(np.sqrt(np.mean(squares)))
 
@@ -118,7 +118,7 @@ def test_a_hexapod_seen_through_a_mirror(tmp_path):
     )
     rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
     found = pkmcal.calibrate(folder)
-    result = compare(found, folder)
+    result = compare_with_truth(found, folder)
     assert result.calibrated.centre < result.drawing.centre / 5
     assert result.calibrated.position < result.drawing.position / 5
     # 44 correlated values: 95 % expected within two deviations

@@ -14,24 +14,24 @@ from pkmcal.pages.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_c_expected as expected
 from pkmcal.studies.paper_c import (
-    AXIS,
-    BOUND,
-    DRAWING,
-    EQ3,
-    EQ5,
-    JOINT,
-    WHITENED,
+    EQ3_AS_PRINTED,
+    EQ5_AS_PRINTED,
+    EQ5_WHITENED,
+    PAPER_C_BOUND,
+    PAPER_C_DRAWING,
+    PAPER_C_JOINT,
+    ROTATION_AXIS_METHOD,
     H4ByBoard,
 )
 from pkmcal.studies.paper_c_machine import (
-    IDENTIFIED,
+    IDENTIFIED_TABLE_2,
     Deviations,
-    grid,
+    measured_volume_grid,
     model,
     table_2_of,
     table_2_values,
 )
-from pkmcal.studies.paper_c_report import reproduced
+from pkmcal.studies.paper_c_report import paper_c_outcome
 from pkmcal.studies.paper_c_validation import before
 from pkmcal.studies.reproduction import Compared
 from pkmcal.studies.statistics import Summary
@@ -52,7 +52,7 @@ def short():
 
 @pytest.fixture(scope="module")
 def found(short):
-    return reproduced(short)
+    return paper_c_outcome(short)
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +69,12 @@ def test_the_simulated_machines():
     assert len(np.unique(np.round(truth.T_base_platform[0, :, :3, 3], 6), axis=0)) == 27
     assert truth.count == 71
     machine = model("design")
-    values = table_2_values(machine, IDENTIFIED)
+    values = table_2_values(machine, IDENTIFIED_TABLE_2)
     there = table_2_of(machine, values)
-    np.testing.assert_allclose(there[:4], IDENTIFIED[:4])
-    np.testing.assert_allclose(there[4:8], IDENTIFIED.alpha)
-    np.testing.assert_allclose(there[8:], IDENTIFIED.q0)
-    assert np.abs(grid()[:, :3, 3].mean(axis=0) - [0, 0, -0.45]).max() < 1e-12
+    np.testing.assert_allclose(there[:4], IDENTIFIED_TABLE_2[:4])
+    np.testing.assert_allclose(there[4:8], IDENTIFIED_TABLE_2.alpha)
+    np.testing.assert_allclose(there[8:], IDENTIFIED_TABLE_2.q0)
+    assert np.abs(measured_volume_grid()[:, :3, 3].mean(axis=0) - [0, 0, -0.45]).max() < 1e-12
 
 
 def test_rods_alone_tilt_the_nacelle():
@@ -93,7 +93,7 @@ def test_rods_alone_tilt_the_nacelle():
 
 def test_checks_pass_and_each_can_fail(short):
     start = before()
-    fine = expected.checks(short, start)
+    fine = expected.paper_c_checks(short, start)
     assert [c.what for c in fine if not c.passed] == []
 
     def with_accuracy(key, **changes):
@@ -106,30 +106,31 @@ def test_checks_pass_and_each_can_fail(short):
         own = Sample({**short.samples[key].values, **changes})
         return replace(short, samples={**short.samples, key: own})
 
-    drawn = short.values("control_mean", "design", "design", DRAWING)
+    drawn = short.values("control_mean", "design", "design", PAPER_C_DRAWING)
     spoilt = [
         (short, start._replace(shift=0.02)),
-        (with_values(DRAWING, control_mean=0.9 * drawn), start),
-        (with_values(EQ3, square=np.full((RUNS, 4), 6e-4)), start),
-        (with_values(EQ3, rank=np.full(RUNS, 22)), start),
-        (with_accuracy(("design", AXIS), chi2=1.3), start),
-        (with_accuracy(("design", "design", JOINT), larger_shift=2e-4), start),
-        (with_accuracy(("calibration", "design", JOINT), chi2=1.1), start),
-        (with_accuracy(("rods", "rods", JOINT), larger_shift=2e-4), start),
-        (with_accuracy(("design", "calibration", EQ5), larger_turn=7e-4), start),
+        (with_values(PAPER_C_DRAWING, control_mean=0.9 * drawn), start),
+        (with_values(EQ3_AS_PRINTED, square=np.full((RUNS, 4), 6e-4)), start),
+        (with_values(EQ3_AS_PRINTED, rank=np.full(RUNS, 22)), start),
+        (with_accuracy(("design", ROTATION_AXIS_METHOD), chi2=1.3), start),
+        (with_accuracy(("design", "design", PAPER_C_JOINT), larger_shift=2e-4), start),
+        (with_accuracy(("calibration", "design", PAPER_C_JOINT), chi2=1.1), start),
+        (with_accuracy(("rods", "rods", PAPER_C_JOINT), larger_shift=2e-4), start),
+        (with_accuracy(("design", "calibration", EQ5_AS_PRINTED), larger_turn=7e-4), start),
     ]
     assert len(spoilt) == len(fine)
     for place, (study_, begin) in enumerate(spoilt):
-        assert not expected.checks(study_, begin)[place].passed, fine[place].what
+        assert not expected.paper_c_checks(study_, begin)[place].passed, fine[place].what
 
 
 def test_every_figure_of_the_prototype_is_compared(short):
-    figures = expected.figures_compared(short)
+    figures = expected.paper_c_figures(short)
     assert len(figures) == 2 * 10 + 3
     assert {f.key for f in figures if not f.held} == {
-        ("calibration", "design", EQ3), ("rods", "design", JOINT), ("rods", "calibration", JOINT),
+        ("calibration", "design", EQ3_AS_PRINTED), ("rods", "design", PAPER_C_JOINT), ("rods",
+        "calibration", PAPER_C_JOINT),
     }  # fmt: skip
-    key, allowed = ("design", "design", EQ3), expected.TOLERANCE
+    key, allowed = ("design", "design", EQ3_AS_PRINTED), expected.PAPER_C_TOLERANCE
     figure = Compared(key, "larger_shift", Summary(0.07, 0.001), 0.070, 0.0005, allowed)
     assert figure.tolerable
     assert not figure._replace(found=Summary(0.09, 0.001)).tolerable
@@ -138,18 +139,21 @@ def test_every_figure_of_the_prototype_is_compared(short):
 def test_noise_twice_as_large_is_not_a_reproduction():
     quiet = H4ByBoard()
     loud = study(runs=4, turn=2 * quiet.turn, shift=2 * quiet.shift)
-    failed = [c.what for c in expected.checks(loud, before()) if not c.passed]
+    failed = [c.what for c in expected.paper_c_checks(loud, before()) if not c.passed]
     assert "figures of the independent prototype" in failed
 
 
 def test_better_methods_are_better(short):
     """As printed, whitened, joint: and the last is not better than the bound says."""
-    for kind, printed in (("design", EQ3), ("calibration", EQ5)):
-        a = {m: short.of(kind, kind, m)["shift"].value for m in (printed, WHITENED, JOINT, BOUND)}
-        assert a[JOINT] < a[printed]
-        assert a[WHITENED] == pytest.approx(a[JOINT], rel=0.02)
-    assert short.of("calibration", "calibration", EQ5)["shift"].value < (
-        0.5 * short.of("calibration", "design", EQ3)["shift"].value
+    for kind, printed in (("design", EQ3_AS_PRINTED), ("calibration", EQ5_AS_PRINTED)):
+        a = {
+            m: short.of(kind, kind, m)["shift"].value
+            for m in (printed, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND)
+        }
+        assert a[PAPER_C_JOINT] < a[printed]
+        assert a[EQ5_WHITENED] == pytest.approx(a[PAPER_C_JOINT], rel=0.02)
+    assert short.of("calibration", "calibration", EQ5_AS_PRINTED)["shift"].value < (
+        0.5 * short.of("calibration", "design", EQ3_AS_PRINTED)["shift"].value
     )
 
 
@@ -170,13 +174,15 @@ def test_another_seed_draws_anew():
 
 
 def test_the_command(tmp_path, monkeypatch, found):
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: found)
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+    )
     done = run("reproduce", "c", "-o", tmp_path, "--json")
     assert (done.code, done.err) == (0, "")
     c = done.json["papers"]["c"]
     assert c == json.loads((tmp_path / "paper-c.json").read_text())
     assert c["before"]["shift"] == pytest.approx(0.0259, abs=2e-4)
-    assert len(c["validation"][f"design, {EQ3}"]["control_rms"]) == 4
+    assert len(c["validation"][f"design, {EQ3_AS_PRINTED}"]["control_rms"]) == 4
     done = run("reproduce", "c", "-o", tmp_path)
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
     assert "…" not in done.out

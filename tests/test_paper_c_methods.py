@@ -12,7 +12,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotat
 from pkmcal.identify.bundle import bundle
 from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import (
     inverse_kinematic,
@@ -21,7 +21,7 @@ from pkmcal.papers.inverse_kinematic import (
 )
 from pkmcal.papers.measured_platform import seen_platform, taken
 from pkmcal.papers.rotation_axis import (
-    MOST_PAIRS,
+    MOST_TURN_PAIRS,
     _pairs,
     axis_frames,
     facing,
@@ -66,11 +66,11 @@ def test_the_platform_from_the_board():
     )
 
 
-@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("name", MOTION_DIRECTIONS)
 @pytest.mark.parametrize("tilt", [0.0, 1e-7, 0.3])
 def test_what_a_machine_can_take_of_a_pose(name, tilt):
     rng = np.random.default_rng(1)
-    motion = MOTIONS[name]
+    motion = MOTION_DIRECTIONS[name]
     own = perturb(np.eye(4), rng.normal(size=6) @ motion @ motion.T)
     whole = perturb(own, tilt * rng.normal(size=6))
     found = taken(motion, whole)
@@ -301,8 +301,8 @@ def boards(turns, rng, sigma=5e-4):
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 40, 700])
 def test_pairs_of_many_poses_are_an_even_choice_of_all(n):
     i, j = np.triu_indices(n, 1)
-    if len(i) > MOST_PAIRS:
-        pick = np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)
+    if len(i) > MOST_TURN_PAIRS:
+        pick = np.linspace(0, len(i) - 1, MOST_TURN_PAIRS).astype(int)
         i, j = i[pick], j[pick]
     np.testing.assert_array_equal(_pairs(n), (i, j))
 

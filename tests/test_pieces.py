@@ -10,7 +10,7 @@ from pkmcal.identify.covariance import Information, identifiability, reduced_row
 from pkmcal.identify.noise import components
 from pkmcal.papers import linear
 from pkmcal.solver import elimination
-from pkmcal.solver.elimination import condensed, stacked
+from pkmcal.solver.elimination import condensed, rows_on_shared
 from test_identify_scene import make_scene
 
 CONFIGURATIONS = 7
@@ -28,7 +28,7 @@ def in_pieces(monkeypatch):
     """Afterwards two configurations, or runs, are worked on at once."""
 
     def begin(problem):
-        monkeypatch.setattr(elimination, "ROWS", 2 * problem.n_rows)
+        monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 2 * problem.n_rows)
 
     return begin
 
@@ -77,7 +77,7 @@ def test_the_rows_of_pieces_say_the_same(in_pieces):
     names = ("machine", "stations")
     whole = Information(problem, truth)
     rows, left = reduced_rows(whole, names)
-    every, value = stacked(whole.linear, whole.reduced)
+    every, value = rows_on_shared(whole.linear, whole.reduced)
     spectrum = identifiability(whole, machine).singular_values
     in_pieces(problem)
     pieces = Information(problem, truth)
@@ -94,7 +94,7 @@ def test_the_rows_of_pieces_say_the_same(in_pieces):
     np.testing.assert_allclose(again, spectrum, atol=1e-8 * spectrum[0])
 
 
-@pytest.mark.parametrize("n", [50, 5 * elimination.TALL + 7])
+@pytest.mark.parametrize("n", [50, 5 * elimination.TALL_BLOCK_ROWS + 7])
 def test_condensed_rows_say_the_same(n):
     rng = np.random.default_rng(0)
     rows, value = rng.normal(size=(2, n, 4)), rng.normal(size=(2, n))
@@ -122,5 +122,5 @@ def test_least_median_leg_after_leg(monkeypatch, noisy):
 
     whole = found()
     assert np.isfinite(whole).all()
-    monkeypatch.setattr(linear, "RESIDUALS", 1)
+    monkeypatch.setattr(linear, "RESIDUALS_SORTED_TOGETHER", 1)
     np.testing.assert_array_equal(found(), whole)

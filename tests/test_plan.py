@@ -22,16 +22,16 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
-from pkmcal.planning.exchange import INDICES, exchanged, greedy
+from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
-from pkmcal.planning.plan import AT_WORK, plan
+from pkmcal.planning.plan import AT_WORK, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
-from pkmcal.planning.route import distances, length, shortest_way
-from pkmcal.planning.subject import of_machine, of_session
+from pkmcal.planning.route import length, motor_distances, shortest_way
+from pkmcal.planning.subject import of_machine, subject_of_session
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import INSIDE, draw_configurations, usable
+from pkmcal.simulation.placement import READING_RANGE_SHARES, draw_configurations, usable
 
 SIZE = (640, 480)
 
@@ -43,10 +43,10 @@ def hexapod(places=2, **more):
 
 def small(subject, monkeypatch, **more):
     """A plan among few candidates, for tests' time."""
-    monkeypatch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
+    monkeypatch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
     monkeypatch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-    monkeypatch.setattr("pkmcal.planning.plan.BETTERED", 1)
-    return plan(subject, count=5, **more)
+    monkeypatch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
+    return plan_measurements(subject, count=5, **more)
 
 
 # ------------------------------------------------------------------ the promise
@@ -98,7 +98,7 @@ def test_configurations_are_possible_and_their_way_is_short(monkeypatch):
     found = small(hexapod(), monkeypatch)
     machine = found.subject.rig.machine
     low, high = machine.joint_ranges.T
-    margin = INSIDE[0] * (high - low) - 1e-9
+    margin = READING_RANGE_SHARES[0] * (high - low) - 1e-9
     assert np.all(found.joints >= low + margin)
     assert np.all(found.joints <= high - margin)
     assert usable(machine, found.T_base_platform, found.joints).all()
@@ -130,12 +130,12 @@ def toy(seed=0, n=14, p=3):
     return CandidateRows(rows, np.zeros(n, int), where, known, machine, rng.normal(size=(5, 6, p)))
 
 
-@pytest.mark.parametrize("name", list(INDICES))
+@pytest.mark.parametrize("name", list(PLAN_INDICES))
 def test_exchange_comes_near_the_best_of_all_subsets(name):
     better = []
     for seed in range(4):
         info = toy(seed)
-        index = INDICES[name](info)
+        index = PLAN_INDICES[name](info)
         every = [
             float(index.value(info.covariance(info.of(np.array(c)))))
             for c in itertools.combinations(range(14), 4)
@@ -152,7 +152,7 @@ def test_exchange_comes_near_the_best_of_all_subsets(name):
 def test_a_tie_is_decided_by_the_variance():
     """Two rows leave one of three directions as the drawing has it, whichever two they are."""
     info = toy(0)
-    index = INDICES["E"](info)
+    index = PLAN_INDICES["E"](info)
     first = greedy(info, 1, index).chosen
     variance = [np.trace(info.covariance(info.of(np.array([c])))) for c in range(14)]
     assert first == [np.argmin(variance)]
@@ -164,17 +164,17 @@ def test_no_configuration_is_measured_twice():
     rows[0:2] *= 50.0  # by far the best, and the same twice
     where = np.repeat(np.arange(7.0), 2)[:, None] + np.tile([0.0, 0.05], 7)[:, None]
     info = replace(info, rows=rows, where=where)
-    index = INDICES["D"](info)
+    index = PLAN_INDICES["D"](info)
     chosen = greedy(info, 5, index).chosen
     for found in (chosen, exchanged(info, chosen, index)):
         assert len(set(found // 2)) == 5
         assert 0 in found // 2
 
 
-@pytest.mark.parametrize("name", list(INDICES))
+@pytest.mark.parametrize("name", list(PLAN_INDICES))
 def test_slopes_are_the_indices_derivatives(name):
     info = toy(1)
-    index = INDICES[name](info)
+    index = PLAN_INDICES[name](info)
     covariance = info.covariance(info.of(np.arange(6)))
     change = np.random.default_rng(0).normal(size=covariance.shape)
     change, step = change + change.T, 1e-6
@@ -186,7 +186,7 @@ def test_slopes_are_the_indices_derivatives(name):
 
 def test_the_greedy_path_is_that_of_its_choice():
     info = toy(2)
-    found = greedy(info, 5, INDICES["tool"](info))
+    found = greedy(info, 5, PLAN_INDICES["tool"](info))
     for k in range(1, 6):
         whole = info.covariance(info.of(found.chosen[:k]))
         np.testing.assert_allclose(found.path[k - 1], whole, rtol=1e-9, atol=1e-12)
@@ -236,7 +236,7 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
 
 
 def test_places_stand_apart_and_better_one_alone(monkeypatch):
-    monkeypatch.setattr("pkmcal.planning.candidates.AROUND", 6)
+    monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_PLACES_A_RING", 6)
     monkeypatch.setattr("pkmcal.planning.plan.FOR_PLACES", 8)
     found = small(hexapod(1), monkeypatch, free_places=2)
     chosen = [tried for tried in found.tried if tried.chosen]
@@ -268,7 +268,7 @@ def test_a_board_is_seen_from_its_face_only():
 @settings(max_examples=30, deadline=None)
 def test_the_way_is_nearly_the_shortest(n, seed):
     joints = np.random.default_rng(seed).random((n, 3))
-    apart = distances(joints, np.tile([0.0, 1.0], (3, 1)))
+    apart = motor_distances(joints, np.tile([0.0, 1.0], (3, 1)))
     first = np.abs(joints - 0.5).max(axis=1)
     way = shortest_way(apart, first)
     assert sorted(way) == list(range(n))
@@ -278,7 +278,7 @@ def test_the_way_is_nearly_the_shortest(n, seed):
 
 def test_barred_steps_are_avoided():
     joints = np.arange(6.0)[:, None]
-    apart = distances(joints, np.array([[0.0, 5.0]]))
+    apart = motor_distances(joints, np.array([[0.0, 5.0]]))
     barred = np.zeros((6, 6), dtype=bool)
     barred[2, 3] = barred[3, 2] = True
     way = shortest_way(apart, None, barred)
@@ -389,7 +389,7 @@ def test_a_hand_held_session_is_not_planned(demo):
     session = load_session(demo.session)
     stations = tuple(replace(s, handheld=True) for s in session.stations)
     with pytest.raises(InputError, match="no place to come back to"):
-        of_session(replace(session, stations=stations))
+        subject_of_session(replace(session, stations=stations))
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved import load
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -128,7 +128,7 @@ def folder(tmp_path):
 @pytest.mark.parametrize("name", ["gough-stewart", "6-rus", "h4", "3-upu", "delta"])
 def test_whole_poses_calibrate_any_machine(folder, name):
     made = make(folder, name)
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     s = result.estimate.statistics
     # of n numbers that are noise, the root mean square has the deviation 1 / sqrt(2 n)
     assert s.pose_scale < 1 + 4 / np.sqrt(2 * s.dof_poses)
@@ -141,7 +141,7 @@ def test_whole_poses_calibrate_any_machine(folder, name):
 def test_stations_and_targets_are_found_with_their_deviations(folder):
     """In frames that do not matter: from the tracker to the target at each configuration."""
     made = make(folder, "gough-stewart", seed=3)
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     state = result.estimate.state
     found = state.T_camera_base[0] @ state.T_base_platform @ state.T_mount[0]
     error = rotation_vector((inverse(found) @ seen_poses(made))[:, :3, :3])
@@ -153,7 +153,7 @@ def test_stations_and_targets_are_found_with_their_deviations(folder):
 
 def test_points_alone(folder):
     made = make(folder, "gough-stewart", "points", n=40)
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     assert result.estimate.statistics.n_poses == 120
     assert tool_error(result.machine, made) < 0.3 * tool_error(made.drawing, made)
 
@@ -162,7 +162,7 @@ def test_heights_of_a_flat_bed(folder):
     """A linear delta probed: its tilt and bulge go, what the bed does not tell is said."""
     target = pose(np.eye(3), np.array([0.0, 0.0, -0.04]))
     made = make(folder, "linear-delta", "heights", n=20, station=target)
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     s = result.estimate.statistics
     assert s.n_poses == 20
     assert s.pose_scale < 1.6
@@ -183,7 +183,7 @@ def test_outliers_are_let_go_and_named(folder):
     seen[7] = perturb(seen[7], np.array([0, 0, 0, 0.004, 0, 0.0]))
     seen[20] = perturb(seen[20], np.array([0, 0.02, 0, 0, 0, 0.0]))
     write_poses(folder, seen)
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     assert np.flatnonzero(result.estimate.pose_weights < 0.5).tolist() == [7, 20]
     told = [r for r in result.observation.rejected if r.configuration in (7, 20)]
     assert all("standard deviations from where all others put it" in r.reason for r in told)
@@ -196,24 +196,24 @@ def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
     assert "design" in text.models
     document = (folder / "session.yaml").read_text().replace("mechanism.yaml", "h4")
     (folder / "session.yaml").write_text(document)
-    poor = calibrate(load_session(folder, "design"))
+    poor = calibrate_session(load_session(folder, "design"))
     assert not poor.verdict.usable
     assert any("--model calibration they fit" in reason for reason in poor.verdict.reasons)
-    rich = calibrate(load_session(folder, "calibration"))
+    rich = calibrate_session(load_session(folder, "calibration"))
     assert rich.verdict.usable
     assert tool_error(rich.machine, made) < 0.2 * tool_error(poor.machine, made)
 
 
 def test_inverse_kinematic_is_a_method(folder, monkeypatch):
-    monkeypatch.setattr(methods, "REPETITIONS", 12)  # of its deviations nothing is asked
+    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 12)  # of its deviations nothing is asked
     made = make(folder, "h4", n=30)
-    result = calibrate(folder, method="inverse-kinematic")
+    result = calibrate_session(folder, method="inverse-kinematic")
     assert tool_error(result.machine, made) < 0.1 * tool_error(made.drawing, made)
 
 
 def test_everything_is_saved_and_read_back(folder, tmp_path):
     make(folder, "h4")
-    result = calibrate(folder)
+    result = calibrate_session(folder)
     save(result, tmp_path / "out")
     document = load(tmp_path / "out").document
     assert document["targets"][0]["name"] == "tracker"
@@ -235,7 +235,7 @@ def test_a_target_moved_on_the_platform(folder):
     seen[18:] = seen[18:] @ step
     write_poses(folder, seen)
     with pytest.raises(InputError, match="between configuration 017 and 018"):
-        calibrate(folder)
+        calibrate_session(folder)
 
 
 def test_one_wrong_reading_is_outvoted_and_told(folder):
@@ -243,7 +243,7 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     joints = made.joints.copy()
     joints[7, 2] += 0.02
     write_joints(folder, joints)
-    found = calibrate(folder)
+    found = calibrate_session(folder)
     assert tool_error(found.machine, made) < 1.5e-4
     (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
     assert "The reading of motor3 in configuration 007 is off" in told
@@ -251,14 +251,14 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     assert "less" in told
     (folder / "joints.csv").unlink()
     write_joints(folder, made.joints)
-    right = calibrate(folder).verdict
+    right = calibrate_session(folder).verdict
     assert not [text for text in right.warnings if "outvoted" in text]
 
 
 def test_exchanged_rows_are_outvoted_and_told(folder):
     made = make(folder, "h4", n=30)
     write_joints(folder, made.joints[[*range(11), 20, *range(12, 20), 11, *range(21, 30)]])
-    found = calibrate(folder)
+    found = calibrate_session(folder)
     assert tool_error(found.machine, made) < 1.5e-4
     (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
     assert "joints.csv, configuration 011 and 020: what was seen in 011 is what" in told
@@ -270,7 +270,7 @@ def test_a_pose_under_another_name_is_told(folder):
     seen = seen_poses(made)
     seen[4] = seen[17]
     write_poses(folder, seen)
-    found = calibrate(folder)
+    found = calibrate_session(folder)
     (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
     assert "configuration 004: what was seen in 004 is what the readings of 017 say" in told
 
@@ -282,7 +282,7 @@ def test_a_frozen_reading(folder, name):
     joints[:, 1] = joints[0, 1]
     write_joints(folder, joints)
     with pytest.raises(InputError, match="the readings of motor2 are frozen"):
-        calibrate(folder)
+        calibrate_session(folder)
 
 
 @pytest.mark.parametrize("motor", [0, 2])
@@ -293,7 +293,7 @@ def test_the_sign_of_one_encoder(folder, motor):
     joints[:, motor] *= -1
     write_joints(folder, joints)
     with pytest.raises(InputError, match=f"the readings of motor{motor + 1} have the wrong sign"):
-        calibrate(folder)
+        calibrate_session(folder)
     assert "range" in text
 
 
@@ -301,7 +301,7 @@ def test_two_columns_exchanged(folder):
     made = make(folder, "h4", n=16)
     write_joints(folder, made.joints[:, [1, 0, 2, 3]])
     with pytest.raises(InputError, match="motor1 and motor2 are exchanged"):
-        calibrate(folder)
+        calibrate_session(folder)
 
 
 def test_readings_in_degrees(folder):
@@ -317,7 +317,7 @@ def test_lengths_of_another_scale(folder):
     seen = seen_poses(made)
     seen[:, :3, 3] *= 1.05
     write_poses(folder, seen)
-    verdict = calibrate(folder).verdict
+    verdict = calibrate_session(folder).verdict
     assert not verdict.usable
     assert any("All of the machine came out" in reason for reason in verdict.reasons)
 

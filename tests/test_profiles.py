@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pkmcal.observe.profiles import (
-    SATURATED,
-    SHIFTS,
+    EDGE_SHIFTS,
+    SATURATED_GREY_LEVEL,
     Profiles,
     cut_of,
     estimate_blur,
@@ -125,7 +125,7 @@ def make(
         grey.append(samples.mean(axis=0))
         truth.append(shift)
         widths.append(limb.half_width)
-        clipped.append(np.any(samples >= SATURATED, axis=0))
+        clipped.append(np.any(samples >= SATURATED_GREY_LEVEL, axis=0))
     counts, widths = np.full(number, float(count)), np.array(widths)
     cut = cut_of(np.array(clipped), widths)
     return Made(Profiles(np.array(grey), counts, widths, cut), np.array(truth))
@@ -147,7 +147,7 @@ def rms(values):
 def located(profiles, blur):
     """Positions of profiles each by itself: about the trial position that leaves least."""
     curves = residual_curves(profiles, blur)
-    return locate(profiles, curves, SHIFTS[curves.argmin(axis=-1)])
+    return locate(profiles, curves, EDGE_SHIFTS[curves.argmin(axis=-1)])
 
 
 BRIGHT_TUBE = {"albedo": (120, 230), "ground": (20, 60)}

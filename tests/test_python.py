@@ -242,7 +242,7 @@ def test_residuals_of_a_file_are_those_of_the_result(result, loaded):
 
 
 def test_nothing_seen_is_no_plot_of_nothing(axes):
-    assert "no edges" in plots.residuals(np.zeros(0), axes).get_title()
+    assert "no edges" in plots.draw_residuals(np.zeros(0), axes).get_title()
 
 
 # functions

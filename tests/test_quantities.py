@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from faults import fault
 from pkmcal.errors import InputError
-from pkmcal.files import Metres, Radians, Reading, Share, read_csv, with_unit
+from pkmcal.files import Metres, Radians, Reading, Share, read_csv, written_unit
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
 
 INCH = 0.0254
@@ -44,7 +44,7 @@ def test_millimetres_are_metres_to_the_last_digit(number, blank):
 )
 def test_units_that_people_write(kind, text, value):
     assert TypeAdapter(kind).validate_python(text, strict=True) == pytest.approx(value, rel=1e-15)
-    assert with_unit(text) is not None
+    assert written_unit(text) is not None
 
 
 def scaled(node, where, path=()):

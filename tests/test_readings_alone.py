@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.commands.cli import app
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import csv_text, parse_yaml, validate, yaml_text
+from pkmcal.files import csv_text, parse_yaml, validated_document, yaml_text
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
-from pkmcal.judge.watch import watch
+from pkmcal.judge.watch import watch_machine
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,
@@ -42,7 +42,9 @@ def four_rpr():
     length: {actuated: true, offset: 0.0, range: [0.15, 0.36]}
 """
     text = text.replace("tolerance:", leg + "tolerance:")
-    return machine_from_document(validate(parse_yaml(text, Path("4-rpr.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("4-rpr.yaml")), MechanismDocument)
+    )
 
 
 def seven_legs():
@@ -53,7 +55,9 @@ def seven_legs():
     length: {actuated: true, offset: 0.0, range: [0.25, 0.45]}
 """
     text = text.replace("tolerance:", leg + "tolerance:")
-    return machine_from_document(validate(parse_yaml(text, Path("7-legs.yaml")), MechanismDocument))
+    return machine_from_document(
+        validated_document(parse_yaml(text, Path("7-legs.yaml")), MechanismDocument)
+    )
 
 
 def readings(machine, n, rng):
@@ -195,7 +199,7 @@ def test_a_session_of_readings_is_calibrated_from_the_command_line(belts):
 
 def test_new_readings_tell_whether_the_machine_changed(belts, tmp_path):
     folder, truth = belts
-    save(calibrate(folder), tmp_path / "out")
+    save(calibrate_session(folder), tmp_path / "out")
     rng = np.random.default_rng(6)
     verdicts = []
     for shift in (0.0, 0.01):
@@ -204,7 +208,7 @@ def test_new_readings_tell_whether_the_machine_changed(belts, tmp_path):
         joints = readings(truth.with_values(values), 10, rng)
         joints = joints + NOISE * rng.standard_normal(joints.shape)
         new = write(tmp_path / f"new{shift}", load_mechanism("four-belt"), joints, NOISE / 10)
-        verdicts.append(watch(tmp_path / "out", new).verdict.usable)
+        verdicts.append(watch_machine(tmp_path / "out", new).verdict.usable)
     assert verdicts == [True, False]
 
 
@@ -220,8 +224,8 @@ def test_repeats_of_a_pose_count_once(tmp_path):
     np.testing.assert_allclose(session.joints, again.reshape(20, 4, 4).mean(axis=1), atol=1e-15)
     (told,) = session.warnings
     assert "80 rows are of 20 poses" in told
-    once = calibrate(write(tmp_path / "once", drawing, joints, NOISE)).estimate
-    found = calibrate(session).estimate
+    once = calibrate_session(write(tmp_path / "once", drawing, joints, NOISE)).estimate
+    found = calibrate_session(session).estimate
     sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, found)]
     assert sigma[1] == pytest.approx(sigma[0], rel=0.1)
 
@@ -241,7 +245,7 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
     drawing, rng = load_mechanism("four-belt"), np.random.default_rng(8)
     joints = readings(drawing, 20, rng)
     joints = joints + 0.01 * rng.standard_normal(joints.shape)
-    found = calibrate(write(tmp_path / "wild", drawing, joints, NOISE))
+    found = calibrate_session(write(tmp_path / "wild", drawing, joints, NOISE))
     assert not found.verdict.usable
     assert any("may belong to other configurations" in text for text in found.verdict.reasons)
 
@@ -249,16 +253,16 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
 def test_what_needs_a_camera_says_so(belts):
     folder, _ = belts
     with pytest.raises(ResultError, match="four steps need photographs"):
-        calibrate(folder, method="four-step")
+        calibrate_session(folder, method="four-step")
     with pytest.raises(InputError, match="no station has a camera"):
-        calibrate(folder, refine_camera=True)
+        calibrate_session(folder, refine_camera=True)
     with pytest.raises(ResultError, match="readings are not predicted from themselves"):
-        outcome_of(calibrate(folder, holdout=5))
+        outcome_of(calibrate_session(folder, holdout=5))
     with pytest.raises(InputError, match="no station to plan for"):
         load_session(folder, measured=False)
 
 
 def test_the_page_holds_no_section_of_cameras(belts):
-    page = page_html(outcome_of(calibrate(belts[0])))
+    page = page_html(outcome_of(calibrate_session(belts[0])))
     assert "Where the cameras stood" not in page
     assert "χ² of the readings" in page

@@ -14,7 +14,7 @@ from pkmcal.files import staged_file
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.observe.images import decode
 from pkmcal.report import rrd
-from pkmcal.report.recording import CORNER, GREY, recorded
+from pkmcal.report.recording import RECORDED_GREY, VIEWER_PIXEL_CORNER, recorded
 
 LOUD = "NO RERUN: recordings were not written and read by it (pip install 'pkmcal[rerun]')"
 NEAR, MIDDLE = 1.0, 0.15
@@ -132,7 +132,7 @@ def test_edges_put_aside_are_apart(calibrated):
     at = edges.configuration[n] + 1
     aside = of(entries, *image(station, "aside"), at=at).values
     assert len(aside["strips"]) == 1
-    assert aside["colours"] == [GREY]
+    assert aside["colours"] == [RECORDED_GREY]
     (label,) = aside["labels"]
     assert label.startswith(f"leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}")
     assert label.endswith("weight 0.20")
@@ -273,4 +273,4 @@ def test_rerun_reads_what_was_recorded(calibrated, entries, tmp_path):
     (pinhole,) = rows[f"/machine/cameras/{name}/image"]
     k = np.array(pinhole["Pinhole:image_from_camera"][0]).reshape(3, 3).T  # columns first
     centre = calibrated.session.stations[0].camera.parameters[2:4]
-    np.testing.assert_allclose(k[:2, 2], centre + CORNER, atol=1e-4)
+    np.testing.assert_allclose(k[:2, 2], centre + VIEWER_PIXEL_CORNER, atol=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.calibrate import Calibration, calibrate
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.repeats import (
     Cylinders,
     RepeatStudy,
@@ -22,7 +22,7 @@ from pkmcal.calibration.repeats import (
     require_repeats,
     study_repeats,
 )
-from pkmcal.commands.comparison import compare
+from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -378,11 +378,11 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
     shutil.copytree(repeats, single)
     for path in single.glob("images/*/*_[234].png"):
         path.unlink()
-    one, four = calibrate(single), looked.calibration
+    one, four = calibrate_session(single), looked.calibration
     sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
     known = sigma[0] > 1e-9
     assert 0.7 < np.median(sigma[1][known] / sigma[0][known]) < 1.1
-    result = compare(four, repeats)
+    result = compare_with_truth(four, repeats)
     assert result.within / result.count > 0.85
     edges = four.observation.edges
     assert len(same_edges(edges).first) == len(edges)
@@ -402,11 +402,11 @@ def looked(repeats):
     made: list[Calibration] = []
 
     def once(*words, **more):
-        made.append(calibrate(*words, **more))
+        made.append(calibrate_session(*words, **more))
         return made[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.repeats.calibrate", once)
+        patch.setattr("pkmcal.calibration.repeats.calibrate_session", once)
         study = study_repeats(repeats)
     (calibration,) = made
     return Looked(study, calibration)

@@ -21,7 +21,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.pages import drawn
 from pkmcal.pages.charts import enlargement, ticks_between
-from pkmcal.pages.drawn import CURVE, STRAIGHT
+from pkmcal.pages.drawn import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from test_report_case import OUTWARD, RADIUS, Case, calibration, edges_of, make_case
@@ -207,7 +207,7 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
     assert len(edges) > 15
     for n, curve in enumerate(curves):
         leg, radius = edges.leg[n], np.array(RADIUS[int(edges.tube[n])])
-        along = np.linspace(*edges.span[n], CURVE)
+        along = np.linspace(*edges.span[n], EDGE_CURVE_POINTS)
         seen = contour_point(legs.a[leg], legs.u[leg], edges.normal[n], radius, along)
         np.testing.assert_allclose(curve, T.project(seen), atol=1e-6)
 
@@ -289,23 +289,25 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
     at = np.linspace(0, len(line.points) - 1, 4000)
     x, y = (np.interp(at, range(len(line.points)), c) for c in zip(*line.points, strict=True))
     away = np.hypot(curve[:, :1] - x, curve[:, 1:] - y).min(axis=1)
-    assert away[1:-1].max() < STRAIGHT
+    assert away[1:-1].max() < STRAIGHT_CURVE_DEVIATION
     assert "too dark" in shots["front1", "c3"].caption
 
 
 def test_as_many_pictures_are_shown_as_there_is_room_for(case, monkeypatch):
-    monkeypatch.setattr(pictures, "MOST", 7)
+    monkeypatch.setattr(pictures, "MOST_PHOTOGRAPHS_SHOWN", 7)
     html = str(pictures.section(case.session, album_of(case)).html)
     assert "Here are 7 of 15 photographs" in html
     assert html.count('<figure class="picture"') == html.count("data-large=") == 7
     whole = sum(len(shot.jpeg) + len(shot.large) for shot in album_of(case).pictures)
     small = sum(len(shot.jpeg) for shot in album_of(case).pictures)
-    monkeypatch.setattr(pictures, "ROOM", (whole + small) // 2)
+    monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", (whole + small) // 2)
     shown = album_of(case).pictures
     assert len(shown) == 7
     assert 0 < sum(bool(shot.large) for shot in shown) < 7
-    assert sum(len(shot.jpeg) + len(shot.large) for shot in shown) <= pictures.ROOM
-    monkeypatch.setattr(pictures, "ROOM", small // 2)
+    assert (
+        sum(len(shot.jpeg) + len(shot.large) for shot in shown) <= pictures.JPEG_CHARACTERS_A_PAGE
+    )
+    monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", small // 2)
     assert 0 < len(album_of(case).pictures) < 7
 
 

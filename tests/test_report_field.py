@@ -74,16 +74,16 @@ def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
 def test_edges_are_off_by_what_they_were_shifted(case):
     none, no_pixel = np.zeros(0, dtype=int), np.zeros((0, 2))
     corners = BoardCorners(none, none, none, none, no_pixel, no_pixel, none.astype(bool))
-    found = field.offsets(case.session, case.observation.edges, case.estimate, corners)
+    found = field.field_offsets(case.session, case.observation.edges, case.estimate, corners)
     kept = int(np.sum(case.estimate.edge_weights >= 0.5))
-    assert len(found.value) == kept * len(field.ALONG)
+    assert len(found.value) == kept * len(field.FIELD_EDGE_FRACTIONS)
     # the camera's own constant shift is taken out; the two sides of a leg lie off in opposite ways
     side = case.observation.edges.side[found.thing]
     np.testing.assert_allclose(found.value, np.where(side == 0, OUTWARD, -OUTWARD), atol=2e-3)
 
 
 def test_correlations_are_those_of_the_covariance(case):
-    part = parameters.together(case.estimate)
+    part = parameters.correlations_part(case.estimate)
     assert part is not None
     (heat,) = part.plots[0].figure["data"]
     rho = np.asarray(heat["z"])

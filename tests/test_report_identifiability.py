@@ -12,7 +12,7 @@ from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
-from pkmcal.report.identifiability import STUB, headline, held, spectrum, tied
+from pkmcal.report.identifiability import STUB_BAR_HEIGHT, directions_headline, held, spectrum, tied
 from test_report_case import make_case, report_html
 from test_report_page import Found
 from test_words import heaved, make, told_of
@@ -72,8 +72,10 @@ def test_the_section_stands_on_the_page(case, apart):
 def test_a_whole_session_has_nothing_to_list():
     findings = findings_of(make("gough-stewart"))
     table = load_mechanism("gough-stewart").parameters
-    assert headline(findings).startswith("The data fix 42 of 42 directions (")
-    assert headline(findings).endswith("Each is known better from the data than from the drawing.")
+    assert directions_headline(findings).startswith("The data fix 42 of 42 directions (")
+    assert directions_headline(findings).endswith(
+        "Each is known better from the data than from the drawing."
+    )
     assert findings.unidentified == findings.weak == ()
     assert (held(findings, table), tied(table)) == ("", "")
 
@@ -83,7 +85,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     assert drawn is not None
     bars = drawn.bars
     assert len(bars) == 42
-    assert [bar.value > STUB for bar in bars] == [True] * 34 + [False] * 8
+    assert [bar.value > STUB_BAR_HEIGHT for bar in bars] == [True] * 34 + [False] * 8
     assert bars[-1].tip == "Direction 42: the data say nothing"
     assert not bars[-1].quiet
     assert bars[0].quiet

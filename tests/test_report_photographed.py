@@ -36,13 +36,13 @@ def points(trace) -> np.ndarray:
 def test_tubes_lie_about_their_legs_in_every_pose(case):
     _, plot = figure(case)
     machine, poses = case.estimate.machine, case.estimate.state.T_base_platform
-    limbs = photographed.limbs_of(machine, case.session.joints, poses)
+    limbs = photographed.posed_limbs(machine, case.session.joints, poses)
     assert [frame["name"] for frame in plot.frames] == list(case.session.configurations)
     for k, frame in enumerate(plot.frames):
         for leg, trace in enumerate(frame["data"][:6]):
             a, b = limbs.a[k, leg], limbs.b[k, leg]
             u = (b - a) / np.linalg.norm(b - a)
-            rings = points(trace).reshape(2, 2, photographed.AROUND, 3)
+            rings = points(trace).reshape(2, 2, photographed.TUBE_RING_CORNERS, 3)
             along = (rings - a) @ u
             away = np.linalg.norm(rings - a - along[..., None] * u, axis=-1)
             for tube, drawn in enumerate(machine.document.legs[leg].tubes):
@@ -55,8 +55,8 @@ def test_a_crank_is_drawn_with_its_arm():
     machine = load_mechanism("h4")
     pose = machine.home()
     joints = machine.inverse(pose[None])
-    limbs = photographed.limbs_of(machine, joints, pose[None])
-    turned = photographed.limbs_of(machine, joints + 0.1, pose[None])
+    limbs = photographed.posed_limbs(machine, joints, pose[None])
+    turned = photographed.posed_limbs(machine, joints + 0.1, pose[None])
     for leg, arm in enumerate(limbs.arms):
         np.testing.assert_allclose(arm[0, -1], limbs.a[0, leg])
         # the motor's axis stays, and the arm about it turns with the reading
@@ -136,7 +136,7 @@ def test_all_that_is_drawn_is_in_the_picture(case, scale):
 
 
 def test_many_poses_are_thinned_and_that_is_said(case, monkeypatch):
-    monkeypatch.setattr(photographed, "MOST", 3)
+    monkeypatch.setattr(photographed, "MOST_SLIDER_POSES", 3)
     plot = figure(case)[1]
     assert [frame["name"] for frame in plot.frames] == ["c0", "c2", "c4"]
     assert "3 poses of 5, evenly chosen" in plot.caption

@@ -18,10 +18,16 @@ from pkmcal.pages.page import page_html
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies import engine, reproduction
 from pkmcal.studies import paper_a_expected as expected
-from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
+from pkmcal.studies.paper_a import (
+    FOUR_STEPS_PRINTED,
+    PAPER_A_BOUND,
+    PAPER_A_JOINT,
+    PAPER_A_METHODS,
+    HexapodByAxes,
+)
 from pkmcal.studies.paper_a_photographs import MeasuredNoise
 from pkmcal.studies.paper_a_report import table_1
-from pkmcal.studies.reproduction import PAPERS, Compared, Options, Words, reproduce
+from pkmcal.studies.reproduction import REPRODUCED_PAPERS, Compared, Options, Words, reproduce_paper
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
 from test_report_page import Found, browse
@@ -40,7 +46,7 @@ def short():
 
 @pytest.fixture(scope="module")
 def found():
-    return reproduce("a", Options(runs=RUNS))
+    return reproduce_paper("a", Options(runs=RUNS))
 
 
 @pytest.fixture(scope="module")
@@ -61,16 +67,18 @@ def test_the_command(tmp_path):
     a = result["papers"]["a"]
     assert a == json.loads((out / "paper-a.json").read_text())
     assert (a["runs"], a["seed"], a["converged"]) == (RUNS, 0, RUNS)
-    assert set(a["methods"]) == set(METHODS)
-    joint = a["methods"][JOINT]
+    assert set(a["methods"]) == set(PAPER_A_METHODS)
+    joint = a["methods"][PAPER_A_JOINT]
     assert 5e-5 < joint["found"]["displacement"] < 1.4e-4
     assert joint["standard_error"]["displacement"] < 2e-5
-    assert len(a["mean_error"][JOINT]) == 30
+    assert len(a["mean_error"][PAPER_A_JOINT]) == 30
     assert a["seconds"]["cpu"] > 0
 
 
 def test_in_words(tmp_path, monkeypatch, found):
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: found)
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+    )
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 0
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
@@ -82,7 +90,7 @@ def test_in_words(tmp_path, monkeypatch, found):
     assert "…" not in done.out
 
 
-@pytest.mark.parametrize("letter", PAPERS)
+@pytest.mark.parametrize("letter", REPRODUCED_PAPERS)
 def test_a_headline_says_what_is_reproduced_and_what_is_not(letter):
     words = read_yaml(Path(reproduction.__file__).with_name(f"paper_{letter}.yaml")).data
     assert words["headline"].startswith("Reproduced: ")
@@ -101,7 +109,9 @@ def test_what_is_not_reproduced_is_no_green_sign(found, page, tmp_path, monkeypa
         "Not reproduced: 0.08 mm by the paper's four steps as printed",
         "Not reproduced: 1 mm before calibration",
     ]
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: found)
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+    )
     done = run("reproduce", "-o", tmp_path)
     assert "\n! Reproduced: the end-effector" in done.out
     assert "\n! Not reproduced: 0.08 mm" in done.out
@@ -124,14 +134,14 @@ def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
 def test_few_runs_that_miss_are_told_to_be_more(monkeypatch, found):
     failed = replace(found, verdict=replace(found.verdict, usable=False))
     monkeypatch.setattr("pkmcal.studies.paper_a_report.reproduce", lambda _options: failed)
-    assert reproduce("a", Options(runs=100)).verdict.advice == ()
-    (advice,) = reproduce("a", Options(runs=8)).verdict.advice
+    assert reproduce_paper("a", Options(runs=100)).verdict.advice == ()
+    (advice,) = reproduce_paper("a", Options(runs=8)).verdict.advice
     assert advice.startswith("8 runs are few")
     assert advice.endswith("simulate 100 or more.")
 
 
 def test_another_seed_draws_anew():
-    first, again, other = (study(runs=3, seed=seed).of(JOINT) for seed in (1, 1, 2))
+    first, again, other = (study(runs=3, seed=seed).of(PAPER_A_JOINT) for seed in (1, 1, 2))
     assert first == again != other
 
 
@@ -142,7 +152,9 @@ def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
     verdict = replace(found.verdict, usable=False, reasons=(bad.sentence,))
     failed = replace(found, verdict=verdict, stamp="Not reproduced", parts=(part,))
     failed.document["passed"] = False
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: failed)
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: failed
+    )
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 1
     assert "✗ " + bad.sentence[:40] in done.out
@@ -164,7 +176,9 @@ def test_refuses(words, said, tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked")
+    )
     (tmp_path / "file").touch()
     done = run("reproduce", "-o", tmp_path / "file" / "out")
     assert done.code == 2
@@ -173,7 +187,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monke
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
     monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce", lambda *_: pytest.fail("worked first")
+        "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked first")
     )
     (tmp_path / "thesis.tex").write_text("mine")
     done = run("reproduce", "a", "-o", tmp_path)
@@ -181,15 +195,15 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
     assert "something other than reproductions; found thesis.tex" in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda *_: found)
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce_paper", lambda *_: found)
     assert run("reproduce", "a", "-o", tmp_path).code == 0
 
 
 def test_every_paper_of_the_command_has_its_module():
     from importlib import import_module
 
-    assert tuple(paper.value for paper in Paper) == PAPERS
-    for paper in PAPERS:
+    assert tuple(paper.value for paper in Paper) == REPRODUCED_PAPERS
+    for paper in REPRODUCED_PAPERS:
         assert callable(import_module(f"pkmcal.studies.paper_{paper}_report").reproduce)
 
 
@@ -197,15 +211,15 @@ def test_every_paper_of_the_command_has_its_module():
 
 
 def test_every_figure_of_the_prototype_is_compared(short):
-    figures = expected.figures_compared(short)
+    figures = expected.paper_a_figures(short)
     assert len(figures) == 4 * 5 + 3 * 2
     assert all(f.found.error >= 0 and f.rounding > 0 for f in figures)
     assert all(f.tolerable for f in figures)
     by_name = {(*f.key, f.quantity): f for f in figures}
-    assert by_name[JOINT, "displacement"].expected == 0.091
-    assert by_name[JOINT, "displacement"].rounding == pytest.approx(0.0005)
-    assert by_name[PRINTED, "base_z"].rounding == pytest.approx(0.005)
-    assert by_name[BOUND, "base_z"].found.value == pytest.approx(0.060, abs=0.002)
+    assert by_name[PAPER_A_JOINT, "displacement"].expected == 0.091
+    assert by_name[PAPER_A_JOINT, "displacement"].rounding == pytest.approx(0.0005)
+    assert by_name[FOUR_STEPS_PRINTED, "base_z"].rounding == pytest.approx(0.005)
+    assert by_name[PAPER_A_BOUND, "base_z"].found.value == pytest.approx(0.060, abs=0.002)
 
 
 def test_what_differs_and_what_fails():
@@ -215,44 +229,44 @@ def test_what_differs_and_what_fails():
         allowed = expected.tolerance((method,), quantity)
         return Compared((method,), quantity, Summary(found, error), wanted, rounding, allowed)
 
-    offset = figure(JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
+    offset = figure(PAPER_A_JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
     assert not offset.differs
     assert offset._replace(found=Summary(0.0640, 0.0010)).differs
     assert offset._replace(found=Summary(0.0640, 0.0010)).tolerable
     assert not offset._replace(found=Summary(0.0780, 0.0010)).tolerable
     # what follows the drawing's error may differ more, nothing else
-    assert figure(PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005).tolerable
-    assert not figure(PRINTED, "base_xy", 2.3, 0.01, 1.79, 0.005).tolerable
+    assert figure(FOUR_STEPS_PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005).tolerable
+    assert not figure(FOUR_STEPS_PRINTED, "base_xy", 2.3, 0.01, 1.79, 0.005).tolerable
 
 
 def test_checks_pass_and_each_can_fail(short):
-    assert all(check.passed for check in expected.checks(short))
+    assert all(check.passed for check in expected.paper_a_checks(short))
 
     def of_joint(**changes):
-        own = short.of(JOINT)
+        own = short.of(PAPER_A_JOINT)
         changed = {name: own[name]._replace(value=value) for name, value in changes.items()}
-        return replace(short, accuracy={**short.accuracy, (JOINT,): {**own, **changed}})
+        return replace(short, accuracy={**short.accuracy, (PAPER_A_JOINT,): {**own, **changed}})
 
-    sample = short.samples[JOINT,]
+    sample = short.samples[PAPER_A_JOINT,]
     lost = {**sample.values, "chi2": np.append(sample.values["chi2"][1:], 100.0)}
     broken = [
-        replace(short, samples={**short.samples, (JOINT,): Sample(lost)}),
+        replace(short, samples={**short.samples, (PAPER_A_JOINT,): Sample(lost)}),
         of_joint(displacement=1.2e-4),
         of_joint(orientation=np.radians(0.019)),
-        of_joint(parameters=1.5 * short.of(JOINT)["parameters"].value),
-        of_joint(chi2=short.of(JOINT)["chi2"].value + 0.1),
+        of_joint(parameters=1.5 * short.of(PAPER_A_JOINT)["parameters"].value),
+        of_joint(chi2=short.of(PAPER_A_JOINT)["chi2"].value + 0.1),
         of_joint(offset=0.12e-3),
     ]
     for place, spoilt in enumerate(broken):
-        assert not expected.checks(spoilt)[place].passed, place
-        assert expected.checks(short)[place].passed
+        assert not expected.paper_a_checks(spoilt)[place].passed, place
+        assert expected.paper_a_checks(short)[place].passed
 
 
 def test_noise_larger_than_table_1_is_not_a_reproduction():
     """Angles three times as noisy: the end-effector and the prototype's figures are missed."""
     noise = AxisNoise(psi=3 * AxisNoise().psi, theta=3 * AxisNoise().theta)
     spoilt = study(runs=RUNS, noise=noise)
-    failed = [check.what for check in expected.checks(spoilt) if not check.passed]
+    failed = [check.what for check in expected.paper_a_checks(spoilt) if not check.passed]
     assert any("displacement" in what for what in failed)
     assert "figures of the independent prototype" in failed
 
@@ -272,7 +286,7 @@ def test_table_1_with_and_without_a_measurement():
 @pytest.mark.slow
 def test_table_1_on_photographs():
     """Edges to a few hundredths of a pixel; depth from the width of a leg, so far worse."""
-    found = reproduce("a", Options(runs=3, photographs=True)).document["table_1_measured"]
+    found = reproduce_paper("a", Options(runs=3, photographs=True)).document["table_1_measured"]
     assert 0.01 < found["edge_px"] < 0.08
     middle, worst = found["median"], found["worst"]
     assert all(middle[name] <= worst[name] for name in middle)
@@ -321,7 +335,7 @@ def test_the_page_runs_in_a_browser(page, tmp_path):
 @pytest.mark.slow
 def test_more_poses():
     """--long: as the square root of the poses, and as the prototype."""
-    found = reproduce("a", Options(runs=60, long=True))
+    found = reproduce_paper("a", Options(runs=60, long=True))
     by_poses = found.document["by_poses"]
     for poses, wanted in expected.PROTOTYPE_POSES.items():
         ours = 1e3 * by_poses[poses]["found"]["displacement"]

@@ -16,25 +16,32 @@ from pkmcal.pages.page import page_html
 from pkmcal.studies import engine, paper_b
 from pkmcal.studies import paper_b_expected as expected
 from pkmcal.studies.paper_b import (
-    CASES,
-    CONTROLLED,
-    JOINT,
-    MIRROR,
-    PERSPECTIVE,
-    PLAIN,
-    REGRESSIONS,
-    ROBUST,
-    SCALE,
-    VIEWS,
+    CONTROLLED_POPULATION,
+    MIRROR_VIEW,
+    PAPER_B_CASES,
+    PAPER_B_JOINT,
+    PAPER_B_REGRESSIONS,
+    PAPER_B_VIEW_NAMES,
+    PERSPECTIVE_VIEW,
+    PLAIN_REGRESSION,
+    ROBUST_REGRESSION,
+    SCALED_BY_SIMILARITY,
     HexapodByLegs,
     drawn_machine,
+    hexapod_with_cylinder_legs,
     seen,
     solved,
-    study_machine,
-    views,
+    views_by_name,
 )
-from pkmcal.studies.paper_b_control import BY_HAND, E1, E2, GOAL, START, controlled
-from pkmcal.studies.paper_b_report import reproduced
+from pkmcal.studies.paper_b_control import (
+    CAMERA_BY_HAND_ERRORS,
+    CONTROL_GOAL_READINGS,
+    CONTROL_START_READINGS,
+    E1,
+    E2,
+    controlled_by_estimates,
+)
+from pkmcal.studies.paper_b_report import paper_b_outcome
 
 RUNS = 16
 
@@ -46,45 +53,50 @@ def short():
 
 @pytest.fixture(scope="module")
 def ran(short):
-    return controlled(short.values("centres", CONTROLLED, CONTROLLED, ROBUST), 2006)
+    return controlled_by_estimates(
+        short.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION),
+        2006,
+    )
 
 
 @pytest.fixture(scope="module")
 def found(short, ran):
-    return reproduced(short, ran, 12.5)
+    return paper_b_outcome(short, ran, 12.5)
 
 
 # ------------------------------------------------------------------ the simulation
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", PAPER_B_VIEW_NAMES)
 def test_without_noise_every_method_is_exact(view, monkeypatch):
     monkeypatch.setattr(paper_b, "POINT_NOISE", 1e-7)
-    monkeypatch.setattr(paper_b, "READING", 1e-12)
+    monkeypatch.setattr(paper_b, "PAPER_B_READING_NOISE", 1e-12)
     rng = np.random.default_rng(3)
-    one = seen(drawn_machine(rng), views()[view], CASES["right"], rng)
-    for centres in solved(one, REGRESSIONS, rng).values():
+    one = seen(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
+    for centres in solved(one, PAPER_B_REGRESSIONS, rng).values():
         assert np.abs(centres - one.centres).max() < 1e-8
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", PAPER_B_VIEW_NAMES)
 def test_every_leg_is_seen_in_most_configurations(view):
     rng = np.random.default_rng(3)
-    one = seen(drawn_machine(rng), views()[view], CASES["right"], rng)
+    one = seen(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
     edges = one.measurements.edges
-    most = 2 * paper_b.CONFIGURATIONS
+    most = 2 * paper_b.PAPER_B_CONFIGURATIONS
     counts = np.bincount(edges.leg, minlength=6)
     assert counts.max() <= most
-    assert counts.min() > (0.99 if view == MIRROR else 0.5) * most  # front legs hide others
+    assert counts.min() > (0.99 if view == MIRROR_VIEW else 0.5) * most  # front legs hide others
     # limits of the workspace: every reading at an end of its range
-    off = np.abs(one.measurements.joints[..., None] - study_machine().joint_ranges).min(axis=-1)
+    off = np.abs(
+        one.measurements.joints[..., None] - hexapod_with_cylinder_legs().joint_ranges
+    ).min(axis=-1)
     assert off.max() < 1e-4
 
 
 def test_cases_are_what_they_say():
     truth = drawn_machine(np.random.default_rng(5))
     right, wrong, shifted, radius = (
-        seen(truth, views()[MIRROR], CASES[case], np.random.default_rng(6))
+        seen(truth, views_by_name()[MIRROR_VIEW], PAPER_B_CASES[case], np.random.default_rng(6))
         for case in ("right", "20 % wrong", "shifted", "radius")
     )
     off = np.linalg.norm(wrong.measurements.edges.normal - right.measurements.edges.normal, axis=-1)
@@ -92,37 +104,40 @@ def test_cases_are_what_they_say():
     # outward: n . A = -R becomes less, the leg looks thicker and so nearer
     edges = shifted.measurements.edges
     distance = np.sum(edges.normal * shifted.centres[edges.leg], axis=-1)
-    assert np.median(distance) < -paper_b.RADIUS - 5e-5
-    assert radius.machine.radii()[0][0] == pytest.approx(1.01 * paper_b.RADIUS)
-    assert truth.radii()[0][0] == paper_b.RADIUS
+    assert np.median(distance) < -paper_b.PAPER_B_LEG_RADIUS - 5e-5
+    assert radius.machine.radii()[0][0] == pytest.approx(1.01 * paper_b.PAPER_B_LEG_RADIUS)
+    assert truth.radii()[0][0] == paper_b.PAPER_B_LEG_RADIUS
 
 
 def test_a_wrong_radius_scales_the_machine(short):
-    for view in VIEWS:
-        key = (view, "radius", ROBUST)
+    for view in PAPER_B_VIEW_NAMES:
+        key = (view, "radius", ROBUST_REGRESSION)
         truth, centres = short.values("truth", *key), short.values("centres", *key)
         scale = np.sum(centres * truth) / np.sum(truth**2)
         assert scale == pytest.approx(1.01, abs=5e-4)
-        assert short.of(view, "radius", SCALE)["centre"].value < short.of(*key)["centre"].value / 2
+        assert (
+            short.of(view, "radius", SCALED_BY_SIMILARITY)["centre"].value
+            < short.of(*key)["centre"].value / 2
+        )
 
 
 # ------------------------------------------------------------------ control
 
 
 def test_what_is_believed_is_what_was_estimated(short, ran):
-    given = short.values("centres", CONTROLLED, CONTROLLED, ROBUST)
+    given = short.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION)
     np.testing.assert_allclose(ran.centres[E2], given, atol=1e-12)
-    drawing = study_machine().base_centers()
+    drawing = hexapod_with_cylinder_legs().base_centers()
     apart = np.linalg.norm(drawing[:, None] - drawing, axis=-1)
-    for name in (E1, *BY_HAND):
+    for name in (E1, *CAMERA_BY_HAND_ERRORS):
         told = ran.centres[name]
         found = np.linalg.norm(told[:, :, None] - told[:, None], axis=-1)
         np.testing.assert_allclose(found, np.broadcast_to(apart, found.shape), atol=1e-12)
-    true = inverse(views()[PERSPECTIVE].T_camera_base)
+    true = inverse(views_by_name()[PERSPECTIVE_VIEW].T_camera_base)
     believed = inverse(ran.trials["hand"].estimate.seen.T_camera_base)
     shift = np.linalg.norm(believed[:, :3, 3] - true[:3, 3], axis=-1)
     # three centimetres by hand, and what laying the drawing on the truth leaves
-    assert np.abs(shift - BY_HAND["hand"][0]).max() < 5e-3
+    assert np.abs(shift - CAMERA_BY_HAND_ERRORS["hand"][0]).max() < 5e-3
 
 
 def test_every_estimate_goes_the_same_way(ran):
@@ -136,8 +151,8 @@ def test_every_estimate_goes_the_same_way(ran):
 
 
 def test_checks_pass_and_each_can_fail(short, ran):
-    names = [check.what for check in expected.checks(short, ran)]
-    assert all(check.passed for check in expected.checks(short, ran))
+    names = [check.what for check in expected.paper_b_checks(short, ran)]
+    assert all(check.passed for check in expected.paper_b_checks(short, ran))
 
     def spoilt(value, *key, name="centre"):
         own = {**short.of(*key), name: short.of(*key)[name]._replace(value=value)}
@@ -150,25 +165,25 @@ def test_checks_pass_and_each_can_fail(short, ran):
     n = len(ran.centres[E2])
     late = replace(ran.trials[E1].runs, end=(*ran.trials[E1].runs.end[1:], End.STUCK))
     broken = [
-        (spoilt(2e-3, PERSPECTIVE, "right", ROBUST), ran),
-        (spoilt(1e-3, MIRROR, "35 % wrong", ROBUST), ran),
-        (spoilt(1e-3, MIRROR, "5 % wrong", PLAIN), ran),
-        (spoilt(20e-3, PERSPECTIVE, "shifted", ROBUST), ran),
-        (spoilt(1e-3, MIRROR, "shifted", JOINT), ran),
-        (spoilt(1e-5, PERSPECTIVE, "right", ROBUST, name="depth"), ran),
+        (spoilt(2e-3, PERSPECTIVE_VIEW, "right", ROBUST_REGRESSION), ran),
+        (spoilt(1e-3, MIRROR_VIEW, "35 % wrong", ROBUST_REGRESSION), ran),
+        (spoilt(1e-3, MIRROR_VIEW, "5 % wrong", PLAIN_REGRESSION), ran),
+        (spoilt(20e-3, PERSPECTIVE_VIEW, "shifted", ROBUST_REGRESSION), ran),
+        (spoilt(1e-3, MIRROR_VIEW, "shifted", PAPER_B_JOINT), ran),
+        (spoilt(1e-5, PERSPECTIVE_VIEW, "right", ROBUST_REGRESSION, name="depth"), ran),
         (short, trial(E1, runs=late)),
         (short, trial("hand", overshoot=np.full(n, 0.2))),
         (short, trial(E2, astray=np.full(n, 5e-3))),
-        (spoilt(5e-3, PERSPECTIVE, "radius", ROBUST), ran),
+        (spoilt(5e-3, PERSPECTIVE_VIEW, "radius", ROBUST_REGRESSION), ran),
     ]
     assert len(broken) == len(names)
     for place, (study, runs) in enumerate(broken):
-        assert not expected.checks(study, runs)[place].passed, names[place]
+        assert not expected.paper_b_checks(study, runs)[place].passed, names[place]
 
 
 def test_figures_of_the_prototype_are_compared(short):
-    figures = expected.figures_compared(short)
-    assert len(figures) == len(expected.PROTOTYPE)
+    figures = expected.paper_b_figures(short)
+    assert len(figures) == len(expected.PAPER_B_PROTOTYPE)
     assert [f.key[1] for f in figures if f.held] == ["radius", "radius"]
     assert all(f.tolerable for f in figures if f.held)
 
@@ -193,7 +208,7 @@ def test_legs_are_drawn_as_the_camera_has_them(ran, found):
     """[B] Fig. 9: a leg's outline is as wide as its cylinder there, and nearer legs hide others."""
     parts = {plot.name: plot for part in found.parts for plot in part.plots}
     machine, T = ran.eye.true.machine, ran.eye.true.T_camera_base
-    for name, readings in (("start", START), ("goal", GOAL)):
+    for name, readings in (("start", CONTROL_START_READINGS), ("goal", CONTROL_GOAL_READINGS)):
         legs = [t for t in parts[name].figure["data"] if t["name"].startswith("leg ")]
         ends = limb_ends(machine.layout, machine.values, readings, machine.forward(readings))
         depth = apply(T, ends.a)[:, 2] + apply(T, ends.b)[:, 2]
@@ -214,8 +229,8 @@ def test_numbers_for_programs(short, ran, found):
     assert document["paper"]["from_drawing"] == {"mirror": 0.012, "perspective": 0.008}
     told = {(a["view"], a["case"], a["method"]): a for a in document["accuracy"]}
     assert set(told) == set(short.samples)
-    right = told[MIRROR, "right", JOINT]
-    assert right["centre"] == short.of(MIRROR, "right", JOINT)["centre"].value
-    assert right["runs"] == RUNS // paper_b.SHARE
+    right = told[MIRROR_VIEW, "right", PAPER_B_JOINT]
+    assert right["centre"] == short.of(MIRROR_VIEW, "right", PAPER_B_JOINT)["centre"].value
+    assert right["runs"] == RUNS // paper_b.ASKED_RUNS_A_CASE
     assert document["seconds"]["wall"] == 12.5
     assert document["control"][E2]["astray"] == float(np.median(ran.trials[E2].astray))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration import results
-from pkmcal.calibration.results import base_camera_covariance, check_output, document_of
+from pkmcal.calibration.results import base_camera_covariance, calibration_document, check_output
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
@@ -86,7 +86,7 @@ def test_the_file_holds_everything(folder, calibrated):
 
 
 def test_numbers_that_are_none_become_null(calibrated):
-    document = document_of(calibrated)
+    document = calibration_document(calibrated)
     document["statistics"]["chi2"] = float("nan")
     document["covariance"] = np.array([np.inf, 1.0])
     data = json.loads(json_text(document), parse_constant=pytest.fail)
@@ -220,7 +220,7 @@ def test_a_failed_save_leaves_the_old_result(folder, calibrated, monkeypatch):
     def fail(*_calibration):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pkmcal.report.calibration.document_of", fail)
+    monkeypatch.setattr("pkmcal.report.calibration.calibration_document", fail)
     with pytest.raises(OSError, match="No space"):
         save(calibrated, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

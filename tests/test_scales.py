@@ -15,7 +15,7 @@ from pkmcal.calibration.doubts import scales_told
 from pkmcal.calibration.same_machine import _check_machine
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
-from pkmcal.export.contract import export
+from pkmcal.export.contract import make_export
 from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
@@ -166,12 +166,12 @@ def test_derivatives_by_scales_and_readings(name):
 )
 def test_a_firmware_without_scales_is_told_what_to_set(name, to, words):
     machine = built(name, seed=4)
-    text = " ".join("".join(export(source_of(machine), to).files.values()).split())
+    text = " ".join("".join(make_export(source_of(machine), to).files.values()).split())
     assert words in text
     factors = [f"{s:.9g}" for s in scales(machine)]
     assert all(f"goes {factor} times as far as its reading says." in text for factor in factors)
     exact = with_scales(load_mechanism(name), 0.0)
-    assert words not in "".join(export(source_of(exact), to).files.values())
+    assert words not in "".join(make_export(source_of(exact), to).files.values())
 
 
 # Words, and files of earlier versions

@@ -19,9 +19,17 @@ from pkmcal.control.simulation import (
     one_image,
     outside,
     platform_joints,
-    simulate,
+    simulate_servo_runs,
 )
-from pkmcal.control.study import Plan, Plant, Uncertainty, check_loop, check_pose, estimates, study
+from pkmcal.control.study import (
+    Plan,
+    Plant,
+    Uncertainty,
+    check_loop,
+    check_pose,
+    estimates,
+    study_servoing,
+)
 from pkmcal.control.words import judgement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
@@ -123,7 +131,9 @@ def test_noise_has_the_size_that_was_asked_for(eye):
 def test_true_geometry_arrives_exponentially(camera, law):
     eye = eye_of(camera)
     starts, goals = ways_of(eye, 4)
-    runs = simulate(eye, eye.true, starts, goals, replace(CLEAN, law=law), np.random.default_rng(0))
+    runs = simulate_servo_runs(
+        eye, eye.true, starts, goals, replace(CLEAN, law=law), np.random.default_rng(0)
+    )
     assert set(runs.end) == {End.REACHED}
     assert runs.past.max() < 0.02
     # (1 - gain / rate) a sample, near the goal where the law is linear
@@ -134,10 +144,12 @@ def test_true_geometry_arrives_exponentially(camera, law):
 def test_wrong_geometry_changes_the_way_and_not_the_end(eye):
     starts, goals = ways_of(eye, 6)
     loop = replace(CLEAN, rate=4.0, duration=16.0)
-    runs = simulate(eye, by_hand(eye, 0.03, 3, 6), starts, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(
+        eye, by_hand(eye, 0.03, 3, 6), starts, goals, loop, np.random.default_rng(0)
+    )
     assert set(runs.end) == {End.REACHED}
     assert runs.way[:, -1].max() < 1e-6
-    exact = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
+    exact = simulate_servo_runs(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
     assert np.abs(runs.way - exact.way).max() > 1e-3
 
 
@@ -145,7 +157,7 @@ def test_large_rotation_errors_break_it(eye):
     starts, goals = ways_of(eye, 8)
     loop = replace(CLEAN, law="directions")
     reached = [
-        simulate(eye, by_hand(eye, 0.0, deg, 8), starts, goals, loop,
+        simulate_servo_runs(eye, by_hand(eye, 0.0, deg, 8), starts, goals, loop,
                  np.random.default_rng(0)).reached.sum()
         for deg in (10, 60)
     ]  # fmt: skip
@@ -156,15 +168,15 @@ def test_large_rotation_errors_break_it(eye):
 def test_runs_do_not_depend_on_each_other(eye):
     starts, goals = ways_of(eye, 3)
     rng = np.random.default_rng
-    together = simulate(eye, eye.true, starts, goals, CLEAN, rng(0))
-    alone = simulate(eye, eye.true, starts[1:2], goals[1:2], CLEAN, rng(0))
+    together = simulate_servo_runs(eye, eye.true, starts, goals, CLEAN, rng(0))
+    alone = simulate_servo_runs(eye, eye.true, starts[1:2], goals[1:2], CLEAN, rng(0))
     np.testing.assert_allclose(together.T_base_platform[1], alone.T_base_platform[0], atol=1e-9)
 
 
 def test_delay_and_rate_limit(eye):
     starts, goals = ways_of(eye, 3)
     loop = replace(CLEAN, delay=3, duration=2.0, speed=np.array([0.01]))
-    runs = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
     still = np.abs(runs.readings[:, :4] - runs.readings[:, :1])
     assert still.max() == 0.0  # nothing moves before the first answer
     fastest = np.abs(np.diff(runs.readings, axis=1)).max() * loop.rate
@@ -188,7 +200,7 @@ def test_predicted_stillness_is_what_the_loop_does(eye, delay):
     loop = LoopSettings(
         noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0
     )
-    runs = simulate(eye, eye.true, goals, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(eye, eye.true, goals, goals, loop, np.random.default_rng(0))
     measured = np.sqrt(np.mean(runs.way[:, 30:] ** 2))
     joints = eye.true.machine.inverse(goals)
     rng = np.random.default_rng(1)
@@ -226,7 +238,9 @@ def test_unstable_loops_are_refused():
 def test_leaving_the_workspace(eye):
     """The way of the image is no straight line of the readings; by a wrong camera still less."""
     starts, goals = ways_of(eye, 8)
-    runs = simulate(eye, by_hand(eye, 0.0, 70, 8), starts, goals, CLEAN, np.random.default_rng(0))
+    runs = simulate_servo_runs(
+        eye, by_hand(eye, 0.0, 70, 8), starts, goals, CLEAN, np.random.default_rng(0)
+    )
     left = [k for k, end in enumerate(runs.end) if end is End.LEFT_WORKSPACE]
     assert left
     low, high = eye.true.machine.joint_ranges.T
@@ -263,7 +277,7 @@ def test_coming_to_a_singular_pose():
     first = int(np.argmax(weak < NEAR_SINGULAR / 2))
     goal = turned[first : first + 1]
     assert machine.same_assembly(start[0], goal[0])
-    runs = simulate(eye, eye.true, start, goal, CLEAN, np.random.default_rng(0))
+    runs = simulate_servo_runs(eye, eye.true, start, goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.SINGULAR,)
     assert runs.last[0] > 3
     assert "singular pose" in End.SINGULAR.sentence
@@ -276,7 +290,7 @@ def test_wrong_assembly_as_start():
     readings = machine.inverse(goal)[0]
     modes = machine.assembly_modes(readings, np.random.default_rng(0))
     start = next(m for m in modes if not machine.same_assembly(m, goal[0]))
-    runs = simulate(eye, eye.true, start[None], goal, CLEAN, np.random.default_rng(0))
+    runs = simulate_servo_runs(eye, eye.true, start[None], goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.WRONG_ASSEMBLY,)
     assert runs.last[0] == 0
     assert "another assembly than the goal" in End.WRONG_ASSEMBLY.sentence
@@ -289,7 +303,7 @@ def test_losing_a_leg(eye):
     parameters[2] += 250
     aside = replace(eye, camera=replace(eye.camera, parameters=parameters))
     loop = replace(CLEAN, duration=3.0)
-    runs = simulate(aside, eye.true, starts, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(aside, eye.true, starts, goals, loop, np.random.default_rng(0))
     lost = [k for k, end in enumerate(runs.end) if end is End.LOST_LEG and runs.last[k] > 0]
     assert lost
     assert len(lost) < 12
@@ -303,7 +317,7 @@ def test_noise_that_keeps_the_goal_away(eye):
     eye = Eye.of(eye.true.only(np.array([0, 2, 4])), eye.camera)
     starts, goals = ways_of(eye, 6)
     loop = LoopSettings(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
-    runs = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
     assert not runs.reached.any()
 
 
@@ -416,7 +430,7 @@ SHORT = replace(CLEAN, rate=4.0, duration=8.0)
 
 
 def test_a_study_that_is_well(eye):
-    found = study(scene_of(eye), Plan(SHORT, runs=6))
+    found = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
     assert [o.reached for o in found.outcomes] == [6, 6, 6, 6]
     words = judgement(found)
     assert words.usable
@@ -430,7 +444,7 @@ def test_how_far_a_platform_leaves_its_way(eye):
     """By hand millimetres beside it, which neither its end nor the time tells; and by definition
     nothing with the true geometry.
     """
-    found = study(scene_of(eye), Plan(SHORT, runs=6))
+    found = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
     true, identified, _, hand = (o.astray for o in found.outcomes)
     assert true.max() == 0
     assert 1e-3 < np.median(hand) < 10e-3
@@ -448,7 +462,7 @@ def test_the_seed_decides(eye):
     legs = (0, 2, 3, 4)
     loop = replace(SHORT, duration=1.0, noise=EdgeNoise(0.1, 0.1))
     ways = [
-        study(scene_of(eye, legs), Plan(loop, runs=2, seed=seed)).outcomes[1].runs.way
+        study_servoing(scene_of(eye, legs), Plan(loop, runs=2, seed=seed)).outcomes[1].runs.way
         for seed in (1, 1, 2)
     ]
     np.testing.assert_array_equal(ways[0], ways[1])
@@ -456,7 +470,7 @@ def test_the_seed_decides(eye):
 
 
 def test_three_legs_are_warned_of(eye):
-    found = study(scene_of(eye, (0, 1, 2)), Plan(replace(SHORT, law="directions"), runs=8))
+    found = study_servoing(scene_of(eye, (0, 1, 2)), Plan(replace(SHORT, law="directions"), runs=8))
     words = judgement(found)
     assert not words.usable
     assert "legs 1 to 3 should not be used" in words.headline
@@ -467,7 +481,7 @@ def test_three_legs_are_warned_of(eye):
 
 
 def test_two_legs_are_blind(eye):
-    found = study(scene_of(eye, (0, 3)), Plan(replace(SHORT, law="directions"), runs=2))
+    found = study_servoing(scene_of(eye, (0, 3)), Plan(replace(SHORT, law="directions"), runs=2))
     words = judgement(found)
     assert not words.usable
     assert "do not show every motion" in words.headline
@@ -491,7 +505,7 @@ def test_a_camera_that_sees_too_little_is_refused(eye):
     parameters[:2] *= 4
     scene = replace(scene_of(eye), camera=replace(eye.camera, parameters=parameters))
     with pytest.raises(InputError, match="does not see all legs"):
-        study(scene, Plan(SHORT, runs=3))
+        study_servoing(scene, Plan(SHORT, runs=3))
 
 
 def test_platform_joints_are_the_machines(eye):

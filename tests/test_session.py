@@ -13,7 +13,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.session.load import digests, load_session, session_digest
 from pkmcal.session.readings import check_readings
-from pkmcal.wording import MINUS
+from pkmcal.wording import MINUS_SIGN
 
 SESSION = """\
 pkmcal: 1
@@ -409,7 +409,7 @@ def test_one_constant_of_one_joint_is_told(folder):
     (folder / "joints.csv").write_text(shifted(0.2, [2]))
     message = fault(load_session, folder)
     assert "column leg3: the readings of leg3 are off by one constant" in message
-    assert f"between {MINUS}242 and {MINUS}148 mm added" in message
+    assert f"between {MINUS_SIGN}242 and {MINUS_SIGN}148 mm added" in message
 
 
 def test_two_joints_with_two_constants_are_out_of_range(folder):

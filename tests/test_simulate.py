@@ -27,9 +27,9 @@ from pkmcal.simulation import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulation.demo import MECHANISM, SETTINGS, demo_camera
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SETTINGS, demo_camera
 from pkmcal.simulation.placement import draw_configurations, usable
-from pkmcal.simulation.render import PixelRays, Scene, ScenePart, photograph, render
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, photograph, render_light
 from pkmcal.simulation.scene import CABLE_PIECES, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, SmoothNoise
@@ -70,7 +70,9 @@ def between(a, b, radius):
 
 
 def picture(parts, view, lighting=DARK, T_camera_base=FRONT, seed=0):
-    return render(Scene(tuple(parts), lighting), view, T_camera_base, np.random.default_rng(seed))
+    return render_light(
+        Scene(tuple(parts), lighting), view, T_camera_base, np.random.default_rng(seed)
+    )
 
 
 def predicted_edge(tube, side, upright):
@@ -536,8 +538,8 @@ def test_a_session_is_written_whole_or_not_at_all(machine, tmp_path):
 
 def test_the_demonstration_can_be_drawn():
     camera = demo_camera()
-    machine = load_mechanism(MECHANISM)
-    truth = draw_truth(machine, (camera,) * SETTINGS.n_stations, SETTINGS, 7)
+    machine = load_mechanism(DEMO_MECHANISM)
+    truth = draw_truth(machine, (camera,) * DEMO_SETTINGS.n_stations, DEMO_SETTINGS, 7)
     assert len(truth.photographs) == 18
 
 

@@ -11,7 +11,7 @@ import yaml
 
 import pkmcal
 from conftest import run
-from pkmcal.commands.comparison import compare
+from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms import load_mechanism, mechanism_text
@@ -28,7 +28,7 @@ from pkmcal.simulation import (
 from pkmcal.simulation.board import board_from_fields
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.drives import drives_of, reaches, side_bars
-from pkmcal.simulation.placement import FARTHEST_TURN, unfolded
+from pkmcal.simulation.placement import FARTHEST_TURN, platform_unfolded
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Cylinder
 from pkmcal.simulation.surfaces import SmoothNoise
@@ -194,8 +194,8 @@ def test_platforms_with_side_bars_do_not_fold(h4):
     T = np.broadcast_to(np.eye(4), (5, 4, 4)).copy()
     T[:, 0, 0] = T[:, 1, 1] = np.cos(turns)
     T[:, 1, 0], T[:, 0, 1] = np.sin(turns), -np.sin(turns)
-    assert unfolded(h4, T).tolist() == [True, True, True, False, False]
-    assert unfolded(load_mechanism("gough-stewart"), T).all()
+    assert platform_unfolded(h4, T).tolist() == [True, True, True, False, False]
+    assert platform_unfolded(load_mechanism("gough-stewart"), T).all()
     truth = draw_truth(h4, (SMALL,), Settings(stations=1, configurations=20), 1)
     for machine in (h4, truth.machine):  # as it is, and as its controller believes
         poses = machine.forward(truth.joints)
@@ -273,7 +273,7 @@ def mixed(tmp_path_factory):
 
 def test_forearms_and_board_in_photographs(mixed):
     found = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
-    errors = compare(found, mixed)
+    errors = compare_with_truth(found, mixed)
     assert found.verdict.usable
     assert found.estimate.statistics.n_poses >= 6 * 2
     assert len(found.observation.edges) > 40
@@ -283,7 +283,7 @@ def test_forearms_and_board_in_photographs(mixed):
 
 def test_forearms_alone_in_photographs(mixed):
     found = pkmcal.calibrate(observing(mixed, "legs"))
-    errors = compare(found, mixed)
+    errors = compare_with_truth(found, mixed)
     assert found.estimate.statistics.n_poses == 0
     assert errors.calibrated.position < errors.drawing.position / 5
 
@@ -334,7 +334,7 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
         drawing = found.session.machine
         z = whitened(drawing, found.estimate, load_truth(folder, drawing))
         assert np.sqrt(np.mean(z**2)) < 1.3
-        errors = compare(found, folder)
+        errors = compare_with_truth(found, folder)
         assert errors.calibrated.position < errors.drawing.position
         sigma.append(np.sqrt(np.diag(found.estimate.covariance)))
     kinematic = np.array(drawing.parameters.kinds) != "radius"

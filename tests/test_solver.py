@@ -9,7 +9,7 @@ import pytest
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
-from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.ranks import column_space, inverse_root, normal_root
 from pkmcal.solver.search import Stop, final_weights, minimise, of_runs, put, soft_weights, take
 from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
@@ -81,7 +81,7 @@ def test_damped_step_equals_dense_marquardt():
 
 def test_reduced_normal_is_the_schur_complement():
     linear = random_linear(np.random.default_rng(2))
-    rows, left = stacked(linear, eliminate(linear))
+    rows, left = rows_on_shared(linear, eliminate(linear))
     normal = rows.mT @ rows
     for run in range(3):
         jac, value = dense(linear, run)
@@ -132,7 +132,10 @@ def test_products_of_strips_are_those_of_their_rows(damping, sharp):
     rows, damping = in_strips(np.random.default_rng(12), sharp), np.full(2, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
-    whole, (jac, left) = normal_equations([rows], damping), stacked(*with_damping(linear, damping))
+    whole, (jac, left) = (
+        normal_equations([rows], damping),
+        rows_on_shared(*with_damping(linear, damping)),
+    )
     normal, gradient = jac.mT @ jac, (jac.mT @ left[..., None])[..., 0]
     for found, by_rows in ((whole.matrix, normal), (whole.gradient, gradient)):
         np.testing.assert_allclose(found, by_rows, atol=1e-9 * np.abs(by_rows).max())
@@ -266,7 +269,7 @@ def test_what_all_runs_share_stays():
 def test_stacked_rows_are_the_reduced_problem():
     """Their least squares is the shared part of the whole problem's."""
     linear = random_linear(np.random.default_rng(8))
-    rows, value = stacked(linear, eliminate(linear))
+    rows, value = rows_on_shared(linear, eliminate(linear))
     for run in range(3):
         jac, residual = dense(linear, run)
         whole = np.linalg.lstsq(jac, residual, rcond=None)[0][:5]

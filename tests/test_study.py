@@ -17,16 +17,16 @@ from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.studies import engine
 from pkmcal.studies.calibrations import (
-    ESTIMATE,
+    JOINT_ESTIMATE_KEY,
     SimulatedCalibrations,
     judged,
-    tool_difference,
+    tool_error_and_sigma,
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import SweepResult, clustered, study
 from pkmcal.studies.statistics import Summary, covered
-from pkmcal.studies.study_report import document_of
+from pkmcal.studies.study_report import study_document
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
 from pkmcal.wording import brief
 
@@ -210,11 +210,11 @@ def test_the_tool_of_the_truth_is_not_off():
     other = changed_frames(machine.layout, true, turn, np.linalg.inv(turn))
     covariance = 1e-8 * np.eye(len(true.theta))
     joints = data.capture.joints[:4]
-    off, sigma = tool_difference(machine, true.theta, covariance, other, joints, every=False)
+    off, sigma = tool_error_and_sigma(machine, true.theta, covariance, other, joints, every=False)
     assert np.abs(off).max() < 1e-9
     assert np.isfinite(sigma).all()
     worse = replace(true, theta=true.theta + 1e-4 * np.eye(len(true.theta))[20])
-    off, _ = tool_difference(machine, true.theta, covariance, worse, joints, every=False)
+    off, _ = tool_error_and_sigma(machine, true.theta, covariance, worse, joints, every=False)
     assert np.abs(off).max() > 1e-6
 
 
@@ -231,7 +231,7 @@ def test_the_tool_of_the_truth_is_not_off():
 def test_stated_deviations_hold(subject, vary, one_process):
     """A few runs: errors over stated deviations are about one, for parameters and tool."""
     found = study(subject, vary, runs=10)
-    cell, sample = found.found[0], found.results[0].samples[ESTIMATE]
+    cell, sample = found.found[0], found.results[0].samples[JOINT_ESTIMATE_KEY]
     assert cell.failed.value == 0
     assert 0.7 < cell.chi2 < 1.1
     for name in ("parameters", "tool"):
@@ -266,7 +266,7 @@ def test_edges_that_scatter_more_than_stated_are_told():
     sharp = replace(problem.data, white=10 * problem.data.white)
     assembled = replace(data.assembled, problem=replace(problem, data=sharp))
     usual, noisy = (
-        setting.solve(batch, one)[ESTIMATE].told
+        setting.solve(batch, one)[JOINT_ESTIMATE_KEY].told
         for one in (data, replace(data, assembled=assembled))
     )
     np.testing.assert_allclose(usual["scale"], 1, atol=0.25)
@@ -335,7 +335,7 @@ def test_one_run_tells_no_standard_error():
 def test_parameters_keep_their_names_where_legs_and_boards_are_compared(one_process):
     """With legs the tubes' radii are parameters as well, between the others."""
     found = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
-    told = [cell["covered_by_parameter"] for cell in document_of(found)["combinations"]]
+    told = [cell["covered_by_parameter"] for cell in study_document(found)["combinations"]]
     for names, cell in zip(told, found.cells, strict=True):
         assert list(names) == [name for name, _ in cell.setting.parameters]
     radius = "legs[1].tubes[1].radius"
@@ -396,7 +396,7 @@ def test_more_runs_go_on_from_the_finished_ones(tmp_path, one_process):
     more = study("3-rpr", SMALL[1:2], runs=20, out=tmp_path)
     after = sorted(p.stat().st_mtime_ns for p in tmp_path.glob("batches/*.npz"))
     assert after[:1] == before
-    first, both = (r.results[0].values("position", *ESTIMATE) for r in (few, more))
+    first, both = (r.results[0].values("position", *JOINT_ESTIMATE_KEY) for r in (few, more))
     np.testing.assert_array_equal(both[:10], first)
 
 
@@ -417,7 +417,9 @@ def test_a_file_that_is_spoilt_is_done_again(tmp_path, one_process):
     (path,) = tmp_path.glob("batches/*.npz")
     path.write_bytes(path.read_bytes()[:500])
     two = study("a", (), runs=4, out=tmp_path)
-    np.testing.assert_array_equal(*(r.results[0].values("position", *ESTIMATE) for r in (one, two)))
+    np.testing.assert_array_equal(
+        *(r.results[0].values("position", *JOINT_ESTIMATE_KEY) for r in (one, two))
+    )
 
 
 def test_parquet(tmp_path, one_process, monkeypatch):

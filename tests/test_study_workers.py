@@ -18,12 +18,12 @@ from conftest import run
 from pkmcal.errors import InputError, ResultError
 from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
-    ESTIMATE,
+    JOINT_ESTIMATE_KEY,
 )
 from pkmcal.studies.findings import study
 from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.studies.store import Store
-from pkmcal.studies.study_report import document_of, runs_bytes
+from pkmcal.studies.study_report import runs_bytes, study_document
 from pkmcal.studies.sweep import cells_of, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
 from test_study import SMALL, batch_of
@@ -109,11 +109,11 @@ class Counting:
         return batch.generator(0).random(batch.runs)
 
     def solve(self, batch, data):
-        return {ESTIMATE: data}
+        return {JOINT_ESTIMATE_KEY: data}
 
     def judge(self, batch, data, found):
         time.sleep(self.takes)
-        return {ESTIMATE: Sample({"x": found[ESTIMATE]})}
+        return {JOINT_ESTIMATE_KEY: Sample({"x": found[JOINT_ESTIMATE_KEY]})}
 
 
 def test_workers_that_die_are_replaced(monkeypatch):
@@ -141,8 +141,8 @@ def test_workers_that_die_are_replaced(monkeypatch):
     assert len(begun) == 2  # beside this process one, and the one in its place
     monkeypatch.setattr(workers, "cores", lambda: 1)
     one = engine.run(Counting(), 750, 1)
-    np.testing.assert_array_equal(*(r.values("x", *ESTIMATE) for r in (many, one)))
-    assert engine.run(setting, 4, 0).values("position", *ESTIMATE).shape == (4,)
+    np.testing.assert_array_equal(*(r.values("x", *JOINT_ESTIMATE_KEY) for r in (many, one)))
+    assert engine.run(setting, 4, 0).values("position", *JOINT_ESTIMATE_KEY).shape == (4,)
 
 
 def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
@@ -174,7 +174,8 @@ def test_what_is_kept_is_what_was_done(tmp_path):
         found = store.load(0, 0, task.batch)
         assert found.wall == done.wall
         np.testing.assert_array_equal(
-            found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
+            found.samples[JOINT_ESTIMATE_KEY].values["x"],
+            done.samples[JOINT_ESTIMATE_KEY].values["x"],
         )
         assert store.load(0, 1, task.batch) is None
         assert store.load(0, 0, replace(task.batch, runs=4)) is None
@@ -228,7 +229,7 @@ def test_a_cluster_without_dask_is_told(monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    monkeypatch.setattr(cluster, "SCHEDULER_TIMEOUT", 1)
     with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
         study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
 
@@ -282,7 +283,7 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, one_pro
     assert killed
     one = study("a", ["configurations=5"], runs=300)
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
-    assert str(document_of(many)) == str(document_of(one))
+    assert str(study_document(many)) == str(study_document(one))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
@@ -292,6 +293,6 @@ def test_a_pipe_in_the_place_of_a_batch_is_none(tmp_path):
     batch.unlink()
     os.mkfifo(batch)
     again = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
-    one, two = (r.results[0].values("position", *ESTIMATE) for r in (first, again))
+    one, two = (r.results[0].values("position", *JOINT_ESTIMATE_KEY) for r in (first, again))
     np.testing.assert_array_equal(one, two)
     assert batch.is_file()

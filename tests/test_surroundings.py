@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
 from pkmcal.observe.alone import Alone
 from pkmcal.observe.predict import LegsInCamera
 from pkmcal.observe.surroundings import (
-    FEWEST,
+    FEWEST_POINT_PAIRS,
     Neighbour,
     Surroundings,
     Texture,
@@ -130,7 +130,7 @@ def test_chance_is_not_taken_for_agreement():
 
 
 def test_few_pairs_tell_nothing():
-    ray = np.tile([0.0, 0.0, 1.0], (FEWEST - 1, 1))
+    ray = np.tile([0.0, 0.0, 1.0], (FEWEST_POINT_PAIRS - 1, 1))
     assert agreement(ray, ray, looking(0) @ inverse(looking(20))) == 0.0
 
 

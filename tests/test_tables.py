@@ -107,7 +107,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
     text = "\ufeff" + end.join(["header", *lines, ""])
     path.write_bytes(text.encode())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(documents, "BLOCK", block)
+        patch.setattr(documents, "TEXT_BLOCK_BYTES", block)
         found = list(documents.text_blocks(path, "t.csv"))
     whole = text[1:].replace("\r\n", "\n").replace("\r", "\n")
     assert "".join(found) == whole
@@ -132,7 +132,7 @@ def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said):
     rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(150_000)]
     rows.insert(120_000, line)
     path = written(tmp_path / "t.csv", HEADER.encode() + b"".join(rows))
-    assert path.stat().st_size > 2 * documents.BLOCK
+    assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES
     assert fault(read_csv, path).startswith("t.csv, " + said.format(120_002))
 
 
@@ -140,7 +140,7 @@ def test_a_large_table(tmp_path):
     names = [f"{k:06d}" for k in range(100_000)]
     values = np.random.default_rng(0).normal(size=(len(names), 2))
     path = written(tmp_path / "t.csv", csv_text(["leg1", "leg2"], names, values))
-    assert path.stat().st_size > 2 * documents.BLOCK
+    assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES
     table = read_csv(path)
     assert (table.names, table.lines) == (tuple(names), tuple(range(2, len(names) + 2)))
     np.testing.assert_array_equal(table.values, values)

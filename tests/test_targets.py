@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.board import Detection, chessboard
-from pkmcal.boards.poses import board_views, detect_again, detect_in, one_a_configuration, standing
+from pkmcal.boards.poses import (
+    board_views,
+    detect_again,
+    detect_in,
+    one_a_configuration,
+    standing_board,
+)
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
@@ -138,7 +144,7 @@ def test_no_photograph_shows_it(board):
     missed = Detection("0000.png", CAMERA.image_size, *none, reason="nothing is recognised")
     views = seen(board, [missed])
     assert len(one_a_configuration(views, 0)[0]) == 0
-    assert standing(views) is None
+    assert standing_board(views) is None
 
 
 def test_a_tilt_that_is_not_sure_is_rejected(board):
@@ -216,7 +222,7 @@ def test_a_still_board_is_one_measurement(board):
     values, sigmas = [], []
     for seed in range(20):
         views = seen(board, still(board, seed=seed), rows=np.arange(8) + 3)
-        stood = standing(views)
+        stood = standing_board(views)
         assert stood.agreed.all()
         assert stood.rejected == ()
         poses = stood.poses(views, mount=0)
@@ -233,7 +239,7 @@ def test_what_all_photographs_share_does_not_average_out(board):
     rng = np.random.default_rng(5)
     printed = replace(board, points=board.points + [1, 1, 0] * rng.normal(0, 5e-5, (48, 3)))
     few, many = (
-        standing(seen(board, detections(printed, np.tile(before(), (n, 1, 1)), noise=0.01)))
+        standing_board(seen(board, detections(printed, np.tile(before(), (n, 1, 1)), noise=0.01)))
         for n in (2, 30)
     )
     assert many.noise == pytest.approx(0.055, rel=0.3)  # 0.05 mm at 1.1 px a mm
@@ -243,8 +249,8 @@ def test_what_all_photographs_share_does_not_average_out(board):
 def test_a_trembling_camera_makes_the_pose_less_sure(board):
     rng = np.random.default_rng(2)
     tremble = {k: np.concatenate([np.zeros(3), rng.normal(0, 1e-4, 3)]) for k in range(8)}
-    quiet = standing(seen(board, still(board)))
-    shaken = standing(seen(board, still(board, moves=tremble)))
+    quiet = standing_board(seen(board, still(board)))
+    shaken = standing_board(seen(board, still(board, moves=tremble)))
     assert shaken.agreed.all()
     assert shaken.scatter > 1.5 * quiet.scatter
     assert np.all(np.diag(shaken.covariance)[3:5] > 2 * np.diag(quiet.covariance)[3:5])
@@ -252,14 +258,14 @@ def test_a_trembling_camera_makes_the_pose_less_sure(board):
 
 def test_one_photograph_is_enough_and_says_nothing_of_standing_still(board):
     views = seen(board, still(board, n=1))
-    stood = standing(views)
+    stood = standing_board(views)
     assert np.isnan(stood.scatter)
     np.testing.assert_allclose(stood.covariance, views.poses.covariance[0], rtol=0.2)
 
 
 @pytest.mark.parametrize("odd", [0, 4, 7])
 def test_one_photograph_that_disagrees_is_left_out(board, odd):
-    stood = standing(seen(board, still(board, moves={odd: AWAY})))
+    stood = standing_board(seen(board, still(board, moves={odd: AWAY})))
     assert np.flatnonzero(~stood.agreed).tolist() == [odd]
     (item,) = stood.rejected
     assert item.configuration == odd
@@ -278,7 +284,7 @@ def test_one_photograph_that_disagrees_is_left_out(board, odd):
 )
 def test_a_board_that_moved(board, moved, last, first):
     with pytest.raises(InputError) as caught:
-        standing(seen(board, still(board, moves=dict.fromkeys(moved, AWAY))))
+        standing_board(seen(board, still(board, moves=dict.fromkeys(moved, AWAY))))
     assert caught.value.what == f"the board, or the camera, moved after {last}"
     assert caught.value.where == first
     assert "px away (2.0 mm, 0.0" in caught.value.found
@@ -287,7 +293,7 @@ def test_a_board_that_moved(board, moved, last, first):
 def test_a_board_that_never_stood_still(board):
     moves = {k: (0, 0, 0, 2e-3 * k, 0, 0) for k in (1, 3, 5)}
     with pytest.raises(InputError, match="did not stand still") as caught:
-        standing(seen(board, still(board, moves=moves)))
+        standing_board(seen(board, still(board, moves=moves)))
     assert caught.value.found.startswith("3 of 8 photographs")
 
 
@@ -296,7 +302,7 @@ def test_all_camera_models_see_a_still_board(board):
         camera = CAMERAS[model]
         place = before(place=(-0.12, -0.09, 0.2))
         found = detections(board, np.tile(place, (4, 1, 1)), camera=camera)
-        stood = standing(seen(board, found, camera=camera))
+        stood = standing_board(seen(board, found, camera=camera))
         assert stood.agreed.all()
         error = pose_difference(stood.T_camera_board, place)
         assert error @ np.linalg.solve(stood.covariance, error) < 24

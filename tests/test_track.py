@@ -13,10 +13,10 @@ from pkmcal.control.track import (
     Sight,
     corrected_pose,
     edge_misfits,
+    first_track_state,
     leg_lines,
-    start_state,
     track,
-    weighted,
+    weighted_task,
 )
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
@@ -52,7 +52,7 @@ def root(lines):
 
 def test_edges_are_found_within_their_sigma(view):
     lab, image, sight = view
-    found = track(sight, start_state(sight.seen), image, READINGS)
+    found = track(sight, first_track_state(sight.seen), image, READINGS)
     assert found.found.sum() >= 5
     truth = true_edges(sight.seen, AT)[found.found]
     lines = found.lines
@@ -72,7 +72,7 @@ def test_a_photograph_late_by_a_millimetre_is_followed(view):
     """The readings have gone on; the next photograph profits from what this one showed."""
     _, image, sight = view
     later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3
-    first = track(sight, start_state(sight.seen), image, later)
+    first = track(sight, first_track_state(sight.seen), image, later)
     second = track(sight, first.state, image, later)
     truth = true_edges(sight.seen, AT)
     for at in (first, second):
@@ -93,7 +93,7 @@ def test_a_first_photograph_several_pixels_off_is_searched():
     sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
     # a centimetre and two degrees aside: up to nine pixels
     moved = MACHINE.inverse(perturb(AT, np.array([0, 0, 0.03, 0.01, 0.008, 0]))[None])[0]
-    found = track(sight, start_state(sight.seen), image, moved)
+    found = track(sight, first_track_state(sight.seen), image, moved)
     assert found.state.searched
     assert found.found.sum() >= 4
     assert found.beside > 2e-3  # and said
@@ -104,7 +104,7 @@ def test_a_first_photograph_several_pixels_off_is_searched():
 
 def test_a_leg_painted_over_is_lost_and_the_others_are_not(view):
     lab, image, sight = view
-    whole = track(sight, start_state(sight.seen), image, READINGS)
+    whole = track(sight, first_track_state(sight.seen), image, READINGS)
     leg = int(np.flatnonzero(whole.found)[0])
     painted = lab.painted(image, AT, READINGS, [leg])
     found = track(sight, whole.state, painted, READINGS)
@@ -116,7 +116,7 @@ def test_a_leg_painted_over_is_lost_and_the_others_are_not(view):
 
 def test_an_empty_photograph_finds_nothing_and_keeps_to_the_readings(view):
     _, image, sight = view
-    state = track(sight, start_state(sight.seen), image, READINGS).state
+    state = track(sight, first_track_state(sight.seen), image, READINGS).state
     empty = np.full_like(image, 90)
     found = track(sight, state, empty, READINGS)
     assert not found.found.any()
@@ -128,7 +128,7 @@ def test_an_empty_photograph_finds_nothing_and_keeps_to_the_readings(view):
 
 def test_readings_that_close_no_machine_are_no_edges(view):
     _, image, sight = view
-    found = track(sight, start_state(sight.seen), image, READINGS * [2, 1, 1, 0.2, 1, 1])
+    found = track(sight, first_track_state(sight.seen), image, READINGS * [2, 1, 1, 0.2, 1, 1])
     assert not found.closed
     assert not found.found.any()
 
@@ -144,7 +144,7 @@ def test_readings_that_close_no_machine_are_no_edges(view):
 def test_images_that_are_none_are_named(image, words):
     sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
     with pytest.raises(InputError, match=words):
-        track(sight, start_state(sight.seen), image, READINGS)
+        track(sight, first_track_state(sight.seen), image, READINGS)
 
 
 # ------------------------------------------------------------------ edges to lines, exactly
@@ -269,7 +269,7 @@ def test_weights_make_errors_white(law):
         turn = (factor @ rng.normal(size=(6, 4, 1))).reshape(6, 2, 2, 1)
         normals = lines.normal + (lines.basis @ turn)[..., 0]
         normals /= np.linalg.norm(normals, axis=-1)[..., None]
-        task, noise = weighted(law, task_of(law, SEEN, normals, goal, legs), lines, every)
+        task, noise = weighted_task(law, task_of(law, SEEN, normals, goal, legs), lines, every)
         rows.append(task.error / (1e-2 * noise))
     spread = np.cov(np.array(rows).T)
     assert len(spread) == (24 if law == "edges" else 12)

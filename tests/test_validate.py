@@ -12,13 +12,27 @@ import pytest
 
 from conftest import run
 from faults import replaced
-from pkmcal.calibration.aside import by_region, chosen, clusters, places, regions, select, spread
+from pkmcal.calibration.aside import (
+    by_region,
+    chosen,
+    clusters,
+    points_of_poses,
+    regions,
+    select,
+    spread,
+)
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
-from pkmcal.judge.comparison import compare, finite_rms, promise, ratio, weighed
+from pkmcal.judge.comparison import (
+    compare_with_drawing,
+    finite_rms,
+    improvement_ratio,
+    promise,
+    weighed_mean_and_rms,
+)
 from pkmcal.judge.held import held_machine
 from pkmcal.judge.holdouts import by_regions, hold_out
 from pkmcal.judge.new_data import repeated_rows
@@ -27,7 +41,7 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report.validation import held_out
+from pkmcal.report.validation import held_out_part
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
@@ -68,7 +82,7 @@ def judged_on(drawing, estimate, machine, data, stations):
     found = seen_by(machine, data, stations)
     by_drawing = seen_by(drawing, data, stations)
     rows = np.flatnonzero(found.seen)
-    return compare(drawing, estimate.covariance, data, found, by_drawing, rows)
+    return compare_with_drawing(drawing, estimate.covariance, data, found, by_drawing, rows)
 
 
 def changed(machine, name, by):
@@ -258,7 +272,9 @@ def test_a_board_on_an_h4(h4):
     new = measured(true, papers_poses()[rng.permutation(81)[:12]], rng)
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
     found = predict(estimate.machine, new.measurements, start)
-    judged = compare(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
+    judged = compare_with_drawing(
+        drawing, estimate.covariance, new.measurements, found, None, np.arange(12)
+    )
     verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
@@ -278,7 +294,7 @@ def test_a_board_on_an_h4(h4):
 
 def test_a_ratio_and_its_spread():
     rng = np.random.default_rng(0)
-    made = ratio(np.abs(10 * rng.normal(size=400)), np.abs(rng.normal(size=400)))
+    made = improvement_ratio(np.abs(10 * rng.normal(size=400)), np.abs(rng.normal(size=400)))
     assert made.low < 10 < made.high
     assert made.sigma == pytest.approx(0.5, rel=0.2)  # sqrt(2/400) / sqrt 2 of both, times ten
     assert not made.better or made.low > 1
@@ -298,7 +314,7 @@ def test_a_promise_is_uniform_in_chance_and_finds_what_is_common():
 
 def test_poses_that_are_hardly_seen_hardly_count():
     values, sigma = np.array([[1.0], [100.0], [np.nan]]), np.array([[1.0], [1e4], [1.0]])
-    assert weighed(values, sigma)[1][0] == pytest.approx(1.0, abs=1e-3)
+    assert weighed_mean_and_rms(values, sigma)[1][0] == pytest.approx(1.0, abs=1e-3)
 
 
 # paths
@@ -324,7 +340,7 @@ def test_regions_are_whole_named_and_the_same_again():
     poses = pose(
         rotation(1e-3 * rng.normal(size=(15, 3))), shifts + 1e-3 * rng.normal(size=(15, 3))
     )
-    points = places(machine, poses)
+    points = points_of_poses(machine, poses)
     rows = np.arange(100, 115)
     found = regions(points, rows, 3)
     assert sorted(np.concatenate([r.rows for r in found])) == sorted(rows)
@@ -420,7 +436,7 @@ def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
             joint_noise=data.joint_noise,
             document={"joints": {"columns": drawing.joint_names}},
         )
-        return " ".join(held_out(item, session).said)
+        return " ".join(held_out_part(item, session).said)
 
     assert said().startswith("On 4 configurations held out")
     joints[item.region.rows[1]] = joints[item.region.rows[0]] + data.joint_noise

@@ -8,7 +8,7 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose_difference, skew
 from pkmcal.mechanisms import catalogue, kinematics, load_mechanism
-from pkmcal.mechanisms.velocities import LOST, inverse_jacobian
+from pkmcal.mechanisms.velocities import LEAST_GAIN_FOR_RATES, inverse_jacobian
 from test_kinematics import SMALL, differences, hexapod, planar, tripod, yawed
 
 NAMES = sorted(catalogue())
@@ -137,7 +137,9 @@ def test_at_a_singular_pose_there_is_no_forward_jacobian_and_its_neighbours_keep
     assert np.isfinite(back[[0, 2]]).all()
     assert np.isfinite(machine.inverse_jacobian(yawed(90))).all()
     # just above what counts as lost
-    assert np.isfinite(machine.forward_jacobian(yawed(90 - np.degrees(10 * LOST)))).all()
+    assert np.isfinite(
+        machine.forward_jacobian(yawed(90 - np.degrees(10 * LEAST_GAIN_FOR_RATES)))
+    ).all()
 
 
 def test_at_a_serial_singularity_the_twist_tells_no_rate():

@@ -180,7 +180,7 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
 
 
 def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
-    monkeypatch.setattr("pkmcal.view.viewed.WIDEST", 100)
+    monkeypatch.setattr("pkmcal.view.viewed.WIDEST_VIEWED_PICTURE", 100)
     image = cv2.imdecode(np.frombuffer(page.get("photograph/0/0").content, np.uint8), 0)
     assert image.shape[1] == 100
 
@@ -478,7 +478,7 @@ def test_the_command_serves_until_it_is_interrupted(demo):
 
 def test_answers_are_sent_at_once():
     """asyncio sends without delay (TCP_NODELAY) where it knows the protocol, else 40 ms later."""
-    with server.listening(0) as found:
+    with server.listening_socket(0) as found:
         assert found.getsockname()[0] == "127.0.0.1"
         assert found.proto == socket.IPPROTO_TCP
 
@@ -570,7 +570,7 @@ async function pulled(target, from, to) {
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
     """One walks, pulls, takes back, pulls two joints to their places, and the machine snaps."""
     template, before = server._template, (session / "session.yaml").read_text()
-    with server.listening(0) as found:
+    with server.listening_socket(0) as found:
         port = found.getsockname()[1]
         subject = Viewed(load_session(session), demo.calibration)
         pane = subject.drawn(0, 0)
@@ -580,7 +580,9 @@ def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch
         monkeypatch.setattr(server, "_template", lambda name: template(name) + more.get(name, ""))
         app = server.application(subject, TOKEN, port)
         # a thread of its own has no signals to be ended by: it ends with the tests
-        threading.Thread(target=server.serve, args=(app, found), daemon=True).start()
+        threading.Thread(
+            target=server.serve_until_interrupted, args=(app, found), daemon=True
+        ).start()
         done = subprocess.run(
             [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
              "--disable-background-networking", f"--user-data-dir={tmp_path / 'profile'}",

@@ -18,22 +18,22 @@ from pkmcal.judge.causes import (
     Cause,
     arms,
     common_scale,
-    joined,
+    joined_causes,
     single_causes,
     whole_legs,
     whole_machine,
     zeros,
 )
 from pkmcal.judge.changes import (
-    POWER,
+    DETECTION_POWER,
     change,
     chi_square,
+    common_level,
     detectable,
     explained,
-    likelihood,
     look_for_changes,
     made_tests,
-    together,
+    twice_log_odds,
 )
 from pkmcal.judge.held import Evidence, Trust, evidence, hold
 from pkmcal.judge.words import LookedAt, watch_verdict
@@ -188,7 +188,7 @@ def test_each_legs_test_is_uniform_in_chance(unchanged, watched):
 def test_false_alarms_of_all_tests_together(unchanged, watched):
     """At a level of 0.2, of 50 machines that did not change 10 are flagged, give or take."""
     asked = [whole_machine(watched.true), *whole_legs(watched.true), *zeros(watched.true)]
-    level = together(unchanged[0], asked)
+    level = common_level(unchanged[0], asked)
     least = np.array([min(chi_square(f, c).chance for c in asked) for f in unchanged])
     flagged = int(np.sum(least < level.single(0.2)))
     assert abs(flagged - 10) < 4 * np.sqrt(SESSIONS * 0.2 * 0.8)
@@ -329,7 +329,9 @@ def test_detectable_changes_are_detected_so_often(watched):
         for _ in range(count)
     ]
     share = np.mean([chi_square(draw, leg).chance < level for draw in draws])
-    assert abs(share - POWER) < 4 * np.sqrt(POWER * (1 - POWER) / count)
+    assert abs(share - DETECTION_POWER) < 4 * np.sqrt(
+        DETECTION_POWER * (1 - DETECTION_POWER) / count
+    )
 
 
 def test_what_is_not_seen_is_not_detected(watched):
@@ -352,13 +354,13 @@ def flat(n=6, p=3):
 
 def test_chances_of_several_tests():
     one = [Cause("zero", (k,), np.eye(3)[:, [k]], np.array([1e-3]), "m") for k in range(3)]
-    level = together(flat(), one)
+    level = common_level(flat(), one)
     # of three independent tests: 1 - (1 - p)^3
     for p in (0.01, 0.1, 0.5):
         assert level.adjusted(p) == pytest.approx(1 - (1 - p) ** 3, rel=0.15)
         assert level.single(1 - (1 - p) ** 3) == pytest.approx(p, rel=0.15)
     assert level.adjusted(1e-9) == pytest.approx(3e-9)
-    same = together(flat(), [one[0]] * 3)  # one test made three times is one test
+    same = common_level(flat(), [one[0]] * 3)  # one test made three times is one test
     assert same.adjusted(0.1) == pytest.approx(0.1, rel=0.15)
 
 
@@ -369,9 +371,9 @@ def test_likelihood_prefers_the_usual_size():
     far = Cause("zero", (1,), np.eye(3)[:, [0]] * 3e-3, np.array([1e-3]), "m")
     assert chi_square(found, near).chi2 == chi_square(found, far).chi2 == 625.0
     assert change(found, far).value[0] == pytest.approx(10 * change(found, near).value[0])
-    assert likelihood(found, near) > likelihood(found, far) + 5
-    wide = joined([near, Cause("zero", (2,), np.eye(3)[:, [2]], np.array([1e-3]), "m")])
-    assert likelihood(found, wide) < likelihood(found, near)
+    assert twice_log_odds(found, near) > twice_log_odds(found, far) + 5
+    wide = joined_causes([near, Cause("zero", (2,), np.eye(3)[:, [2]], np.array([1e-3]), "m")])
+    assert twice_log_odds(found, wide) < twice_log_odds(found, near)
 
 
 def test_nothing_explains_noise():

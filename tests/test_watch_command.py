@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved import Known, load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
@@ -21,7 +21,7 @@ from pkmcal.judge import new_data
 from pkmcal.judge.causes import magnification, magnified
 from pkmcal.judge.changes import change
 from pkmcal.judge.held import Trust, evidence, hold
-from pkmcal.judge.watch import watch
+from pkmcal.judge.watch import watch_machine
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.report.calibration import save
@@ -135,7 +135,7 @@ def test_configurations_that_the_calibration_used_are_left_out(demo, later, cali
             entry["photographs"] = digests(session)[name]
 
     spoiled(calibration, listed)
-    found = watch(calibration, session)
+    found = watch_machine(calibration, session)
     assert found.document()["known_configurations"] == known
     assert found.document()["configurations"] == list(session.configurations[2:])
     assert f"made from configuration {known[0]} and {known[1]}" in found.verdict.warnings[0]
@@ -227,10 +227,12 @@ def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, st
     whole = replace(session, stations=(lost, *session.stations))
 
     def without_the_first(saved, session, *rest):
-        return new_data.look(saved, session.of_stations([1], ("by hand/1 is left out",)), *rest)
+        return new_data.measured_new_data(
+            saved, session.of_stations([1], ("by hand/1 is left out",)), *rest
+        )
 
-    monkeypatch.setattr("pkmcal.judge.watch.look", without_the_first)
-    found = watch(load(demo.calibration), whole, same_place=[stayed.name])
+    monkeypatch.setattr("pkmcal.judge.watch.measured_new_data", without_the_first)
+    found = watch_machine(load(demo.calibration), whole, same_place=[stayed.name])
     assert found.same_place == (stayed.name,)
     assert not found.moved
     assert not found.judged.changed
@@ -316,15 +318,15 @@ def test_half_a_millimetre_in_five_photographs(tmp_path):
     drawing, camera = load_mechanism("gough-stewart"), demo_camera()
     settings = Settings(stations=3, configurations=8)
     truth = simulate_session(tmp_path / "before", drawing, camera, settings, seed=11)
-    save(calibrate(tmp_path / "before"), tmp_path / "calibration")
+    save(calibrate_session(tmp_path / "before"), tmp_path / "calibration")
     kept = load(tmp_path / "calibration")
     for seed in range(5):
         folder = tmp_path / f"same{seed}"
         photographed(folder, drawing, truth.machine, camera, 100 + seed, configurations=5)
-        assert watch(kept, folder).verdict.usable
+        assert watch_machine(kept, folder).verdict.usable
     off = changed(truth.machine, "legs[3].length.offset", 0.5e-3)
     folder = photographed(tmp_path / "off", drawing, off, camera, 303, stations=2, configurations=5)
-    found = watch(kept, folder)
+    found = watch_machine(kept, folder)
     first = found.judged.findings[0].suspect
     assert not found.verdict.usable
     assert "leg 3 has changed" in found.verdict.headline

@@ -61,7 +61,7 @@ LOOKS = {
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
 def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
-    monkeypatch.setattr(legs, "WINDOW", window)
+    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", window)
     photographs, seen, fresh = many()
     look(photographs, seen)
     assert fresh.most == window
@@ -74,7 +74,7 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 def test_windows_change_nothing(monkeypatch, name):
     photographs, seen, _ = many()
     whole = LOOKS[name](photographs, seen)
-    monkeypatch.setattr(legs, "WINDOW", 4)
+    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", 4)
     found = LOOKS[name](photographs, seen)
     assert found.rejected == whole.rejected
     for field in fields(whole.edges):
@@ -87,7 +87,7 @@ def test_windows_change_nothing(monkeypatch, name):
 
 def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
     photographs, seen, _ = many()
-    monkeypatch.setattr(legs, "WINDOW", 4)
+    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", 4)
     few = photographs.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
     of_few = LOOKS["measure"](photographs.select(few), seen[few]).blur
@@ -126,7 +126,7 @@ def session(demo):
 def test_so_many_bytes_of_a_session_stay_decoded(session, monkeypatch):
     sizes = [np.prod(station.camera.image_size) for station in session.stations]
     each = len(session.stations[0].photographs)
-    monkeypatch.setattr(recognise, "KEPT", int(sizes[0] * each + sizes[1]))
+    monkeypatch.setattr(recognise, "KEPT_PHOTOGRAPH_BYTES", int(sizes[0] * each + sizes[1]))
     kept = [
         [p.images[k] is p.images[k] for k in range(len(p.images))]
         for p in read_photographs(session)

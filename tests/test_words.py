@@ -15,10 +15,16 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
-from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
-from pkmcal.identify.sentences import MOST
+from pkmcal.identify.motions import (
+    NamedChanges,
+    Situation,
+    candidates,
+    hanging_together,
+    movable_leg_groups,
+)
+from pkmcal.identify.sentences import MOST_SENTENCES
 from pkmcal.identify.tool import _around, platform_by_parameters, pose_by_parameters
-from pkmcal.identify.unidentified import describe, seen_legs, seen_through_boards, vectors
+from pkmcal.identify.unidentified import describe, direction_vectors, seen_legs, seen_through_boards
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
 from pkmcal.mechanisms.carriers.slider import Slider
@@ -84,7 +90,7 @@ def told_of(scene: Scene, *views):
     told = identifiability(Information(assembled.problem, state), scene.machine)
     edges = measurements.edges
     seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
-    null = vectors(told.unidentified, machine)
+    null = direction_vectors(told.unidentified, machine)
     return told, seen, describe(Situation(machine, seen, scene.poses[0]), null)
 
 
@@ -330,7 +336,7 @@ def test_any_basis_of_the_space_gives_the_same_words():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
     told, seen, expected = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
     machine = scene.machine.with_values(scene.theta[0])
-    null = vectors(told.unidentified, machine)
+    null = direction_vectors(told.unidentified, machine)
     mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
     again = describe(Situation(machine, seen, scene.poses[0]), mix @ null)
     assert [s.text for s in again] == [s.text for s in expected]
@@ -351,7 +357,7 @@ def test_many_open_directions_stay_readable():
     rng = np.random.default_rng(1)
     null = rng.normal(size=(25, len(machine.parameters))) * machine.parameters.tolerance
     sentences = describe(Situation(machine, np.ones((1, 6), bool), poses), null)
-    assert 0 < len(sentences) <= MOST
+    assert 0 < len(sentences) <= MOST_SENTENCES
     assert sum(s.dimensions for s in sentences) == 25
 
 
@@ -478,8 +484,8 @@ def test_one_pose_does_not_hide_what_others_show():
 
 def test_groups_follow_what_stations_share():
     seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
-    assert (1, 4) in groups(seen)
-    assert (2, 5) in groups(seen)
+    assert (1, 4) in movable_leg_groups(seen)
+    assert (2, 5) in movable_leg_groups(seen)
     assert [tuple(np.flatnonzero(g)) for g in hanging_together(seen)] == [tuple(range(6))]
     apart = seen_from([1, 2], [3, 4], [4, 5], [6])
     parts = {tuple(np.flatnonzero(g).tolist()) for g in hanging_together(apart)}
@@ -507,7 +513,7 @@ def test_carriers_name_motions_of_their_own_numbers(carrier):
     """What a carrier's file says of itself, for every carrier."""
     assert carrier.called
     parameters = np.random.default_rng(0).normal(size=len(carrier.parameters))
-    places = set(re.findall(r"``{(\w+)}``", Motion.__doc__ or ""))
+    places = set(re.findall(r"``{(\w+)}``", NamedChanges.__doc__ or ""))
     for motion in carrier.motions(parameters, np.array([0.1, np.nan, 0.3])):
         assert motion.columns.shape[0] == len(parameters)
         assert np.isfinite(motion.columns).all()

@@ -23,7 +23,7 @@ from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.report import parameters
 from pkmcal.report.identifiability import held as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
-from pkmcal.report.parameters import TIGHT, bound_together, grouped, tight_pairs
+from pkmcal.report.parameters import TIGHT_CORRELATION, bound_together, grouped, tight_pairs
 from pkmcal.solver.search import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
@@ -241,10 +241,10 @@ def test_pairs_that_a_finding_names_are_not_said_again():
 def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
     _, _, estimate = told_of(name)
     table, said = estimate.machine.parameters, bound_together(estimate)
-    part = parameters.together(estimate)
+    part = parameters.correlations_part(estimate)
     (heat,) = part.plots[0].figure["data"]
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
-    assert bool(said) == (abs(closest) > TIGHT)
+    assert bool(said) == (abs(closest) > TIGHT_CORRELATION)
     for i, j, rho in tight_pairs(estimate)[:1]:
         assert (
             f"{table.in_words(table.names[i])} and {table.in_words(table.names[j])}" in part.text[0]

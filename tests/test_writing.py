@@ -24,7 +24,7 @@ from pkmcal.files import (
     write_folder,
     write_text,
 )
-from pkmcal.files.writing import COMMITTED
+from pkmcal.files.writing import COMMITTED_FOLDER
 
 
 def everything_in(folder):
@@ -131,8 +131,8 @@ from pkmcal.commands import finish as end
 
 session, new, keep, made = map(Path, sys.argv[1:])
 found = pickle.loads(made.read_bytes())
-pkmcal.calibration.calibrate.calibrate = lambda *_, **_more: found
-write, out = calibrate.write, session / "calibration"
+pkmcal.calibration.calibrate.calibrate_session = lambda *_, **_more: found
+write, out = calibrate.write_outcome, session / "calibration"
 old = keep / "old"
 shutil.copytree(out, old)
 
@@ -170,7 +170,7 @@ def again_and_again(outcome, folder, files, over):
     shutil.copytree(out, new)
 
 
-calibrate.write = again_and_again
+calibrate.write_outcome = again_and_again
 sys.exit(cli.main(["calibrate", str(session), "--quiet"]))
 """
 
@@ -280,7 +280,7 @@ def test_of_an_earlier_result_no_file_stays(tmp_path):
 
 
 def test_a_replacement_that_cannot_be_finished_is_told(tmp_path, monkeypatch):
-    write_text(tmp_path / COMMITTED / "new" / "a", "1")
+    write_text(tmp_path / COMMITTED_FOLDER / "new" / "a", "1")
 
     def refuse(*_):
         raise PermissionError(13, "Permission denied")

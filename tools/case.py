@@ -14,7 +14,7 @@ from pkmcal.calibration.recognise import platform_poses, read_photographs, recog
 from pkmcal.observe import legs
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
-from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
 
 
 class Case:
@@ -26,7 +26,7 @@ class Case:
     @cached_property
     def folder(self) -> Path:
         """The session's folder."""
-        return simulated(self.work / "demo", SEED)
+        return simulated(self.work / "demo", DEMO_SEED)
 
     @cached_property
     def session(self) -> Session:
@@ -61,6 +61,6 @@ class Case:
 def simulated(folder: Path, seed: int) -> Path:
     """A session like the demonstration's, made where it is not there yet."""
     if not folder.exists():
-        machine = pkmcal.load_mechanism(MECHANISM)
-        simulate_session(folder, machine, demo_camera(), SETTINGS, seed=seed)
+        machine = pkmcal.load_mechanism(DEMO_MECHANISM)
+        simulate_session(folder, machine, demo_camera(), DEMO_SETTINGS, seed=seed)
     return folder

@@ -225,7 +225,7 @@ def measured_places(case: Case) -> Places:
         blur = profiles.estimate_blur(seen.across)
         dull = profiles.without_highlights(seen.across)
         curves = profiles.residual_curves(dull, blur)
-        chances = profiles.likelihood(dull, curves)
+        chances = profiles.shift_log_likelihoods(dull, curves)
         about = legs._leg_lines(chances, seen.places.along, seen.full, seen.tubes)
         at = profiles.locate(dull, curves, about)
         tube = seen.tubes.tube[np.nonzero(seen.full)[1]]

@@ -22,7 +22,7 @@ import pkmcal
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.check import pictures
 from pkmcal.check.check import check_session
-from pkmcal.judge.validate import validate
+from pkmcal.judge.validate import validate_calibration
 from pkmcal.outcome import Outcome
 from pkmcal.pages import page
 from pkmcal.report import calibration, validation
@@ -81,7 +81,7 @@ def confirmed(work: Path) -> str:
     out = work / "out"
     if not (out / "calibration.json").exists():
         calibration.save(calibrated(session(work), HELD_OUT), out)
-    return page.page_html(validation.outcome_of(validate(out, session(work))))
+    return page.page_html(validation.outcome_of(validate_calibration(out, session(work))))
 
 
 def laid_over(folder: Path) -> str:

@@ -23,13 +23,13 @@ import numpy as np
 
 import pkmcal
 from pkmcal.arrays import Array
-from pkmcal.commands.comparison import compare
+from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.pages import page
-from pkmcal.planning.plan import plan as make_plan
+from pkmcal.planning.plan import plan_measurements as make_plan
 from pkmcal.planning.subject import of_machine
 from pkmcal.report import pictures, scene
 from pkmcal.report import residuals as shown
@@ -45,8 +45,14 @@ from pkmcal.simulation import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
-from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
+from pkmcal.view.server import (
+    LOOPBACK_ADDRESS,
+    application,
+    listening_socket,
+    new_token,
+    serve_until_interrupted,
+)
 from pkmcal.view.viewed import Viewed
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -104,7 +110,7 @@ def result(case: Case) -> Shot:
         " differences {{ '{:g}'.format(scene.factor) }} times enlarged, ellipses of 2σ"
         " {{ '{:g}'.format(scene.spread_factor) }} times</p></div></div>"
     )
-    body = template.render(shot=shot, view=scene.views(drawn)[0], scene=drawn)
+    body = template.render(shot=shot, view=scene.plane_projections(drawn)[0], scene=drawn)
     style = (
         ".grid { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
         ".grid p { font-size: 15px; line-height: 1.35; margin: 8px 4px 0; color: #58626d; }"
@@ -202,7 +208,7 @@ def _edge_scores(case: Case, seed: int) -> Array:
     """
     truth, rng = case.truth, np.random.default_rng(seed)
     drawing = case.session.machine
-    machine = true_machine(drawing, SETTINGS.tolerance, rng)
+    machine = true_machine(drawing, DEMO_SETTINGS.tolerance, rng)
     edges, joints = simulate_edges(
         machine,
         truth.T_camera_base,
@@ -249,7 +255,7 @@ def accuracy(case: Case) -> None:
     for folder, count in ((case.folder, 6), (_larger(case.work / "larger", 15), 15)):
         found = pkmcal.calibrate(folder)
         tell(f"{count} configurations a station, {sum(found.timings.values()):.1f} s")
-        compared = compare(found, folder)
+        compared = compare_with_truth(found, folder)
         for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
             tell(
                 f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
@@ -259,9 +265,9 @@ def accuracy(case: Case) -> None:
 
 def _larger(folder: Path, count: int) -> Path:
     if not folder.exists():
-        machine = pkmcal.load_mechanism(MECHANISM)
-        settings = replace(SETTINGS, configurations=count)
-        simulate_session(folder, machine, demo_camera(), settings, seed=SEED)
+        machine = pkmcal.load_mechanism(DEMO_MECHANISM)
+        settings = replace(DEMO_SETTINGS, configurations=count)
+        simulate_session(folder, machine, demo_camera(), settings, seed=DEMO_SEED)
     return folder
 
 
@@ -304,16 +310,16 @@ def photograph(shot: Shot, path: Path) -> None:
 
 def served(session: Session) -> str:
     """The address at which a session is to be viewed, until this program ends."""
-    found, token = listening(0), new_token()
+    found, token = listening_socket(0), new_token()
     port = found.getsockname()[1]
     app = application(Viewed(session, None), token, port)
-    Thread(target=serve, args=(app, found), daemon=True).start()
-    return f"http://{LOOPBACK}:{port}/{token}/"
+    Thread(target=serve_until_interrupted, args=(app, found), daemon=True).start()
+    return f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
 
 
 def plan(_case: Case) -> Shot:
     """Where a plan puts three cameras round a hexapod: the page's drawing in space."""
-    machine = pkmcal.load_mechanism(MECHANISM)
+    machine = pkmcal.load_mechanism(DEMO_MECHANISM)
     subject = of_machine(machine, [demo_camera()], machine.joint_names)
     found = outcome_of(make_plan(subject, free_places=3))
     kept = tuple(part for part in found.parts if part.name == "where")

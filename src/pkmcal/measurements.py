@@ -18,11 +18,11 @@ Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
 OWN_SHADING = 0.015
 """Standard deviation (px) of what shading adds to one edge beside what all of its line have in
 common, where light is even; highlights and what metal mirrors add ten times as much."""
-ALIKE = np.radians(7.0)
+SHADING_ALIKE_ANGLE = np.radians(7.0)
 """Angle between the normals of two edges of one side of a tube at one station over which their
-shading ceases to be the same, by exp(-angle / ALIKE): what a surface mirrors, and where its
-highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree by half at 5
-degrees once what all have in common is taken off."""
+shading ceases to be the same, by exp(-angle / SHADING_ALIKE_ANGLE): what a surface mirrors, and
+where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree by
+half at 5 degrees once what all have in common is taken off."""
 BREATHING_SIGMA = 1.5e-3
 """Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
 focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pkmcal.errors import PkmcalError
 
-Source = Literal["paper", "prototype", "ours"]
+FigureSource = Literal["paper", "prototype", "ours"]
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Row:
 
     name: str
     cells: tuple[str, ...]
-    source: Source = "ours"
+    source: FigureSource = "ours"
     mark: Mark | None = None
 
 

@@ -6,12 +6,12 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
-MINUS = "\N{MINUS SIGN}"
-SCALES = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
+MINUS_SIGN = "\N{MINUS SIGN}"
+SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
 """Factor and name of the unit that the report shows, by the unit inside."""
 
 LARGEST_DECIMALS = 6
-LEG = re.compile(r"legs\[(\d+)\]\.(.+)")
+LEG_PARAMETER_NAME = re.compile(r"legs\[(\d+)\]\.(.+)")
 
 
 def decimals(sigma: float) -> int:
@@ -30,7 +30,7 @@ def number(value: float, places: int, signed: bool = False) -> str:
     if float(text) == 0:
         return text.lstrip("-")
     if value < 0:
-        return MINUS + text[1:]
+        return MINUS_SIGN + text[1:]
     return f"+{text}" if signed else text
 
 
@@ -41,7 +41,7 @@ def brief(value: float) -> str:
 
 def amount(value: float, unit: str) -> str:
     """A positive magnitude in m or rad, as ``0.07 mm`` or ``0.3°``."""
-    scale, name = SCALES[unit]
+    scale, name = SHOWN_UNITS[unit]
     return with_unit(brief(value * scale), name)
 
 
@@ -58,7 +58,7 @@ def count(n: float, thing: str) -> str:
 
 def split_name(name: str) -> tuple[int | None, str]:
     """Leg number from 1 (None where the parameter has none) and what is left of the path."""
-    match = LEG.fullmatch(name)
+    match = LEG_PARAMETER_NAME.fullmatch(name)
     return (int(match[1]), match[2]) if match else (None, name)
 
 
@@ -110,7 +110,7 @@ def percent(share: float) -> str:
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"
 
 
-def ratio(value: float, sigma: float) -> str:
+def ratio_in_per_cent(value: float, sigma: float) -> str:
     """The size of a ratio in per cent, with its standard deviation where that is known."""
     if not math.isfinite(sigma):
         return f"some {100 * abs(value):.1g} %"

@@ -11,7 +11,7 @@ import numpy as np
 import printers
 from fuzz import pictures
 from pkmcal.cameras import load_camera
-from pkmcal.cameras.files import FORMATS, foreign_text
+from pkmcal.cameras.files import CAMERA_FILE_FORMATS, foreign_text
 from pkmcal.commands.cli import main
 from pkmcal.files import Exif, csv_text, with_exif, yaml_text
 from pkmcal.geometry.rigid import look_at, pose, rotation
@@ -186,7 +186,7 @@ def cameras(folder: Path) -> None:
         path = folder / f"{name}.yaml"
         path.write_text(yaml_text(fields))
         camera = load_camera(path)
-        for form in FORMATS:
+        for form in CAMERA_FILE_FORMATS:
             if form == "ros" and name == "unified":
                 continue
             (folder / f"{name}.{form}.yaml").write_text(foreign_text(camera, path, form))

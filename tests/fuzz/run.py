@@ -138,18 +138,18 @@ def _look_at(folder: Path) -> None:
     """What the page of `pkmcal view` asks for of every station, without serving it."""
     from pkmcal.session.load import load_session
     from pkmcal.view.found import found
-    from pkmcal.view.overlay import overlay
+    from pkmcal.view.overlay import overlay_after_gesture
     from pkmcal.view.requests import LookRequest
-    from pkmcal.view.server import page_html
+    from pkmcal.view.server import view_page_html
     from pkmcal.view.viewed import Viewed
 
     viewed = Viewed(load_session(folder), None)
-    page_html(viewed)
+    view_page_html(viewed)
     for k, station in enumerate(viewed.session.stations):
         if station.photographs:
             viewed.jpeg(k, 0)
             look = LookRequest(station=k, photograph=0)
-            overlay(viewed, look)
+            overlay_after_gesture(viewed, look)
             found(viewed, look)
 
 

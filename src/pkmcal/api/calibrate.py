@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.calibrate import calibrate as run
+from pkmcal.calibration.calibrate import calibrate_session as run
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.report.calibration import save
 from pkmcal.report.rrd import write_rrd

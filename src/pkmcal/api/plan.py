@@ -13,8 +13,8 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.region import Region
-from pkmcal.planning.plan import CAPTURE, MeasurementPlan
-from pkmcal.planning.plan import plan as run
+from pkmcal.planning.plan import CONFIGURATIONS_A_CAPTURE, MeasurementPlan
+from pkmcal.planning.plan import plan_measurements as run
 from pkmcal.planning.subject import as_it_stands, of_machine
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import demo_camera
@@ -23,7 +23,7 @@ from pkmcal.simulation.demo import demo_camera
 def plan(
     subject: Session | Machine | Path | str,
     *,
-    count: int = CAPTURE,
+    count: int = CONFIGURATIONS_A_CAPTURE,
     index: Literal["tool", "D", "E", "O1"] = "tool",
     after: SavedCalibration | Path | str | None = None,
     places: int | None = None,

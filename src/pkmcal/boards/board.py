@@ -17,19 +17,28 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Metres, Schema, Share, closest, read_yaml, shown, validate
+from pkmcal.files import (
+    Document,
+    Metres,
+    Schema,
+    Share,
+    closest,
+    read_yaml,
+    shown,
+    validated_document,
+)
 
 Count = Annotated[int, Field(ge=3, le=100)]
 Counts = tuple[Count, Count]
 InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
 Length = Annotated[Metres, Field(gt=0)]
-Tolerance = Annotated[
+BoardSizeTolerance = Annotated[
     Share, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
 ]
-PRINTED = 1e-3
+PRINTED_SIZE_TOLERANCE = 1e-3
 """Standard deviation of a printed board's size, relative, unless its file says otherwise: paper
 moves by as much with the air's moisture, and printers' feeds differ by more."""
-LONGEST = 5.0
+LONGEST_SQUARE_SIDE = 5.0
 """m; a square or marker longer than this was written in millimetres."""
 
 
@@ -49,7 +58,7 @@ class _Dictionary(Schema):
 
 
 def _metres(length: float) -> float:
-    if length > LONGEST:
+    if length > LONGEST_SQUARE_SIDE:
         raise ValueError(f"{length:g} looks like millimetres; lengths are wanted in metres")
     return length
 
@@ -62,7 +71,7 @@ class CharucoSchema(_Dictionary):
     square: Length = Field(description="the length of a square's side in metres")
     marker: Length = Field(description="the length of a marker's side in metres")
     legacy: bool = False
-    tolerance: Tolerance = PRINTED
+    tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
     @field_validator("square", "marker")
     @classmethod
@@ -80,7 +89,7 @@ class ChessboardSchema(Schema):
     corners: InnerCorners | None = None
     squares: Counts | None = Field(default=None, validate_default=True)
     square: Length = Field(description="the length of a square's side in metres")
-    tolerance: Tolerance = PRINTED
+    tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
     @field_validator("squares")
     @classmethod
@@ -109,7 +118,7 @@ class GridSchema(_Dictionary):
     marker: Length = Field(description="the length of a marker's side in metres")
     gap: Length = Field(description="the distance between two markers in metres")
     first_id: Annotated[int, Field(ge=0)] = 0
-    tolerance: Tolerance = PRINTED
+    tolerance: BoardSizeTolerance = PRINTED_SIZE_TOLERANCE
 
     @field_validator("marker", "gap")
     @classmethod
@@ -117,7 +126,7 @@ class GridSchema(_Dictionary):
         return _metres(length)
 
 
-SCHEMAS: dict[str, type[Schema]] = {
+BOARD_SCHEMAS: dict[str, type[Schema]] = {
     "charuco": CharucoSchema, "chessboard": ChessboardSchema, "aruco_grid": GridSchema,
 }  # fmt: skip
 
@@ -141,7 +150,7 @@ class Board:
     @property
     def tolerance(self) -> float:
         """Standard deviation of its size, relative: all squares are larger or smaller alike."""
-        return self.document.get("tolerance", PRINTED)
+        return self.document.get("tolerance", PRINTED_SIZE_TOLERANCE)
 
     @property
     def described(self) -> str:
@@ -193,15 +202,15 @@ def load_board(path: Path | str, label: str | None = None) -> Board:
 def board_from_document(document: Document) -> Board:
     """The board of a file's fields, checked."""
     kind = document.data.get("type")
-    if not isinstance(kind, str) or kind not in SCHEMAS:
-        guess = closest(str(kind), SCHEMAS)
+    if not isinstance(kind, str) or kind not in BOARD_SCHEMAS:
+        guess = closest(str(kind), BOARD_SCHEMAS)
         raise InputError(
             "no such type of board" if kind is not None else "the board's type is missing",
             where=document.where("type"),
             found=kind,
-            expected=guess or " or ".join(SCHEMAS),
+            expected=guess or " or ".join(BOARD_SCHEMAS),
         )
-    fields: Any = validate(document, SCHEMAS[kind])
+    fields: Any = validated_document(document, BOARD_SCHEMAS[kind])
     data = fields.model_dump(mode="json", exclude_none=True)
     if kind == "aruco_grid":
         return _marker_grid(fields, data)

@@ -14,7 +14,7 @@ from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import CameraFit, Views, covariance_of, views_of
 from pkmcal.boards.selection import (
-    TERMS,
+    DISTORTION_CANDIDATES,
     Candidate,
     HeldOut,
     best_of,
@@ -33,19 +33,19 @@ from pkmcal.wording import listed
 
 LEAST_VIEWS = 3
 GOOD_VIEWS = 6
-UNFIT = 3.0
+UNFIT_MODEL_RATIO = 3.0
 """A model whose left-out error is so many times another's is refused; less, and worse, warned."""
 LEAST_SURE = 0.02
 """Share of the focal length that its standard deviation may reach; a machine of a metre would be
 2 cm off."""
-EXPLAINED = 0.004
+HELD_OUT_ERROR_LIMIT = 0.004
 """Held-out error as a share of the image's width from which no model explains the photographs."""
-STANDS_OUT = 2.5
-FACING = 15.0
+ODD_VIEW_RMS_FACTOR = 2.5
+FACING_CAMERA_TILT = 15.0
 """degrees; boards tilted by less all say the same about the focal length."""
-CELLS = (8, 6)
-COVERED = 0.5
-STRONG = 0.95
+COVERAGE_CELLS = (8, 6)
+LEAST_COVERED_SHARE = 0.5
+STRONG_INTRINSICS_CORRELATION = 0.95
 """Correlation from which two intrinsics are named as hardly told apart."""
 
 
@@ -104,7 +104,7 @@ class CameraCalibration:
             (names[i], names[j], float(rho[i, j]))
             for i in range(len(names))
             for j in range(i + 1, len(names))
-            if abs(rho[i, j]) >= STRONG
+            if abs(rho[i, j]) >= STRONG_INTRINSICS_CORRELATION
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
@@ -166,7 +166,7 @@ def calibrate_camera(
     check_enough(used, len(detections))
     image_size = used[0].image_size
     views = views_of(used, board)
-    pool = camera_candidates(thinned(views), image_size, tuple(TERMS))
+    pool = camera_candidates(thinned(views), image_size, tuple(DISTORTION_CANDIDATES))
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)
@@ -204,7 +204,7 @@ def calibrate_camera(
 
 
 def _check_known(model: str) -> None:
-    known = ("auto", *TERMS)
+    known = ("auto", *DISTORTION_CANDIDATES)
     if model not in known:
         raise InputError(
             "no such camera model",
@@ -239,7 +239,7 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
     if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
         return []
     ratio = chosen.left_out / best.left_out
-    if ratio > UNFIT:
+    if ratio > UNFIT_MODEL_RATIO:
         raise InputError(
             f"the model {model} does not fit the photographs",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
@@ -280,7 +280,7 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
 
 def check_explained(rms: float, camera: Camera) -> None:
     """Raise `ResultError` where not even the best model explains the photographs."""
-    limit = EXPLAINED * camera.image_size[0]
+    limit = HELD_OUT_ERROR_LIMIT * camera.image_size[0]
     if rms <= limit:
         return
     raise ResultError(
@@ -301,10 +301,11 @@ def tilts(T_camera_board: Array, points: Array) -> Array:
 
 
 def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
-    """Corners in each cell of the picture, CELLS columns and rows, (rows, columns)."""
+    """Corners in each cell of the picture, COVERAGE_CELLS columns and rows, (rows, columns)."""
     flat = pixels[np.isfinite(pixels).all(axis=-1)]
     edges = [
-        np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip(image_size, CELLS, strict=True)
+        np.linspace(-0.5, size - 0.5, n + 1)
+        for size, n in zip(image_size, COVERAGE_CELLS, strict=True)
     ]
     return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
 
@@ -336,13 +337,13 @@ def warnings_of(calibration: CameraCalibration) -> list[str]:
             " deviations contain it."
         )
     most = tilts(c.T_camera_board, c.board.points).max()
-    if most < FACING:
+    if most < FACING_CAMERA_TILT:
         found.append(
             f"The board is tilted by {most:.0f} degrees at most; tilts of 20 to 45 degrees tell the"
             " focal length better."
         )
     covered = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    if covered < COVERED:
+    if covered < LEAST_COVERED_SHARE:
         found.append(
             f"Corners cover {100 * covered:.0f} % of the picture; outside, the camera is"
             " extrapolated."
@@ -357,7 +358,7 @@ def warnings_of(calibration: CameraCalibration) -> list[str]:
     found += [
         f"The residuals of {name} are {rms / middle:.1f} times those of the middle photograph."
         for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True)
-        if rms > STANDS_OUT * middle
+        if rms > ODD_VIEW_RMS_FACTOR * middle
     ]
     # xi with f, and the like: known together, not alone
     others = [

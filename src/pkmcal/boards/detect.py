@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
-    LEAST_CORNERS,
+    LEAST_CORNERS_FOUND,
     Markers,
     charuco_detector,
     detect_board,
@@ -27,15 +27,15 @@ from pkmcal.observe.images import decode
 from pkmcal.session.photographs import photograph_header
 from pkmcal.wording import listed
 
-LOOKED_AT = 3
+BOARD_PHOTOGRAPHS_EXAMINED = 3
 """Photographs that are examined more closely; one good one is enough."""
-NEIGHBOURS = 2
+SQUARE_MISCOUNTS_TRIED = 2
 """Counts each way by which a description of a chessboard is tried wrong."""
 MOST_SQUARES = 16
-WIDEST = 512
+COUNTING_IMAGE_WIDTH = 512
 """px; photographs are reduced to this width to try many counts of a chessboard on them: each try
 takes a quarter of a second there, a second and more at full size."""
-FAMILY = 1000
+LARGEST_FAMILY_DICTIONARY = 1000
 """Markers in the largest dictionary of a family, whose first ones are the smaller dictionaries."""
 OTHER_MARKER = 0.1
 """Part by which markers must differ from their description: their corners are found to half a
@@ -45,7 +45,7 @@ LEAST_MARKER = 10.0
 LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
-THREADS = 2
+BOARD_SEARCH_THREADS = 2
 
 
 def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:
@@ -56,7 +56,7 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     """
     files = [Path(path) for path in paths]
     size = _common_size(files)
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
         found = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
         if not any(detection.found for detection in found):
             # Before all that can be tried is tried on photographs of something else.
@@ -103,7 +103,7 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
     shown = [path for path, _ in seen]
     size = found[0].image_size
     other: str | None = None
-    for path, detection in seen[:LOOKED_AT]:
+    for path, detection in seen[:BOARD_PHOTOGRAPHS_EXAMINED]:
         # One photograph alone may show something beside the board that looks like more of it.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
@@ -117,7 +117,7 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
             break
     if other is not None:
         raise _another(shown[0], other, board)
-    for path in missed[:LOOKED_AT]:
+    for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
         other = other_board(decode(path, size, path.name), board, part=not shown)
         if other is not None and not shown:
             raise _another(path, other, board)
@@ -244,9 +244,9 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
     if counts == (0, 0):
         candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
     else:
-        span = range(-NEIGHBOURS, NEIGHBOURS + 1)
+        span = range(-SQUARE_MISCOUNTS_TRIED, SQUARE_MISCOUNTS_TRIED + 1)
         candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
-    scale = WIDEST / image.shape[1]
+    scale = COUNTING_IMAGE_WIDTH / image.shape[1]
     if scale < 1:
         small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         image = small
@@ -283,7 +283,7 @@ def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | Non
     ]
     scored = [(_found(image, data, ids, corners), data) for data in layouts]
     mine = _found(image, board.document, ids, corners)
-    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS, mine[0] + 1)]
+    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS_FOUND, mine[0] + 1)]
     if not scored:
         return None
     data = max(scored, key=lambda item: item[0])[1]
@@ -311,7 +311,11 @@ def _found(
 def _other_markers(image: Integers, mine: str) -> str | None:
     """The dictionary whose markers the photograph shows; the smallest that has them all."""
     # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search finds either's.
-    wanted = [n for n in dictionaries() if _size_of(n) in (FAMILY, NO_SIZE) or n == mine]
+    wanted = [
+        n
+        for n in dictionaries()
+        if _size_of(n) in (LARGEST_FAMILY_DICTIONARY, NO_SIZE) or n == mine
+    ]
     # some names differ by a capital only
     names = list({name.lower(): name for name in wanted}.values())
     ids = {name: detect_markers(image, dictionary(name)).ids for name in names}

@@ -22,31 +22,31 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 
-STEPS = 12
-SETTLED = 1e-3
+CORNER_FIT_STEPS = 12
+CORNER_FIT_SETTLED = 1e-3
 """px; a thirtieth of what the noise of a good photograph does."""
-FARTHEST = 0.25
+FARTHEST_CORNER_MOVE = 0.25
 """Squares by which the fit may move a corner that a detector has found."""
 LEAST_RADIUS, MOST_RADIUS = 2.5, 14
 """px; below, the window holds too few pixels for seven unknowns, above, lines bend."""
-BLURS = (0.25, 4.0)
+CORNER_BLUR_RANGE = (0.25, 4.0)
 """px; outside, the window shows something other than a corner."""
 LEAST_SHARE = 0.6
 """Share of the window's variance that a corner explains; shadows and fingers leave less."""
 LONGEST_STEP = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
 """Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
-REACH = 0.25
+CORNER_WINDOW_REACH = 0.25
 """Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
-BENT = 0.02
+UNMODELLED_EDGE_BEND = 0.02
 """px by which an edge may leave its tangent within the window before its bend is put in."""
-CLEAR = 0.9
+BLANK_BORDER_SHARE = 0.9
 """Share of the blank border between edge and marker that the window may fill."""
-LEAST_CORNERS = 6
+LEAST_CORNERS_FOUND = 6
 """Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
-WHOLE = 0.75
+WHOLE_CHESSBOARD_SHARE = 0.75
 """Share of a chessboard's corners that must look like corners: what is found there is the whole
 board, or something else."""
-SMALL = 1000
+FULL_SIZE_ONLY_WIDTH = 1000
 """px; pictures wider than this are tried at half their size as well."""
 STRAIGHT_ENOUGH = 0.35
 """Share of a square by which a corner may lie off the middle of its two neighbours' line."""
@@ -65,12 +65,16 @@ def detect_board(image: Integers, board: Board, name: str = "", quick: bool = Fa
         raw, mirrored, why = (_charuco if board.type == "charuco" else _marker_grid)(image, board)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
-    if len(raw[0]) < LEAST_CORNERS:
+    if len(raw[0]) < LEAST_CORNERS_FOUND:
         return Detection(name, size, *nothing, reason=why)
     fitted = _fitted(image, board, raw)
     ids, good = raw[0], fitted.good
     weak = tuple(int(i) for i in ids[~good])
-    least = WHOLE * len(board.points) if board.type == "chessboard" else LEAST_CORNERS
+    least = (
+        WHOLE_CHESSBOARD_SHARE * len(board.points)
+        if board.type == "chessboard"
+        else LEAST_CORNERS_FOUND
+    )
     if good.sum() < least or _on_a_line(board.points[ids[good], :2]):
         why = f"only {good.sum()} of {len(board.points)} corners are sharp and uncovered"
         return Detection(name, size, *nothing, reason=why, weak=weak)
@@ -92,7 +96,7 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
         # By one threshold alone five times as fast: enough where it shows the whole board.
         for detector, enough in (
             (charuco_detector(board.document, quick=True), len(board.points)),
-            (charuco_detector(board.document), LEAST_CORNERS),
+            (charuco_detector(board.document), LEAST_CORNERS_FOUND),
         ):
             corners, ids, _, marker_ids = detector.detectBoard(picture)
             markers = max(markers, _length(marker_ids))
@@ -239,7 +243,7 @@ def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
     if quick:
         return
     yield cv2.createCLAHE(3.0, (8, 8)).apply(image), 1.0
-    if image.shape[1] > SMALL:
+    if image.shape[1] > FULL_SIZE_ONLY_WIDTH:
         yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0
 
@@ -295,23 +299,25 @@ def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
     data = board.document
     if board.type == "aruco_grid":
         module = 1 / (marker_bits(data["dictionary"]) + 2)
-        reach = min(REACH, 0.8 * data["gap"] / data["marker"])
+        reach = min(CORNER_WINDOW_REACH, 0.8 * data["gap"] / data["marker"])
         axes = _marker_axes(ids, pixels)
-        plain = refine(image, pixels, axes, Window(reach, CLEAR * module, False))
-        touching = refine(image, pixels, axes, Window(reach, CLEAR * module, True))
+        plain = refine(image, pixels, axes, Window(reach, BLANK_BORDER_SHARE * module, False))
+        touching = refine(image, pixels, axes, Window(reach, BLANK_BORDER_SHARE * module, True))
         # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
         right = plain.good.sum() > touching.good.sum() or (
             np.median(plain.sigma) <= np.median(touching.sigma)
         )
         return plain if right else touching
-    margin = REACH
+    margin = CORNER_WINDOW_REACH
     if board.type == "charuco":
-        margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
-    window = Window(REACH, margin, True)
+        margin = min(
+            CORNER_WINDOW_REACH, BLANK_BORDER_SHARE * 0.5 * (1 - data["marker"] / data["square"])
+        )
+    window = Window(CORNER_WINDOW_REACH, margin, True)
     fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
     # How lines bend is told by the fitted corners; the detector's are too rough for it.
     sides, bends = _axes(board, ids, fitted.pixels)
-    if np.abs(bends).max() * REACH**2 / 2 < BENT:
+    if np.abs(bends).max() * CORNER_WINDOW_REACH**2 / 2 < UNMODELLED_EDGE_BEND:
         return fitted
     return refine(image, fitted.pixels, sides, window, bends, fitted)
 
@@ -592,9 +598,9 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fitted:
     """
     fit = _Fit.begun(grey, weight, shape, p)
     out = _Fitted(np.empty_like(p), np.empty_like(grey), np.empty((len(p), 7, 7)))
-    for more in reversed(range(STEPS)):
+    for more in reversed(range(CORNER_FIT_STEPS)):
         fit, step = fit.stepped()
-        on = (np.abs(step[:, :2]).max(axis=1) >= SETTLED) & (more > 0)
+        on = (np.abs(step[:, :2]).max(axis=1) >= CORNER_FIT_SETTLED) & (more > 0)
         settled = fit.select(~on)
         for all_of_them, these in zip(out, (settled.p, settled.left, settled.normal), strict=True):
             all_of_them[settled.number] = these
@@ -654,9 +660,9 @@ def _judged(start: Array, fitted: _Fitted, grey: Array, weight: Array, scale: Ar
     blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
     good = (
         (left < (1 - LEAST_SHARE) * variance)
-        & (blur > BLURS[0] / 2)
-        & (blur < np.maximum(BLURS[1], 0.2 * scale))
-        & (moved < np.maximum(1.5, FARTHEST * scale))
+        & (blur > CORNER_BLUR_RANGE[0] / 2)
+        & (blur < np.maximum(CORNER_BLUR_RANGE[1], 0.2 * scale))
+        & (moved < np.maximum(1.5, FARTHEST_CORNER_MOVE * scale))
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )

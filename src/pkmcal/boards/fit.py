@@ -29,10 +29,10 @@ LEAST_KNOWN = 1e-14
 """Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
-ROUNDS = 12
-STEPS = 20
+CAMERA_FIT_ROUNDS = 12
+CAMERA_FIT_STEPS = 20
 """Most steps of a round; a long valley, such as that of xi and f, is followed over several."""
-SETTLED = 1e-3
+CAMERA_FIT_SETTLED = 1e-3
 """Change of the corners' weights and relative change of tau that end the rounds."""
 
 
@@ -181,7 +181,11 @@ class CameraFit:
 
 
 def fit_camera(
-    camera: Camera, free: Integers, views: Views, T_camera_board: Array, rounds: int = ROUNDS
+    camera: Camera,
+    free: Integers,
+    views: Views,
+    T_camera_board: Array,
+    rounds: int = CAMERA_FIT_ROUNDS,
 ) -> CameraFit:
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
     seen = views.seen
@@ -190,7 +194,7 @@ def fit_camera(
     tau, cut, converged, off = 1.0, 4.0, True, views.pixels
     for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
-        found = minimise(problem, state, max_steps=STEPS)
+        found = minimise(problem, state, max_steps=CAMERA_FIT_STEPS)
         state, converged = found.state, found.stop[0] is Stop.CONVERGED
         off = _off(with_free(camera, free, state), state, views)
         dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
@@ -199,7 +203,11 @@ def fit_camera(
         distance = np.sum(np.nan_to_num(off) ** 2, axis=-1) / (views.sigma**2 + (robust * cut) ** 2)
         new_weight = np.where(seen, final_weights(np.sqrt(distance)), 0.0)
         change = np.abs(new_weight - weight).max(initial=0.0)
-        done = cut == 1.0 and change < SETTLED and abs(new_tau - tau) <= SETTLED * max(tau, new_tau)
+        done = (
+            cut == 1.0
+            and change < CAMERA_FIT_SETTLED
+            and abs(new_tau - tau) <= CAMERA_FIT_SETTLED * max(tau, new_tau)
+        )
         weight, tau, cut = new_weight, new_tau, max(cut / 2, 1.0)
         if done:
             break
@@ -222,7 +230,7 @@ def refit(fit: CameraFit, views: Views, kept: Integers) -> CameraFit:
     )  # fmt: skip
 
 
-def fit_poses(
+def fit_board_poses(
     camera: Camera, views: Views, T_camera_board: Array, scale: Array
 ) -> tuple[Array, Array]:
     """Poses (V, 4, 4) alone, each view on its own, and their costs (V,). scale : (V, N)."""
@@ -336,8 +344,8 @@ def settled_poses(camera: Camera, views: Views, start: Array | None = None) -> A
     """Poses (V, 4, 4) by least squares, the better of each view's two tilts."""
     start = linear_poses(camera.ray(views.pixels), views.points) if start is None else start
     scale = views.seen.astype(float)
-    first, cost = fit_poses(camera, views, start, scale)
-    second, other = fit_poses(camera, views, tilted_back(first, views.points), scale)
+    first, cost = fit_board_poses(camera, views, start, scale)
+    second, other = fit_board_poses(camera, views, tilted_back(first, views.points), scale)
     return np.where((other < cost)[:, None, None], second, first)
 
 

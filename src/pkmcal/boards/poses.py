@@ -5,7 +5,7 @@ their noise; corners far off lose their weight, and a board that is partly hidde
 is seen of it. A board on the platform is somewhere else in every configuration, each of which is
 one measurement, by the mean of its repeats (:func:`one_a_configuration`). A board on the base is
 always in the same place: its photographs are one measurement, by the means of their corners
-(:func:`standing`).
+(:func:`standing_board`).
 
 A pose's uncertainty here is that of its corners: their noise in the picture, and what camera
 model and board leave unexplained. What the camera's calibration may be wrong by is not in it.
@@ -26,13 +26,13 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.detect import THREADS
+from pkmcal.boards.detect import BOARD_SEARCH_THREADS
 from pkmcal.boards.find import detect_board
 from pkmcal.boards.fit import (
     BoardPoses,
     Views,
     board_poses,
-    fit_poses,
+    fit_board_poses,
     tilted_back,
     views_of,
 )
@@ -41,28 +41,28 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
-from pkmcal.wording import listed, ratio
+from pkmcal.wording import listed, ratio_in_per_cent
 
-UNEXPLAINED = 0.004
+BOARD_RESIDUAL_LIMIT = 0.004
 """Share of the image's width that corners lie off their prediction, rms, from which the board file
 or the camera file is wrong; good ones leave a hundredth of it."""
-LEAST_CORNERS = 6
+LEAST_CORNERS_WEIGHED = 6
 """Corners with weight below which a pose is not tested by any corner."""
 TWO_TILTS = 25.0
 """Chi square by which a board must speak against its other tilt, which looks alike from afar."""
-UNSURE = "the board: too few corners agree on one pose, or its tilt is not sure"
-STILL = 0.2
+UNSURE_BOARD_REASON = "the board: too few corners agree on one pose, or its tilt is not sure"
+STILL_BOARD_DIFFERENCE = 0.2
 """px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
 tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
-SURE = 4.0
+MOVED_BOARD_DEVIATIONS = 4.0
 """Standard deviations of a photograph's own noise beyond that."""
 MOST_ODD = 1 / 3
 """Share of the photographs that may disagree one by one; with more, the board was never still."""
 _EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
     "station show the board in one place"  # fmt: skip
 MOST_COMMON = 0.99
-ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
-FAR = 5.0
+ODD_BOARD_REASON = "the board lies {:.1f} standard deviations from where the repeats show it"
+ODD_BOARD_DEVIATIONS = 5.0
 """Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
 which it is not one of them."""
 
@@ -96,7 +96,7 @@ class BoardViews:
     def rejected(self) -> tuple[Rejection, ...]:
         """Photographs without a pose, with the reason."""
         missed = [(k, f"the board: {d.reason}") for k, d in enumerate(self.detections) if d.reason]
-        unsure = [(int(k), UNSURE) for k in self.shown[~self.usable]]
+        unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.shown[~self.usable]]
         return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
 
     def rejection(self, photograph: int, reason: str) -> Rejection:
@@ -113,7 +113,7 @@ def detect_in(
         # Taken in the thread, so that photographs may be decoded there.
         return detect_board(images[k], board, names[k], quick=True)
 
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
         return tuple(pool.map(detect, range(len(names))))
 
 
@@ -129,7 +129,7 @@ def detect_again(
         return tuple(found)
     chosen = [missed[k] for k in evenly(len(missed), most)]
     out = list(found)
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
         again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
         for k, detection in zip(chosen, again, strict=True):
             out[k] = detection
@@ -155,7 +155,7 @@ def board_views(
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
-    usable = (used >= LEAST_CORNERS) & _one_tilt(camera, views, poses)
+    usable = (used >= LEAST_CORNERS_WEIGHED) & _one_tilt(camera, views, poses)
     seen = BoardViews(
         station, camera, board, configuration, tuple(detections), shown, views, poses, rms, usable
     )
@@ -182,8 +182,8 @@ def _one_tilt(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
     if not len(poses.T_camera_board):
         return np.zeros(0, dtype=bool)
     scale = np.sqrt(poses.weight / (views.sigma**2 + poses.noise**2))
-    first, cost = fit_poses(camera, views, poses.T_camera_board, scale)
-    second, other = fit_poses(camera, views, tilted_back(first, views.points), scale)
+    first, cost = fit_board_poses(camera, views, poses.T_camera_board, scale)
+    second, other = fit_board_poses(camera, views, tilted_back(first, views.points), scale)
     # Where both searches end in one place there is no other tilt.
     same = np.linalg.norm((second - first)[:, :3, :3], axis=(1, 2)) < 1e-3
     return same | (other > cost + TWO_TILTS)
@@ -211,7 +211,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
 
 def _check_explained(seen: BoardViews) -> None:
     """Raise `InputError` where the corners do not lie as board and camera files say."""
-    limit = UNEXPLAINED * seen.camera.image_size[0]
+    limit = BOARD_RESIDUAL_LIMIT * seen.camera.image_size[0]
     if not len(seen.rms) or np.median(seen.rms) <= limit:
         return
     worst = int(np.argmax(seen.rms))
@@ -250,7 +250,7 @@ class Standing:
         return replace(found, by_intrinsics=by)
 
 
-def standing(seen: BoardViews) -> Standing | None:
+def standing_board(seen: BoardViews) -> Standing | None:
     """The board's one pose in a station's photographs; None where none shows it surely.
 
     Raises `InputError` where the board or the camera was moved between photographs.
@@ -295,7 +295,9 @@ def _places(seen: BoardViews) -> tuple[Array, Array]:
 
 def _agreed(there: Array, noise: Array, usable: Booleans) -> Booleans:
     """(F,) the photographs that agree with the one that agrees with the most others."""
-    limit = np.sqrt(STILL**2 + SURE**2 * (noise[:, None] ** 2 + noise**2))
+    limit = np.sqrt(
+        STILL_BOARD_DIFFERENCE**2 + MOVED_BOARD_DEVIATIONS**2 * (noise[:, None] ** 2 + noise**2)
+    )
     agree = (_distance(there[:, None], there) <= limit) & usable & usable[:, None]
     return agree[int(np.argmax(agree.sum(axis=1)))]
 
@@ -408,7 +410,7 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     # Of two that differ nobody knows which is wrong, so both stay and their scatter tells.
     several = groups.count[groups.member] > 2
     usual = float(np.median(off[several])) if several.any() else 1.0
-    used = (off < FAR * max(1.0, usual)) | ~several
+    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~several
     kept = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
     mean, stated = kept.mean(delta), kept.mean(covariance_used)
@@ -442,7 +444,7 @@ def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Re
     common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
     found = mean_poses(rows, seen.poses.T_camera_board[kept], seen.poses.covariance[kept], common)
     odd = tuple(
-        seen.rejection(int(seen.shown[kept[k]]), ODD.format(found.off[k]))
+        seen.rejection(int(seen.shown[kept[k]]), ODD_BOARD_REASON.format(found.off[k]))
         for k in np.flatnonzero(~found.used)
     )
     poses = pose_set(seen.station, rows[found.first], mount, found.pose, found.covariance)
@@ -462,7 +464,7 @@ def size_departure(poses: PoseSet, mount: int, file: str) -> Departure:
 
     def says(value: Array, sigma: Array) -> tuple[str, str]:
         return (
-            f"The board's squares are {ratio(value[0], sigma[0])}"
+            f"The board's squares are {ratio_in_per_cent(value[0], sigma[0])}"
             f" {'larger' if value[0] > 0 else 'smaller'} than {file} says",
             "Measure them over as many as there are; if a ruler agrees, multiply square and marker"
             f" by {1 + value[0]:.5f}",

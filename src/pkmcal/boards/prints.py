@@ -20,19 +20,19 @@ from pkmcal.boards.find import dictionary, marker_bits
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 
-POINT = 0.0254 / 72
+PDF_POINT = 0.0254 / 72
 """m; PDF's unit of length."""
-PAPERS = {
+PAPER_SIZES = {
     "a4": (0.210, 0.297), "letter": (0.2159, 0.2794), "a3": (0.297, 0.420),
     "tabloid": (0.2794, 0.4318), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189),
 }  # fmt: skip
 """Width and height, m, upright."""
-BORDER, LETTERING = 0.008, 0.022
+UNPRINTABLE_EDGE_WIDTH, LETTERING_STRIP_WIDTH = 0.008, 0.022
 """m; what printers leave white at an edge, and the strip for ruler and words at the left and below:
 a board needs white paper round it as well."""
-RULERS = (0.2, 0.1, 0.05)
+PRINTED_RULER_LENGTHS = (0.2, 0.1, 0.05)
 """m; lengths of the lines to measure, the longest that is no longer than the board."""
-LETTER = 8
+PRINTED_LETTER_POINTS = 8
 """Points."""
 
 
@@ -108,25 +108,34 @@ def _modules(name: str, number: int) -> Booleans:
 def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
     """A PDF page with the board in true size, and the paper's name.
 
-    paper : one of PAPERS; the smallest ISO size that holds the board unless told. Besides the board
-    there are two lines of a stated length, and what the board is. Raises InputError where the
+    paper : one of PAPER_SIZES; the smallest ISO size that holds the board unless told. Besides the
+    board there are two lines of a stated length, and what the board is. Raises InputError where the
     paper is too small.
     """
     printed = Print.of(board)
     size = np.array([printed.x[-1] - printed.x[0], printed.y[-1] - printed.y[0]])
     name, page = _page(size, paper)
-    corner = np.array([LETTERING, BORDER]) + (page - size - LETTERING - BORDER) / 2
+    corner = (
+        np.array([LETTERING_STRIP_WIDTH, UNPRINTABLE_EDGE_WIDTH])
+        + (page - size - LETTERING_STRIP_WIDTH - UNPRINTABLE_EDGE_WIDTH) / 2
+    )
 
     def on_page(x: float, y: float) -> str:
         """A point right of and below the page's upper left corner, m, as PDF counts."""
-        return f"{x / POINT:.4f} {(page[1] - y) / POINT:.4f}"
+        return f"{x / PDF_POINT:.4f} {(page[1] - y) / PDF_POINT:.4f}"
 
     rectangles = [
-        f"{on_page(x0, y1)} {(x1 - x0) / POINT:.4f} {(y1 - y0) / POINT:.4f} re"
+        f"{on_page(x0, y1)} {(x1 - x0) / PDF_POINT:.4f} {(y1 - y0) / PDF_POINT:.4f} re"
         for x0, y0, x1, y1 in _rectangles(printed, corner)
     ]
-    ruler = next((length for length in RULERS if length <= size.min()), RULERS[-1])
-    left, below = corner[0] - 0.6 * LETTERING, corner[1] + size[1] + 0.35 * LETTERING
+    ruler = next(
+        (length for length in PRINTED_RULER_LENGTHS if length <= size.min()),
+        PRINTED_RULER_LENGTHS[-1],
+    )
+    left, below = (
+        corner[0] - 0.6 * LETTERING_STRIP_WIDTH,
+        corner[1] + size[1] + 0.35 * LETTERING_STRIP_WIDTH,
+    )
     lines = [
         *_ruler(np.array([corner[0], below]), np.array([ruler, 0.0]), on_page),
         *_ruler(np.array([left, corner[1] + size[1]]), np.array([0.0, -ruler]), on_page),
@@ -139,26 +148,29 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
         f"{_described(board)}.",
     ]
     # from the page's edge on where the board is small: beside it there is no room for a line
-    text = [f"BT /F {LETTER} Tf {on_page(min(corner[0], LETTERING), below + 0.005)} Td 10 TL"]
+    text = [
+        f"BT /F {PRINTED_LETTER_POINTS} Tf"
+        f" {on_page(min(corner[0], LETTERING_STRIP_WIDTH), below + 0.005)} Td 10 TL"
+    ]
     text += [f"({_escaped(line)}) Tj T*" for line in words] + ["ET"]
     # all in one path: no seams between neighbours where a viewer smoothes their borders
     content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])
-    return _document(page / POINT, content), name
+    return _document(page / PDF_POINT, content), name
 
 
 def _page(size: Array, paper: str | None) -> tuple[str, Array]:
     """The paper's name and its width and height, m, turned as the board is."""
-    if paper is not None and paper.lower() not in PAPERS:
+    if paper is not None and paper.lower() not in PAPER_SIZES:
         raise InputError(
             "no such paper",
             where="--paper",
             found=paper,
-            expected=closest(paper, PAPERS) or ", ".join(PAPERS),
+            expected=closest(paper, PAPER_SIZES) or ", ".join(PAPER_SIZES),
         )
-    names = [paper.lower()] if paper else [name for name in PAPERS if name.startswith("a")]
-    need = size + LETTERING + BORDER
+    names = [paper.lower()] if paper else [name for name in PAPER_SIZES if name.startswith("a")]
+    need = size + LETTERING_STRIP_WIDTH + UNPRINTABLE_EDGE_WIDTH
     for name in names:
-        short, long = PAPERS[name]
+        short, long = PAPER_SIZES[name]
         for page in (np.array([short, long]), np.array([long, short])):
             if (page >= need).all():
                 return name, page
@@ -166,7 +178,7 @@ def _page(size: Array, paper: str | None) -> tuple[str, Array]:
         "the board is larger than the paper",
         where="--paper" if paper else None,
         found=f"{1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm, and a white border of"
-        f" {1e3 * (LETTERING + BORDER):.0f} mm",
+        f" {1e3 * (LETTERING_STRIP_WIDTH + UNPRINTABLE_EDGE_WIDTH):.0f} mm",
         expected=f"at most {names[-1]}",
         next_step="Take a larger paper" if paper else "Choose smaller or fewer squares",
     )

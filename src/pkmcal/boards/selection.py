@@ -16,8 +16,8 @@ from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.boards.fit import (
     CameraFit,
     Views,
+    fit_board_poses,
     fit_camera,
-    fit_poses,
     inverted,
     linear_poses,
     refit,
@@ -27,18 +27,18 @@ from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.solver.elimination import eliminate
 
-FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
+FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of pixels a radian in the picture's middle, as a share of its width."""
-TRIES = 16
-XIS = (0.0, 0.5, 1.0, 1.5, 2.2)
-KEPT = 3
+FOCALS_TRIED = 16
+XIS_TRIED = (0.0, 0.5, 1.0, 1.5, 2.2)
+CAMERA_STARTS_REFINED = 3
 """Best tries that are refined, over so many rounds of weights: it is a start only."""
-ROUNDS = 3
-FOLDS = 10
+CAMERA_START_ROUNDS = 3
+HELD_OUT_PARTS = 10
 """Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
-CHANCE = 1.5
+CHANCE_DISAGREEMENT_RATIO = 1.5
 """Disagreement of views (square) that chance alone explains, with ten views or so."""
-TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
+DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
     "pinhole": (
         (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
     ),
@@ -54,7 +54,7 @@ LEAST_RAYS = 4
 """Corners that fix a board's pose."""
 LEAST_OF_VIEW = 12
 """Corners that every view keeps, where it has them."""
-HOPELESS = 5.0
+HOPELESS_MODEL_RATIO = 5.0
 """A model that fits so many times worse than another, with two radial terms, gets no more."""
 
 
@@ -81,9 +81,9 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
             scored.append((score, camera, poses))
     scored.sort(key=lambda item: item[0])
     best: CameraFit | None = None
-    for _, camera, poses in scored[:KEPT]:
+    for _, camera, poses in scored[:CAMERA_STARTS_REFINED]:
         settled = settled_poses(camera, views, poses)
-        fit = fit_camera(camera, positions(camera, ()), views, settled, ROUNDS)
+        fit = fit_camera(camera, positions(camera, ()), views, settled, CAMERA_START_ROUNDS)
         if best is None or _level(fit) < _level(best):
             best = fit
     return best
@@ -98,8 +98,8 @@ def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
     width, height = image_size
     kind = camera_models()[model]
     names = kind.parameter_names
-    for scale in np.geomspace(*FOCALS[model], TRIES):
-        for xi in XIS if "xi" in names else (0.0,):
+    for scale in np.geomspace(*FOCAL_RANGES[model], FOCALS_TRIED):
+        for xi in XIS_TRIED if "xi" in names else (0.0,):
             values = dict.fromkeys(names, 0.0)
             values["focal.x"] = values["focal.y"] = float(scale) * width * (1 + xi)
             values["center.x"], values["center.y"] = (width - 1) / 2, (height - 1) / 2
@@ -130,13 +130,13 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
     kept = (fit.weight >= 0.5) & views.seen
     residuals = np.full(views.pixels.shape, np.nan)
     bends: list[Array] = []
-    part_of = np.arange(count) % min(FOLDS, count)
+    part_of = np.arange(count) % min(HELD_OUT_PARTS, count)
     for part in range(part_of.max() + 1):
         out = np.flatnonzero(part_of == part)
         camera = refit(fit, views, np.flatnonzero(part_of != part)).camera
         mine = views.take(out)
         scale = np.where(kept[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
-        poses, _ = fit_poses(camera, mine, fit.T_camera_board[out], scale)
+        poses, _ = fit_board_poses(camera, mine, fit.T_camera_board[out], scale)
         predicted = camera.project(apply(poses[:, None], views.points))
         residuals[out] = np.where(kept[out][..., None], predicted - mine.pixels, np.nan)
         for v in out:
@@ -195,7 +195,7 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     count = len(moved)
     jackknife = (count - 1) / count * off.T @ off
     ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
-    return float(np.sqrt(ratio)) if ratio > CHANCE else 1.0
+    return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
 
 
 def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
@@ -237,14 +237,16 @@ def camera_candidates(
     """Every model with each of its sets of terms, fitted; models without a start are missing."""
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
     # The unified camera fits almost anything: it tells which of the others are hopeless.
-    for model in sorted(models, key=list(TERMS).index, reverse=True):
+    for model in sorted(models, key=list(DISTORTION_CANDIDATES).index, reverse=True):
         start = first_fit(model, views, image_size)
         if start is None:
             continue
-        for terms in TERMS[model]:
+        for terms in DISTORTION_CANDIDATES[model]:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            if "k2" in terms and _level(fit) > HOPELESS * min(_level(f) for _, _, f in fits):
+            if "k2" in terms and _level(fit) > HOPELESS_MODEL_RATIO * min(
+                _level(f) for _, _, f in fits
+            ):
                 break
             # A set that holds this one begins where it ended.
             start = fit if "k1" in terms else start
@@ -253,7 +255,7 @@ def camera_candidates(
     # Judged by the corners in use by the one that fits best.
     judged = (min((fit for _, _, fit in fits), key=_level).weight > 0.5) & views.seen
     pool = [_candidate(model, terms, fit, views, judged) for model, terms, fit in fits]
-    return tuple(sorted(pool, key=lambda c: list(TERMS).index(c.model)))
+    return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
 
 def best_of(pool: tuple[Candidate, ...]) -> Candidate:

@@ -9,15 +9,15 @@ import numpy as np
 from pkmcal.arrays import Integers, evenly
 from pkmcal.boards.board import Board, Detection, load_board
 from pkmcal.boards.detect import check_boards
-from pkmcal.boards.poses import board_views, detect_again, detect_in, standing
+from pkmcal.boards.poses import board_views, detect_again, detect_in, standing_board
 from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 
-ENOUGH = 4
+SLOW_SEARCH_PHOTOGRAPHS = 4
 """Photographs in which a chessboard that stands still is looked for by slow ways."""
-EXAMINED = 2
+OTHER_BOARD_TRIALS = 2
 """Photographs that are examined for another board."""
 
 
@@ -66,12 +66,12 @@ def station_board(
     nowhere = not any(detection.found for detection in detections)
     _check_another(session, board, number, detections)
     # A board that moves says something new in every photograph; a still one is seen enough.
-    most = len(images) if moves else ENOUGH if nowhere else 0
+    most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
     detections = detect_again(images, board, detections, most)
     _check_shown(station.name, board, detections)
     rows = np.array([photo.configuration for photo in station.photographs])
     seen = board_views(number, station.camera, rows, board, detections)
-    stood = None if moves else standing(seen)
+    stood = None if moves else standing_board(seen)
     if not moves and stood is None:
         raise InputError(
             "no photograph shows the board well enough for its pose",
@@ -108,7 +108,7 @@ def _board_by_hand(
     seen = board_views(number, station.camera, rows, board, detections)
     if session.board_body == "platform":
         return detections[0], StationBoard(seen, None)
-    stood = standing(seen)
+    stood = standing_board(seen)
     return detections[0], None if stood is None else StationBoard(seen, stood)
 
 
@@ -119,7 +119,7 @@ def _check_another(
     station = session.stations[number]
     shown = np.flatnonzero([detection.found for detection in detections])
     rows = shown if shown.size else np.arange(len(detections))
-    few = rows[evenly(len(rows), EXAMINED)]
+    few = rows[evenly(len(rows), OTHER_BOARD_TRIALS)]
     paths = [station.photographs[k].path for k in few]
     try:
         check_boards(paths, [detections[k] for k in few], board)

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.geometry.rigid import inverse
 from pkmcal.measurements import PoseSet, Rejection, concatenate
-from pkmcal.session.schema import Body
+from pkmcal.session.schema import BoardBody
 
 if TYPE_CHECKING:
     from pkmcal.boards.poses import BoardViews, Standing
 
-MOUNT = 0
+ONLY_BOARD_MOUNT = 0
 """A session has one board, so one mount."""
 
 
@@ -33,7 +33,9 @@ class StationBoard:
     @property
     def poses(self) -> PoseSet:
         """The measurements that it gives."""
-        return self._moving[0] if self.stood is None else self.stood.poses(self.seen, MOUNT)
+        return (
+            self._moving[0] if self.stood is None else self.stood.poses(self.seen, ONLY_BOARD_MOUNT)
+        )
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
@@ -44,7 +46,7 @@ class StationBoard:
     def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
         from pkmcal.boards.poses import one_a_configuration
 
-        return one_a_configuration(self.seen, MOUNT)
+        return one_a_configuration(self.seen, ONLY_BOARD_MOUNT)
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Boards:
     """
 
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
-    body: Body = "platform"
+    body: BoardBody = "platform"
     tolerance: float = 0.0
 
     __repr__ = short_repr

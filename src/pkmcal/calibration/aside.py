@@ -21,14 +21,14 @@ from pkmcal.mechanisms import Machine
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import count
 
-LEAST = 3
+FEWEST_LEFT_TO_CALIBRATE = 3
 """Configurations without which a calibration of the rest means nothing."""
 
-ROUNDS = 100
-STANDS_OUT = 0.7
+MOST_CLUSTERING_ROUNDS = 100
+NAMED_REGION_OFFSET = 0.7
 """Standard deviations of the whole workspace by which a region must lie off its middle to be named
 by that direction."""
-AXES = (
+REGION_DIRECTION_NAMES = (
     ("turned about −x", "turned about +x"),
     ("turned about −y", "turned about +y"),
     ("turned about −z", "turned about +z"),
@@ -57,7 +57,7 @@ class LeftOut:
     measurements: Measurements
 
 
-def places(machine: Machine, poses: Array) -> Array:
+def points_of_poses(machine: Machine, poses: Array) -> Array:
     """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
     then positions; both from the mean.
     """
@@ -78,7 +78,7 @@ def clusters(points: Array, n: int) -> Integers:
         far = _distances(points, centres).min(axis=1)
         centres = np.concatenate([centres, points[[int(np.argmax(far))]]])
     owner = np.argmin(_distances(points, centres), axis=1)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_CLUSTERING_ROUNDS):
         inside = owner[:, None] == np.arange(n)
         centres = (inside.T @ points) / np.maximum(inside.sum(axis=0), 1)[:, None]
         new = np.argmin(_distances(points, centres), axis=1)
@@ -100,7 +100,7 @@ def spread(points: Array, n: int) -> Integers:
 
 
 def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
-    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`places`."""
+    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`points_of_poses`."""
     owner = clusters(points, n)
     scale = points.std(axis=0)
     scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves
@@ -113,7 +113,11 @@ def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
 def _named(middle: Array) -> str:
     """A region by the two directions in which it lies off the middle the most."""
     order = np.argsort(-np.abs(middle))[:2]
-    words = [AXES[k][int(middle[k] > 0)] for k in order if abs(middle[k]) > STANDS_OUT]
+    words = [
+        REGION_DIRECTION_NAMES[k][int(middle[k] > 0)]
+        for k in order
+        if abs(middle[k]) > NAMED_REGION_OFFSET
+    ]
     return ", ".join(words) or "the middle"
 
 
@@ -130,7 +134,7 @@ def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - n, first.size, "configurations held out")
-    points = places(drawing, whole.state.T_base_platform[rows[at]])
+    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
     out = np.isin(pose, first[spread(points, n)])
     return Neighbours(rows[out], "spread over the workspace")
 
@@ -142,7 +146,7 @@ def by_region(
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - first.size // n, first.size, "regions")
-    points = places(drawing, whole.state.T_base_platform[rows[at]])
+    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
     return tuple(
         replace(region, rows=rows[np.isin(pose, region.rows)])
         for region in regions(points, first, n)
@@ -159,15 +163,20 @@ def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integ
 
 def _check(n: int, left: int, total: int, what: str) -> None:
     """Raise InputError where n poses or regions, of a total, leave too few poses to calibrate."""
-    if n >= 1 and left >= max(LEAST, total // 2) and not (what == "regions" and n < 2):
+    if (
+        n >= 1
+        and left >= max(FEWEST_LEFT_TO_CALIBRATE, total // 2)
+        and not (what == "regions" and n < 2)
+    ):
         return
     least = 2 if what == "regions" else 1
-    most = total if what == "regions" else total - max(LEAST, total // 2)
+    most = total if what == "regions" else total - max(FEWEST_LEFT_TO_CALIBRATE, total // 2)
     if most < least:
         raise InputError(
             "there are too few configurations to hold any out",
             found=f"{count(total, 'pose')} seen",
-            expected=f"{2 * LEAST} at least; configurations whose readings are equal within their"
+            expected=f"{2 * FEWEST_LEFT_TO_CALIBRATE} at least; configurations whose readings"
+            f" are equal within their"
             " noise are of one pose",
             next_step="Photograph more configurations",
         )

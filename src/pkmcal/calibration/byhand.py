@@ -25,14 +25,14 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
+from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MachineTold
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, Alone, find_alone
+from pkmcal.observe.alone import SAME_PLACE_TURN, Alone, find_alone
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
@@ -41,16 +41,16 @@ from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 from pkmcal.wording import brief, listed
 
-SURE = 0.05
+MISPLACED_PROBABILITY = 0.05
 """Probability that any photograph of a session is believed to be where it is not; each has an equal
 share of it."""
-LIKELY = 4
+PLACES_ASKED_AGAIN = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
-GIVEN_UP = "too few of its edges agree with the other photographs"
-TURNED = "all photographs together turn its camera by more than ten degrees"
+EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
+CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
 """Why one is left out that was found in one place and does not belong there."""
-MOST_TURN = ALIKE / 2
+MOST_TURN = SAME_PLACE_TURN / 2
 """Turn (rad) from where a photograph was placed from which on it does not belong there."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
 """Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
@@ -63,7 +63,7 @@ def place(
     photographs: list[legs.Photographs],
     boards: Boards,
     rng: np.random.Generator,
-    told: Progress | None = None,
+    told: CalibrationProgress | None = None,
 ) -> SeenSession:
     """Where all stations stand; photographs by hand that are not found are left out and told.
 
@@ -89,8 +89,8 @@ def place(
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         for k in sorted(found.keys() & known.edges.keys()):
             turn = angle_between(known.T_camera_base[k], found[k].T_camera_base[0])
-            if turn > MOST_TURN and found[k].doubt * len(found) < SURE:
-                lost[k] = TURNED
+            if turn > MOST_TURN and found[k].doubt * len(found) < MISPLACED_PROBABILITY:
+                lost[k] = CAMERA_TURNED_REASON
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
 
@@ -100,7 +100,7 @@ def search_by_hand(
     photographs: list[legs.Photographs],
     boards: Boards,
     known: KnownScene,
-    told: Progress | None = None,
+    told: CalibrationProgress | None = None,
 ) -> tuple[dict[int, Alone], KnownScene]:
     """The places that each photograph by hand could show, by its station's number; and what is
     known with those that are believed, T_camera_base NaN for the others.
@@ -130,7 +130,7 @@ def search_by_hand(
     def believed() -> Array:
         return _believed(found(), len(by_hand), boards, known.T_camera_base)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
         alone = pool.map(partial(_alone, session, known), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _Answer(one, one)
@@ -245,7 +245,7 @@ def _search(
             alone = _alone(session, scene, p)
         elif scene.told.like(before.by):
             asked, by = before.asked, before.by
-    likely = before.places.T_camera_base[:LIKELY]
+    likely = before.places.T_camera_base[:PLACES_ASKED_AGAIN]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
@@ -285,14 +285,14 @@ def _on_board(found: Mapping[int, Alone], boards: Boards) -> dict[int, Alone]:
     own: dict[int, Array] = {}
     for k, T in T_camera_board.items():
         places, evidence = found[k].T_camera_base, found[k].evidence
-        alike = angle_between((T @ T_board_base)[:, None], places) < ALIKE
+        alike = angle_between((T @ T_board_base)[:, None], places) < SAME_PLACE_TURN
         worth = np.where(alike, np.maximum(evidence, 0.0), 0.0)
         total += worth.max(axis=1)
         best = np.argmax(worth, axis=1)
         agrees = np.take_along_axis(worth, best[:, None], axis=1) > 0
         own[k] = np.where(agrees[..., None], places[best], T @ T_board_base)
     order = np.argsort(-total, kind="stable")
-    near = angle_between(T_board_base[order], T_board_base[order[0]]) < ALIKE
+    near = angle_between(T_board_base[order], T_board_base[order[0]]) < SAME_PLACE_TURN
     order = order[~near | (np.arange(len(order)) == 0)]
     return {k: Alone(T[order], total[order], 1.0) for k, T in own.items()}
 
@@ -305,7 +305,7 @@ def _believed(found: dict[int, Alone], count: int, boards: Boards, known: Array)
     """
     out = known.copy()
     for k, one in found.items():
-        if one.doubt * count < SURE:
+        if one.doubt * count < MISPLACED_PROBABILITY:
             out[k] = one.T_camera_base[0]
     seen = [None if np.isnan(T).any() else T for T in out]
     joined = boards.joined(seen)
@@ -332,7 +332,7 @@ def misplaced(
     few = shown.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
     lost = ((2 * kept < count) | (kept < FEWEST_EDGES) | few) & ~by_board
     return {
-        k: GIVEN_UP if lost[k] else TURNED
+        k: EDGES_DISAGREE_REASON if lost[k] else CAMERA_TURNED_REASON
         for k, station in enumerate(session.stations)
         if station.handheld and (lost[k] or astray[k])
     }

@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
-from pkmcal.calibration.departures import Departed, departures
+from pkmcal.calibration.departures import Departed, unmodelled_departures
 from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
     as_stated,
@@ -32,7 +32,7 @@ from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
-    Progress,
+    CalibrationProgress,
     boards_of,
     check_observable,
     legs_stations,
@@ -57,7 +57,7 @@ from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.papers import Method as PaperMethod
+from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
@@ -66,8 +66,8 @@ if TYPE_CHECKING:
     from pkmcal.calibration.aside import LeftOut
     from pkmcal.identify.bed import Bed
 
-Method = Literal["bundle"] | PaperMethod
-METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
+CalibrationMethod = Literal["bundle"] | PaperMethod
+CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,14 +125,14 @@ class Calibration(ShownCalibration):
         )
 
 
-def calibrate(
+def calibrate_session(
     session: Session | Path | str,
     *,
-    method: Method = "bundle",
+    method: CalibrationMethod = "bundle",
     seed: int = 0,
     refine_camera: bool = False,
     holdout: int = 0,
-    progress: Progress | None = None,
+    progress: CalibrationProgress | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
 
@@ -173,13 +173,13 @@ def calibrate(
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
     """Raise InputError for what no caller may ask."""
-    if method not in METHODS:
-        guess = closest(str(method), METHODS)
+    if method not in CALIBRATION_METHODS:
+        guess = closest(str(method), CALIBRATION_METHODS)
         raise InputError(
             "there is no method of this name",
             where="method",
             found=shown(method),
-            expected=guess or listed(METHODS),
+            expected=guess or listed(CALIBRATION_METHODS),
         )
     for name, value in (("seed", seed), ("holdout", holdout)):
         if value < 0:
@@ -249,7 +249,7 @@ def _estimated(
     drawing: Machine,
     turns: Turns,
     richer: tuple[RicherModel, ...],
-    method: Method,
+    method: CalibrationMethod,
     seed: int,
     holdout: int,
     clock: _Clock,
@@ -275,7 +275,7 @@ def _estimated(
 
 
 def _judge(
-    seen: SeenSession, found: _Identified, method: Method, seed: int, clock: _Clock
+    seen: SeenSession, found: _Identified, method: CalibrationMethod, seed: int, clock: _Clock
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
@@ -292,7 +292,9 @@ def _judge(
     departed: tuple[Departed, ...] = ()
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = found.turns
-        departed = departures(session, turns.observation, turns.measurements, found.estimate, ended)
+        departed = unmodelled_departures(
+            session, turns.observation, turns.measurements, found.estimate, ended
+        )
     verdict = judge(
         found.turns.observation,
         found.estimate,
@@ -362,8 +364,8 @@ def _findings(measurements: Measurements, estimate: Estimate, info: Information)
 class _Clock:
     """Seconds by step, each of which may be lapped several times; told : what is being done."""
 
-    def __init__(self, progress: Progress | None) -> None:
-        self.told: Progress = progress or (lambda _text, _share: None)
+    def __init__(self, progress: CalibrationProgress | None) -> None:
+        self.told: CalibrationProgress = progress or (lambda _text, _share: None)
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
 

@@ -32,21 +32,26 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turned_about
-from pkmcal.observe.evidence import StationView, apart, grain, settle
+from pkmcal.observe.alone import FINEST_TABLES, SAME_PLACE_TURN, Alone, distinct, turned_about
+from pkmcal.observe.evidence import StationView, distinct_silhouettes, grain, settle_by_evidence
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
-CLOSER, BEHIND = 8, 12.0
+PLACES_LOOKED_AT_CLOSER, MOST_BEHIND_BEST = 8, 12.0
 """Most places of a photograph that are asked about, and by how many measurements of the search one
 may be behind the best: what is further behind has odds of one in a hundred thousand."""
-FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
-LATER: tuple[float | None, ...] = (legs.REACH, None)
-AT_LAST: tuple[float | None, ...] = (legs.AGAIN, None)
+LOOKS_BY_DRAWING: tuple[float | None, ...] = (
+    legs.LEG_SEARCH_REACH,
+    legs.REPEATED_SEARCH_REACH,
+    None,
+    None,
+)
+LOOKS_BY_TOLD_MACHINE: tuple[float | None, ...] = (legs.LEG_SEARCH_REACH, None)
+AT_LAST: tuple[float | None, ...] = (legs.REPEATED_SEARCH_REACH, None)
 """Pixels within which legs are looked for, one look after the other; None: edges are measured. The
 drawing is off by pixels, a machine that photographs have told is not. AT_LAST follows where all are
 measured already: they are where all together say."""
-NEAR = legs.SEARCH_SIGMA
+SILHOUETTE_SCATTER = legs.SEARCH_SIGMA
 """Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
 leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
 that lie near something; it does not offer legs that lie on it."""
@@ -66,7 +71,13 @@ def join(
     already in some of them, from where they are; with that they are joined first, and looked at
     again from where all put them. Raises a `PkmcalError` where there is nothing to be estimated.
     """
-    looks = (legs.REACH, *AT_LAST) if measured else LATER if known.edges else FIRST
+    looks = (
+        (legs.LEG_SEARCH_REACH, *AT_LAST)
+        if measured
+        else LOOKS_BY_TOLD_MACHINE
+        if known.edges
+        else LOOKS_BY_DRAWING
+    )
     last = _looked(session, photographs, known, places, boards, looks, measured)
     return last.known._replace(told=machine_told(last.measurements, last.estimate))
 
@@ -81,7 +92,7 @@ def ask(
     the same however many they are. Boards are left out: what a place is asked is how the legs look
     from there. Raises a `PkmcalError` where too few legs are where they should be.
     """
-    k, looks = photograph.station, LATER if known.edges else FIRST
+    k, looks = photograph.station, LOOKS_BY_TOLD_MACHINE if known.edges else LOOKS_BY_DRAWING
     alone, places = known._replace(edges={}), {k: T_camera_base}
     last = _looked(session, {k: photograph}, alone, places, Boards(), looks)
     squares = last.estimate.statistics.chi2_drawing + last.estimate.statistics.chi2_joints
@@ -179,29 +190,31 @@ def look_closer(
     one = np.zeros(1, dtype=int)
     view = StationView(
         before.machine, p.camera, p.configuration, session.joints, before.T_base_platform,
-        distance_tables(p.images, *FINEST),
+        distance_tables(p.images, *FINEST_TABLES),
     )  # fmt: skip
-    near = found.evidence > found.evidence[0] - BEHIND * found.unit
-    places = np.concatenate([found.T_camera_base[near][:CLOSER], others])
+    near = found.evidence > found.evidence[0] - MOST_BEHIND_BEST * found.unit
+    places = np.concatenate([found.T_camera_base[near][:PLACES_LOOKED_AT_CLOSER], others])
     # the machine as it is known; where it fits better changed, that is taken
-    settled, evidence = settle(view, places, one, 16, 6, NEAR)
+    settled, evidence = settle_by_evidence(view, places, one, 16, 6, SILHOUETTE_SCATTER)
     seen = AskedPlaces.nothing() if asked is None else asked
     order = np.argsort(-evidence, kind="stable")
     both = np.concatenate([seen.T_camera_base, settled[order]])
     count = len(seen.T_camera_base)
-    order = order[[k - count for k in apart(view, both, one) if k >= count]]
+    order = order[[k - count for k in distinct_silhouettes(view, both, one) if k >= count]]
     at, fits = [*seen.T_camera_base, *settled[order]], [*seen.evidence, *evidence[order]]
     paid, edges = [*seen.paid, *np.zeros(len(order))], [*seen.edges, *[None] * len(order)]
     for number, T in enumerate(places[order], start=count):
         best = max(fit / found.unit - cost for fit, cost in zip(fits, paid, strict=True))
-        if before.edges and fits[number] / found.unit < best - BEHIND:
+        if before.edges and fits[number] / found.unit < best - MOST_BEHIND_BEST:
             break  # what is known of the machine already does not change by so much
         try:
             known, cost = ask(session, p, before, T)
         except PkmcalError:
             continue  # too few legs are where they should be
         changed = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        there, fit = settle(changed, known.T_camera_base[[p.station]], one, 16, 6, NEAR)
+        there, fit = settle_by_evidence(
+            changed, known.T_camera_base[[p.station]], one, 16, 6, SILHOUETTE_SCATTER
+        )
         at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
         edges[number] = known.edges[p.station]
         edges.append(edges[number])
@@ -216,8 +229,8 @@ def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]
     turned = angle_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
-    here = angle_between(at, first) < ALIKE
-    same = here | (turned < ALIKE)
+    here = angle_between(at, first) < SAME_PLACE_TURN
+    same = here | (turned < SAME_PLACE_TURN)
     worth = np.where(same, by_edges - by_edges.max() + by_legs[here].max(), by_legs)
     order = np.argsort(-worth, kind="stable")
     order = order[distinct(view, at[order])]

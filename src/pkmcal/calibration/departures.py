@@ -21,7 +21,7 @@ from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import MOST, Departures, Freed, Score
+from pkmcal.identify.score import MOST_DEPARTURES_SOUGHT, Departures, Freed, Score
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
 from pkmcal.mechanisms.closure import scales
@@ -29,9 +29,9 @@ from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
 
-LEVEL = 0.005
+FALSE_DEPARTURE_CHANCE = 0.005
 """Chance at which any departure at all is found in a session that has none."""
-AGAINST = 1.0
+MOST_TOOL_DEPARTURE = 1.0
 """Standard deviations by which a departure moves the tool, beyond which the result is refused."""
 
 
@@ -57,7 +57,7 @@ class Departed:
     @property
     def against(self) -> bool:
         """Whether the result should not be used for it."""
-        return self.tool > AGAINST
+        return self.tool > MOST_TOOL_DEPARTURE
 
     def document(self) -> dict[str, Any]:
         """For programs."""
@@ -80,7 +80,7 @@ class Departed:
         return f"{self.what}; {moves}, {self.tool:.2g} standard deviations. {self.todo}."
 
 
-def departures(
+def unmodelled_departures(
     session: Session,
     observation: Observation,
     measurements: Measurements,
@@ -98,19 +98,24 @@ def departures(
     )
     first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
     families = [
-        *readings.departures(measurements.joints, columns, units, present[first]),
+        *readings.reading_departures(measurements.joints, columns, units, present[first]),
         list(_lenses(session, observation, measurements)),
         list(_boards(session, measurements)),
         list(_tripods(session, measurements)),
     ]
-    tubes = list(islice(outlines(session, measurements, estimate, LEVEL), MOST))
+    tubes = list(
+        islice(
+            outlines(session, measurements, estimate, FALSE_DEPARTURE_CHANCE),
+            MOST_DEPARTURES_SOUGHT,
+        )
+    )
     families.append([one.departure for one in tubes])
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     tests = Departures(*ended, [one.effect for one in listed], number.tolist(), singles=True)
     known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    found = [*tests.found(LEVEL, [k for k, _ in known]), *known]
+    found = [*tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known]), *known]
     if not found:
         return ()
     used = estimate.configurations
@@ -205,4 +210,4 @@ def _tripods(session: Session, measured: Measurements) -> Iterator[Departure]:
         seen = [x.configuration[x.station == s] for x in (measured.edges, measured.poses)]
         what = "camera" if s < len(session.stations) else "tracker"
         used = np.unique(np.concatenate(seen))
-        yield from moved.departures(s, name, used, session.configurations, what)
+        yield from moved.movement_departures(s, name, used, session.configurations, what)

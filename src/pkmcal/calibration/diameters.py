@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkmcal.calibration.byhand import place
-from pkmcal.calibration.doubts import CURED
+from pkmcal.calibration.doubts import CURED_MISFIT_SHARE
 from pkmcal.calibration.gather import refinement_of
 from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.turns import take_turns
@@ -48,7 +48,7 @@ def check_radii(
     except PkmcalError:  # it is not found in these photographs, or not known by them
         return
     found = turns.estimate
-    cured = found.statistics.noise_scale <= CURED * TOO_NOISY
+    cured = found.statistics.noise_scale <= CURED_MISFIT_SHARE * TOO_NOISY
     kept = 0.0 if estimate is None else estimate.edge_weights.sum()
     if cured and found.edge_weights.sum() > kept:
         raise diameters(seen.session.document["mechanism"])

@@ -27,45 +27,45 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import middle_pose, start_state
-from pkmcal.identify.verdict import POOR, RicherModel
+from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import Session
-from pkmcal.wording import listed, ratio
+from pkmcal.wording import listed, ratio_in_per_cent
 
-BAD = 2.0
+SUSPECT_POSE_SCALE = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
-LOST = 0.1
+SUSPECT_LOST_SHARE = 0.1
 """Share of poses given up from which they are."""
-CURED = 0.5
+CURED_MISFIT_SHARE = 0.5
 """A mistake is believed where, put right, the poses' misfit is at most this part of what it was."""
-FEWEST = 3
+FEWEST_POSES_A_SIDE = 3
 """Poses on either side of a movement: fewer are outliers."""
 OTHER_SIZE = 2e-3
 """Relative difference of a board's size below which the print is as good as printers are."""
-SURE = 1.5
+SURELY_CURED_MISFIT = 1.5
 """Standard deviations that a mistake put right leaves, below which no other is tried."""
-BELIEVED = 0.85
+EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a mistake put right has to explain."""
-CERTAIN = 12.0
+CERTAIN_BOARD_MOVE = 12.0
 """Standard deviations by which a board has to have moved, all six numbers together."""
-ENOUGH = 4.0
+MOST_CURED_MISFIT = 4.0
 """Standard deviations that it may leave: a drawing's own errors are in them."""
-OPEN = 0.7
+UNTOLD_BOARD_SIZE_SIGMA = 0.7
 """Part of its tolerance from which a board's size is known from its file: the data say less."""
-DISAGREES = 2.0
+BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all else from which a hint says so:
 one of these in twenty is chance."""
-SURELY = 3.0
+WRONG_SCALE_DEVIATIONS = 3.0
 """Standard deviations by which a reading's scale is told to be another than the drawing's."""
-SPEAKS = 60.0
+COMMON_FACTOR_CHI2 = 60.0
 """Chi2 by which the drawing has to speak for a common factor on all lengths."""
-HOPELESS = 50.0
+HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
-richer model no help: what is believed ends below ENOUGH."""
+richer model no help: what is believed ends below MOST_CURED_MISFIT."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
-KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
+BOARDS_TURN_WORDS = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,15 @@ class Doubt:
 
 def pose_misfit(estimate: Estimate) -> float:
     """How far off the poses are, in their standard deviations, root mean square of the better
-    BELIEVED of them, given up or not: outliers of another cause should hide nothing.
+    EXPLAINED_POSES_SHARE of them, given up or not: outliers of another cause should hide nothing.
     """
     return _usual(estimate.pose_residuals * estimate.statistics.pose_scale)
 
 
 def _usual(error: Array) -> float:
-    """Root mean square of the better BELIEVED of errors (N, 6), 0 of none."""
+    """Root mean square of the better EXPLAINED_POSES_SHARE of errors (N, 6), 0 of none."""
     each = np.sort(np.mean(error**2, axis=1))
-    few = each[: max(int(np.ceil(BELIEVED * len(each))), 1)]
+    few = each[: max(int(np.ceil(EXPLAINED_POSES_SHARE * len(each))), 1)]
     return float(np.sqrt(np.mean(few))) if few.size else 0.0
 
 
@@ -107,7 +107,9 @@ def in_doubt(estimate: Estimate) -> bool:
     """Whether the poses disagree with the machine so much that a mistake is likely."""
     lost = estimate.pose_weights < 0.5
     return bool(lost.size) and (
-        estimate.statistics.pose_scale > BAD or lost.mean() > LOST or lost.sum() >= 2 * FEWEST
+        estimate.statistics.pose_scale > SUSPECT_POSE_SCALE
+        or lost.mean() > SUSPECT_LOST_SHARE
+        or lost.sum() >= 2 * FEWEST_POSES_A_SIDE
     )
 
 
@@ -127,7 +129,7 @@ def wrong_scale(estimate: Estimate) -> float:
     back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
     gain = np.sum(weight * (new - old) ** 2) - np.sum(weight * (back * new - old) ** 2)
     left = np.sum(weight * (back * new - old) ** 2)
-    return 1 / back if gain > SPEAKS and gain > left else 1.0
+    return 1 / back if gain > COMMON_FACTOR_CHI2 and gain > left else 1.0
 
 
 def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:
@@ -145,9 +147,13 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
         if found is None or doubt.misfit < found.misfit:
             found = doubt
         # a board that moved and a camera that moved are alike, so both are always tried
-        if found.misfit < SURE and doubt.kind not in ("board moved", "camera moved"):
+        if found.misfit < SURELY_CURED_MISFIT and doubt.kind not in ("board moved", "camera moved"):
             break
-    return found if found and found.misfit < min(CURED * before, ENOUGH) else None
+    return (
+        found
+        if found and found.misfit < min(CURED_MISFIT_SHARE * before, MOST_CURED_MISFIT)
+        else None
+    )
 
 
 def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
@@ -171,7 +177,7 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Do
         order[[one, other]] = order[[other, one]]
         doubt = Doubt("order", np.inf, motor=one, other=other)
         mistakes.append((doubt, measurements.joints[:, order]))
-    limit = CURED * _first_misfit(machine, measurements)
+    limit = CURED_MISFIT_SHARE * _first_misfit(machine, measurements)
     ranked = [
         (_first_misfit(machine, replace(measurements, joints=joints)), k)
         for k, (_, joints) in enumerate(mistakes)
@@ -207,7 +213,9 @@ def _tried(machine: Machine, measurements: Measurements, start: State | None) ->
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
-        return bundle(machine, measurements, start, hopeless=HOPELESS, scale_readings=False)
+        return bundle(
+            machine, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
+        )
     except (PkmcalError, np.linalg.LinAlgError):
         return None
 
@@ -219,7 +227,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
         for s in np.unique(poses.station[poses.mount == m]):
             rows = np.flatnonzero((poses.mount == m) & (poses.station == s))
             rows = rows[np.argsort(poses.configuration[rows], kind="stable")]
-            if len(rows) < 2 * FEWEST:
+            if len(rows) < 2 * FEWEST_POSES_A_SIDE:
                 continue
             at = _jump(measurements, estimate, rows)
             later = rows[at:]
@@ -256,7 +264,7 @@ def _certain(T: Array, covariance: Array) -> bool:
     off, spread = pose_difference(T[1], T[0]), covariance.sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(spread), 1e-30))
     white = np.linalg.solve(spread / scale / scale[:, None] + 1e-9 * np.eye(6), off / scale)
-    return bool(np.sqrt(white @ (off / scale)) > CERTAIN)
+    return bool(np.sqrt(white @ (off / scale)) > CERTAIN_BOARD_MOVE)
 
 
 def _camera_moved(
@@ -310,9 +318,9 @@ def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int
     off = off / np.maximum(scale, 1e-3 * max(scale.max(), 1e-12))
     rest = [
         sum(np.abs(part - np.median(part, axis=0)).sum() for part in (off[:at], off[at:]))
-        for at in range(FEWEST, len(rows) - FEWEST + 1)
+        for at in range(FEWEST_POSES_A_SIDE, len(rows) - FEWEST_POSES_A_SIDE + 1)
     ]
-    return FEWEST + int(np.argmin(rest))
+    return FEWEST_POSES_A_SIDE + int(np.argmin(rest))
 
 
 def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
@@ -320,7 +328,7 @@ def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> 
     poses = measurements.poses
     boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
     rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
-    if not boards or len(rows) < 2 * FEWEST:
+    if not boards or len(rows) < 2 * FEWEST_POSES_A_SIDE:
         return
     state = start_state(machine, measurements, estimate.state.T_camera_base)
     there = state.T_base_platform[poses.configuration[rows], :3, 3]
@@ -347,7 +355,7 @@ def check_poses(
 
     richer : models that were tried; where one of them fits, it is the model that is at fault.
     """
-    if not in_doubt(estimate) or any(model.scale < BAD for model in richer):
+    if not in_doubt(estimate) or any(model.scale < SUSPECT_POSE_SCALE for model in richer):
         return
     if error := frozen_in(session):
         raise error
@@ -368,7 +376,7 @@ def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) 
 def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
     """Whether a richer model fits what the estimate's, with noise as stated, does not."""
     best = min((model.scale for model in richer), default=np.inf)
-    return best < max(POOR, CURED * estimate.statistics.pose_scale)
+    return best < max(POOR_MODEL_POSE_SCALE, CURED_MISFIT_SHARE * estimate.statistics.pose_scale)
 
 
 def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
@@ -389,7 +397,7 @@ def richer_models(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel, ...]:
     """How well the mechanism file's richer models fit, where this one is too poor for the poses."""
-    if estimate.statistics.pose_scale < POOR:
+    if estimate.statistics.pose_scale < POOR_MODEL_POSE_SCALE:
         return ()
     machine = session.machine
     unknowns = machine.parameters.free_matrix().shape[1]
@@ -403,7 +411,9 @@ def richer_models(
             if other.parameters.free_matrix().shape[1] <= unknowns or not alike:
                 continue
             start = start_state(other, measurements, estimate.state.T_camera_base)
-            found = bundle(other, measurements, start, hopeless=HOPELESS, scale_readings=False)
+            found = bundle(
+                other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
+            )
         except (PkmcalError, np.linalg.LinAlgError):
             continue
         out.append(RicherModel(name, found.statistics.pose_scale))
@@ -494,16 +504,16 @@ def sizes_told(session: Session, measurements: Measurements, estimate: Estimate)
         # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
         other = max(1 - sigma**2, np.finfo(float).eps)
         without, apart = value / other, abs(value) / np.sqrt(other)
-        if sigma > OPEN:
+        if sigma > UNTOLD_BOARD_SIZE_SIGMA:
             out.append(
                 f"Nothing but {file} tells how large the board is: to {100 * tolerance:.2g} %, its"
                 " tolerance, and standard deviations contain that. Measure its squares over as many"
                 " as there are, correct square and marker, and state how well you measured."
                 + (
                     " All else, the drawing's lengths first, fits best as if the board were"
-                    f" {ratio(tolerance * without, tolerance * sigma / np.sqrt(other))}"
+                    f" {ratio_in_per_cent(tolerance * without, tolerance * sigma / np.sqrt(other))}"
                     f" {'larger' if value > 0 else 'smaller'}."
-                    if apart > DISAGREES
+                    if apart > BOARD_SIZE_DISAGREEMENT
                     else ""
                 )
             )
@@ -528,7 +538,7 @@ def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
         name = session.document["joints"]["columns"][column]
         share = estimate.machine.values[k] / table.drawing[k] - 1
         sigma = float(np.sqrt(estimate.covariance[k, k]))
-        if abs(share) > SURELY * sigma > 0 and name not in named:
+        if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
             more = "larger" if share > 0 else "smaller"
             out[name] = f"{100 * abs(share):.3f} ± {100 * sigma:.3f} % {more} ({name})"
     if not out:
@@ -616,7 +626,7 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
         if len(part) >= FEWEST_POSES:
             found = rotation_axis(part, motion)
             # Noise that is stated a little too small is no reason to doubt a mechanism.
-            doubt = not found.tenable and found.chi2 > POOR**2 * found.dof
+            doubt = not found.tenable and found.chi2 > POOR_MODEL_POSE_SCALE**2 * found.dof
             said = found.sentence
             if not (doubt or found.tenable):
                 off, noise = (
@@ -624,7 +634,8 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
                     for tilt in (found.tilt, found.expected_tilt)
                 )
                 said = (
-                    f"The boards {KEPT[found.hypothesis]} but for {off:.3f}°, where their stated"
+                    f"The boards {BOARDS_TURN_WORDS[found.hypothesis]} but for {off:.3f}°, where"
+                    f" their stated"
                     f" noise alone gives {noise:.3f}°."
                 )
             out.append((doubt, f"{session.station_names[s]}: {said}"))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from pkmcal.measurements import (
     Measurements,
     Mount,
     Observation,
-    PoseSet,
+    Set,
     concatenate,
 )
 from pkmcal.session.load import Session
@@ -221,9 +220,6 @@ def measurements_of(
         shaded=len(measurements.edges) > 0,
         breathing_at=breathing,
     )
-
-
-Set = TypeVar("Set", PoseSet, EdgeSet)
 
 
 def _breathing(measured: Set, cameras: CameraRefinement) -> Set:

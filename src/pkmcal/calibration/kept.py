@@ -13,15 +13,15 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from pkmcal.calibration.results import EVERYTHING, REPORT
+from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
 from pkmcal.files import entries, staged_folder
 
 
 def keep_earlier(
     folder: Path,
     texts: Mapping[str, str | bytes],
-    document: str = EVERYTHING,
-    page: str = REPORT,
+    document: str = CALIBRATION_DOCUMENT_FILE,
+    page: str = CALIBRATION_REPORT_FILE,
 ) -> Path | None:
     """Copy the result that ``folder`` holds into a folder beside it; returns that.
 
@@ -63,7 +63,7 @@ def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page
 def _told(name: str, content: str | bytes) -> object:
     """What a file says, but for how long it took to find out."""
     raw = content if isinstance(content, bytes) else content.encode("utf-8")
-    if name != EVERYTHING:
+    if name != CALIBRATION_DOCUMENT_FILE:
         return raw
     try:
         document = json.loads(raw)

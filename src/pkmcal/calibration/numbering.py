@@ -17,7 +17,7 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
-TRIED = 5
+NUMBERING_CONFIGURATIONS = 5
 """Configurations at which numberings are compared: unlike machines differ at any."""
 LAST_DIGIT = 1e-6
 """m; by as much equal drawings differ that were written with few digits."""
@@ -33,7 +33,7 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     layout, m = machine.layout, machine.n_joints
     if machine.n_legs != m or sorted(layout.actuated.tolist()) != list(range(m)):
         return ()
-    readings = joints[evenly(len(joints), TRIED)]
+    readings = joints[evenly(len(joints), NUMBERING_CONFIGURATIONS)]
     orders = [np.roll(np.arange(m), -first) for first in range(1, m)]
     return tuple(order for order in orders if _alike(machine, readings, order))
 

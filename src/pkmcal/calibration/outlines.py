@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import lines
-from pkmcal.identify.bundle import FREEDOM
+from pkmcal.identify.bundle import SHADING_FREEDOM
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Score
 from pkmcal.measurements import Departure, Effect, Measurements
@@ -24,7 +24,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
 
-SAMPLE = 4000
+DISTANCE_SAMPLE_EDGES = 4000
 """Edges, spread over all, by which it is told how far away each line is."""
 OF_MEDIAN = 1.25
 """Deviation of a median in that of a mean, of normal numbers."""
@@ -88,7 +88,7 @@ def outlines(
         departure = Departure("tube radius", name, _another_radius(j, t, file), by)
         yield Outline(departure, score, value, known)
     z = np.abs(shift) / sigma
-    chance = np.where(np.isin(np.arange(len(keys)), told), 1.0, 2 * stdtr(FREEDOM, -z))
+    chance = np.where(np.isin(np.arange(len(keys)), told), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
     for k in np.argsort(chance, kind="stable").tolist():
         adjusted = 2 * len(keys) * float(chance[k])
         if adjusted > level:
@@ -135,7 +135,9 @@ def _metres(measurements: Measurements, estimate: Estimate, number: Integers, co
     """Metres (n,) on each line's tube that a pixel is."""
     edges, state = measurements.edges, estimate.state
     each, first = np.unique(number, return_index=True)
-    some = np.union1d(first[each >= 0], np.arange(0, len(number), -(-len(number) // SAMPLE)))
+    some = np.union1d(
+        first[each >= 0], np.arange(0, len(number), -(-len(number) // DISTANCE_SAMPLE_EDGES))
+    )
     some = some[number[some] >= 0]
     rows = edges.configuration[some]
     legs = legs_in_camera(

@@ -20,12 +20,12 @@ from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
-LEVEL = 0.005
+FALSE_OUTVOTED_CHANCE = 0.005
 """Chance at which any configuration of a right session disagrees."""
-UNLIKE = 1e-4
+UNLIKELY_EXPLANATION_CHANCE = 1e-4
 """Chance below which one reading, or another configuration's, is no explanation; so small because
 the machine's own uncertainty, about as large as that of a pose, is not counted."""
-WORST = 100.0
+MOST_USUAL_MISFIT = 100.0
 """Times its noise that the better half of a session may be off: with more, nothing fits, and no
 configuration stands out."""
 
@@ -47,16 +47,19 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
         return
     chi2 = _chi2(off, noise)
     usual = max(float(np.median(chi2)) / m, 1.0)  # what the model leaves out, all poses have
-    if usual > WORST**2:
+    if usual > MOST_USUAL_MISFIT**2:
         return
     noise = usual * noise
-    odd = _chance(m, chi2 / usual) < LEVEL / len(which)
+    odd = _chance(m, chi2 / usual) < FALSE_OUTVOTED_CHANCE / len(which)
     odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
     # rows of the table that say what the machine did in each odd one, (n, K)
     every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         rows = machine.inverse(every, np.tile(joints, (len(odd), 1))).reshape(-1, *joints.shape)
-    alike = _chance(m, np.nan_to_num(_chi2(rows - joints, noise[odd, None]), nan=np.inf)) > UNLIKE
+    alike = (
+        _chance(m, np.nan_to_num(_chi2(rows - joints, noise[odd, None]), nan=np.inf))
+        > UNLIKELY_EXPLANATION_CHANCE
+    )
     exchanged = alike[:, own[odd]] & alike[:, own[odd]].T
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     for n, k in enumerate(odd.tolist()):
@@ -68,7 +71,9 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
             continue
         sharp = np.linalg.inv(noise[k])
         value, sigma = (sharp @ off[k]) / np.diag(sharp), 1 / np.sqrt(np.diag(sharp))
-        explains = _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > UNLIKE
+        explains = (
+            _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > UNLIKELY_EXPLANATION_CHANCE
+        )
         if np.count_nonzero(explains) == 1:
             motor = int(np.argmax(explains))
             one = wrong_reading(columns[motor], units[motor], name)

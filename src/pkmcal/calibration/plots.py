@@ -14,10 +14,10 @@ from pkmcal.identify.tool import ToolError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-CALIBRATED, DRAWING, QUIET = "#2a6fb0", "#b5651d", "#888888"
-ROW = 0.17
+CALIBRATED_COLOUR, DRAWING_COLOUR, QUIET_COLOUR = "#2a6fb0", "#b5651d", "#888888"
+PARAMETER_ROW_HEIGHT = 0.17
 """Inches of a parameter's line."""
-REACH = 5.0
+RESIDUAL_PLOT_REACH = 5.0
 """Standard deviations to either side in which residuals are counted one by one."""
 
 
@@ -34,21 +34,22 @@ def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 
-def residuals(values: Array, ax: Axes | None = None) -> Axes:
+def draw_residuals(values: Array, ax: Axes | None = None) -> Axes:
     """Residuals (n,) in standard deviations, beside the normal distribution of noise alone."""
     ax = _axes(ax, (6.0, 3.4))
     if not values.size:
         ax.set_title("There are no edges and no measured poses")
         return ax
-    at = np.linspace(-REACH, REACH, 200)
-    outside = int(np.sum(np.abs(values) > REACH))
-    bins = np.linspace(-REACH, REACH, 51).tolist()
-    ax.hist(np.clip(values, -REACH, REACH), bins=bins, density=True, color=CALIBRATED, alpha=0.6,
+    at = np.linspace(-RESIDUAL_PLOT_REACH, RESIDUAL_PLOT_REACH, 200)
+    outside = int(np.sum(np.abs(values) > RESIDUAL_PLOT_REACH))
+    bins = np.linspace(-RESIDUAL_PLOT_REACH, RESIDUAL_PLOT_REACH, 51).tolist()
+    drawn = np.clip(values, -RESIDUAL_PLOT_REACH, RESIDUAL_PLOT_REACH)
+    ax.hist(drawn, bins=bins, density=True, color=CALIBRATED_COLOUR, alpha=0.6,
             label=f"{values.size} residuals")  # fmt: skip
-    ax.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=QUIET, label="noise alone")
+    ax.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=QUIET_COLOUR, label="noise alone")
     ax.set_xlabel("residual, standard deviations")
     ax.set_ylabel("density")
-    ax.set_title(f"Residuals ({outside} beyond {REACH:g}, in the outermost bars)")
+    ax.set_title(f"Residuals ({outside} beyond {RESIDUAL_PLOT_REACH:g}, in the outermost bars)")
     ax.legend(frameon=False)
     return ax
 
@@ -58,14 +59,14 @@ def parameters(found: FoundParameters, tolerance: Array, ax: Axes | None = None)
     those that a frame or the file holds are left out.
     """
     rows = [k for k, row in enumerate(found) if row.decided_by in ("data", "drawing")]
-    ax = _axes(ax, (6.0, 1.2 + ROW * len(rows)))
+    ax = _axes(ax, (6.0, 1.2 + PARAMETER_ROW_HEIGHT * len(rows)))
     for place, k in enumerate(rows):
         row, size = found[k], float(tolerance[k])
-        colour = CALIBRATED if row.decided_by == "data" else DRAWING
+        colour = CALIBRATED_COLOUR if row.decided_by == "data" else DRAWING_COLOUR
         reach = 2 * row.sigma / size
         ax.errorbar(row.change / size, place, xerr=reach, fmt="o", ms=3, color=colour, lw=1)
-    ax.axvline(0, color=QUIET, linewidth=0.8)
-    ax.axvspan(-1, 1, color=QUIET, alpha=0.12, linewidth=0)
+    ax.axvline(0, color=QUIET_COLOUR, linewidth=0.8)
+    ax.axvspan(-1, 1, color=QUIET_COLOUR, alpha=0.12, linewidth=0)
     ax.set_yticks(range(len(rows)), [found[k].name for k in rows], fontsize=7)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlabel("calibrated less drawing ± 2σ, in tolerances of the drawing")
@@ -80,8 +81,8 @@ def tool(error: ToolError, ax: Axes | None = None) -> Axes:
     order = known[np.argsort(error.position[known])]
     place = np.arange(len(order))
     for values, colour, name in (
-        (error.off_position, DRAWING, "the drawing's error"),
-        (error.position, CALIBRATED, "calibrated, 1σ"),
+        (error.off_position, DRAWING_COLOUR, "the drawing's error"),
+        (error.position, CALIBRATED_COLOUR, "calibrated, 1σ"),
     ):
         ax.plot(place, values[order] * 1e3, "o", ms=4, color=colour, label=name)
     ax.set_yscale("log")

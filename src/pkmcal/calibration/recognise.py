@@ -16,7 +16,7 @@ from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.evidence import StationView
-from pkmcal.observe.images import KEPT, Pictures, fitting
+from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, fitting
 from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session, Station
@@ -31,13 +31,13 @@ stations: a search looks at eight, and of thirty that are asked whether the mach
 surer by one standard deviation says so by 5 of them together. Their tables take 200 to 400 MB."""
 FEWEST_AT_A_STATION = 8
 """However many stations there are: what a search looks at."""
-Progress = Callable[[str, float], None]
+CalibrationProgress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share that is done, 0 to 1."""
-WORKERS = 2
+CALIBRATION_THREADS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
-NEARLY = 2.0
+ALLOWED_LEG_MISS = 2.0
 """Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
-MOST = 0.5
+LEAST_REACHED_SHARE = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
 
@@ -56,7 +56,7 @@ def check_observable(session: Session) -> None:
 
 def read_photographs(session: Session) -> list[legs.Photographs]:
     """The photographs of stations that observe legs, each of which can be decoded; the first that
-    fit into KEPT bytes stay so.
+    fit into KEPT_PHOTOGRAPH_BYTES bytes stay so.
     """
 
     def read(number: int, most: int) -> legs.Photographs:
@@ -66,13 +66,13 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         rows = np.array([p.configuration for p in station.photographs])
         return legs.Photographs(number, station.camera, rows, session.joints[rows], images)
 
-    numbers, room, kept = legs_stations(session), KEPT, list[int]()
+    numbers, room, kept = legs_stations(session), KEPT_PHOTOGRAPH_BYTES, list[int]()
     for number in numbers:
         station = session.stations[number]
         size = station.camera.image_size
         kept.append(min(fitting(size, room), len(station.photographs)))
         room -= kept[-1] * size[0] * size[1]
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
         return list(pool.map(read, numbers, kept))
 
 
@@ -98,8 +98,8 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     except GeometryError as error:  # the drawing is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a drawing that is right to its tolerance may not close
-    near = found.error < NEARLY * session.machine.document.tolerance.center
-    if near.all() or (most and near.mean() > MOST):
+    near = found.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
+    if near.all() or (most and near.mean() > LEAST_REACHED_SHARE):
         _check_turns(session, found.T_base_platform, near)
         return found.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
@@ -206,7 +206,7 @@ def recognise(
         tables = distance_tables(p.images)
         return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
         few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
         views = tuple(pool.map(view, few))
     at = [p.station for p in photographs]
@@ -257,7 +257,7 @@ def _anywhere(
             return before
         return _better(find_station(view, None, rng), before)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
         return list(pool.map(search, views, before, rngs))
 
 
@@ -308,7 +308,7 @@ def station_poses(
     photographs: list[legs.Photographs],
     boards: Boards,
     rng: np.random.Generator,
-    told: Progress | None = None,
+    told: CalibrationProgress | None = None,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
     before any leg is looked for, the search for the legs, and what measured poses tell. NaN of

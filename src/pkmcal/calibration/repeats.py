@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, rms
-from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
 from pkmcal.calibration.recognise import read_photographs
 from pkmcal.errors import InputError
-from pkmcal.files import plain
+from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.measurements import EdgeSet
@@ -26,29 +26,29 @@ from pkmcal.observe import legs
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
     Groups,
-    deviations,
     groups_of,
     odd_ones,
     pixel_units,
     same_edges,
+    turns_from_first,
 )
 from pkmcal.outcome import Finding, Level, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
-SHARED = 0.3
+CAUSE_TOLD_SHARE = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""
-BETTER = 0.1
+LEGS_BETTER_SHARE = 0.1
 """Share by which each leg's own motion must explain more than one of the whole to be the cause."""
-TELLING = 0.9
+MOST_EXPLAINED_BY_CHANCE = 0.9
 """Share that chance explains from which nothing can be told of a motion: too few edges show it."""
 MOSTLY_COMMON = 0.5
 """Scatter, in what photographs promise, below which averaging repeats gains under an eighth."""
-SHUFFLES = 16
+REPEAT_SHUFFLES = 16
 """Exchanges of the repeats that tell what chance explains, to a few hundredths."""
-PAPER = AxisNoise(images=1)
+PAPER_AXIS_NOISE = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
-LEGEND = (
+REPEATS_TABLE_LEGEND = (
     "Standard deviations of one photograph, pooled over the configurations.",
     "ψ: of the leg's direction in the image. θ: towards the camera. x, z: of its",
     "point with y = 0, camera frame; – for a leg level in the image, without one.",
@@ -56,7 +56,7 @@ LEGEND = (
     "Shift, tilt: of its edges, as a whole and at their ends.",
 )
 
-LEVEL = float(np.sin(np.deg2rad(10.0)))
+LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
 """Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
 far away or nowhere (errata)."""
 _RANK = 1e-9
@@ -114,9 +114,9 @@ class StationScatter:
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
-        if self.legs > max(SHARED, whole + BETTER):
+        if self.legs > max(CAUSE_TOLD_SHARE, whole + LEGS_BETTER_SHARE):
             return "legs"
-        return best if whole > SHARED else "noise"
+        return best if whole > CAUSE_TOLD_SHARE else "noise"
 
 
 @dataclass(frozen=True)
@@ -135,23 +135,23 @@ class RepeatStudy:
     def as_dict(self) -> dict[str, Any]:
         """Everything under its name, for ``--json``."""
         causes = [{**asdict(s), "cause": s.cause} for s in self.stations]
-        paper = {name: getattr(PAPER, name) for name in ("psi", "theta", "x", "z")}
+        paper = {name: getattr(PAPER_AXIS_NOISE, name) for name in ("psi", "theta", "x", "z")}
         findings = [finding.document() for finding in self.findings]
         own = asdict(replace(self, findings=()))
-        return plain({**own, "findings": findings, "stations": causes, "paper": paper})
+        return json_value({**own, "findings": findings, "stations": causes, "paper": paper})
 
 
 def study_repeats(
-    session: Session | Path | str, *, seed: int = 0, progress: Progress | None = None
+    session: Session | Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> RepeatStudy:
     """How photographs of the same configurations scatter, by station and leg.
 
-    Raises InputError where the session has no repeats, and what `calibrate` raises.
+    Raises InputError where the session has no repeats, and what `calibrate_session` raises.
     """
     if not isinstance(session, Session):
         session = load_session(session)
     require_repeats(session)
-    calibration = calibrate(session, seed=seed, progress=progress)
+    calibration = calibrate_session(session, seed=seed, progress=progress)
     session = calibration.session  # without photographs by hand that were not placed
     observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
     looks = [_Look.of(calibration, photographs) for photographs in observed]
@@ -225,7 +225,7 @@ class _Look:
         keep = ~odd.any
         edges, photo = edges.select(keep), photo[keep]
         same = same_edges(edges)
-        turn = deviations(edges, same)
+        turn = turns_from_first(edges, same)
         ends = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
         radius = machine.radii_of(edges.leg, edges.tube)
         return cls(
@@ -344,9 +344,9 @@ def _explained(look: _Look, rows: Array, groups: Groups) -> float:
         fit = fit_motions(turn, rows, whiten, groups)
         return float(fit.explained.sum() / max(fit.total.sum(), 1e-300))
 
-    shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(SHUFFLES)]
+    shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(REPEAT_SHUFFLES)]
     chance = float(np.mean(shuffled))
-    return (share(look.turn) - chance) / (1 - chance) if chance < TELLING else 0.0
+    return (share(look.turn) - chance) / (1 - chance) if chance < MOST_EXPLAINED_BY_CHANCE else 0.0
 
 
 @dataclass(frozen=True)
@@ -431,7 +431,7 @@ def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
     across = np.hypot(u[:, 0], u[:, 1])
     psi = (u[:, 0] * du[:, 1] - u[:, 1] * du[:, 0]) / across**2
     theta = du[:, 2] / across
-    uy = np.where(np.abs(u[:, 1]) < LEVEL, np.nan, u[:, 1])[:, None]
+    uy = np.where(np.abs(u[:, 1]) < LEVEL_AXIS_SINE, np.nan, u[:, 1])[:, None]
     ay, day, duy = a[:, 1, None], motion[:, 1, None], du[:, 1, None]
     point = motion[:, :3] - day / uy * u + ay / uy**2 * duy * u - ay / uy * du
     return np.stack([psi, theta, point[:, 0], point[:, 2]], axis=-1)
@@ -465,10 +465,17 @@ def part_of(study: RepeatStudy) -> Part:
     rows = [Row(leg.station, (str(leg.leg), *_cells(leg))) for leg in study.legs]
     rows.append(Row("median", ("", *_cells(study.middle))))
     rows.append(Row("upper bound", ("", *_cells(study.bound))))
-    paper = (_degrees(PAPER.psi), _degrees(PAPER.theta), _mm(PAPER.x), _mm(PAPER.z))
+    paper = (
+        _degrees(PAPER_AXIS_NOISE.psi),
+        _degrees(PAPER_AXIS_NOISE.theta),
+        _mm(PAPER_AXIS_NOISE.x),
+        _mm(PAPER_AXIS_NOISE.z),
+    )
     rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
     columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
-    table = Table("Scatter of repeated photographs", columns, tuple(rows), legend=LEGEND)
+    table = Table(
+        "Scatter of repeated photographs", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND
+    )
     return Part("repeats", "Repeats", tables=(table,))
 
 

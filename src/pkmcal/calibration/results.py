@@ -20,7 +20,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import check_writable, entries, json_text, plain
+from pkmcal.files import check_writable, entries, json_text, json_value
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import BREATHING_SIGMA
@@ -33,13 +33,21 @@ if TYPE_CHECKING:
     from pkmcal.calibration.toolmap import ToolMap
     from pkmcal.identify.unidentified import Findings
 
-MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
-FILES = (REPORT, MECHANISM, EVERYTHING)
+CALIBRATED_MECHANISM_FILE, CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE = (
+    "mechanism.yaml",
+    "calibration.json",
+    "report.html",
+)
+CALIBRATION_RESULT_FILES = (
+    CALIBRATION_REPORT_FILE,
+    CALIBRATED_MECHANISM_FILE,
+    CALIBRATION_DOCUMENT_FILE,
+)
 CAMERA_FILE = re.compile(r"camera-.+\.yaml")
 """Cameras as refined with the machine, where that was asked for."""
-FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
-PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
-CONVENTIONS = (
+FORMAT_KEY, CALIBRATION_FORMAT = "pkmcal_calibration", 1
+PACKAGES_WITH_VERSION = ("numpy", "scipy", "opencv-contrib-python-headless")
+CALIBRATION_CONVENTIONS = (
     "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
     " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not"
     " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
@@ -52,7 +60,7 @@ POSE_COLUMNS = (
 )  # fmt: skip
 """Of a row in residuals.poses, the last six whitened together, in standard deviations."""
 EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
-OPEN = 1.0
+UNTOLD_TARGET_SIGMA = 1.0
 """m or rad; a target's place that is known no better is not told by the data."""
 
 
@@ -66,9 +74,13 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
     folder = Path(folder)
     check_writable(folder)
     standing = entries(folder)
-    foreign = [name for name in standing if name not in FILES and not CAMERA_FILE.fullmatch(name)]
+    foreign = [
+        name
+        for name in standing
+        if name not in CALIBRATION_RESULT_FILES and not CAMERA_FILE.fullmatch(name)
+    ]
     # A mechanism.yaml without the rest is somebody's drawing.
-    if foreign or (standing and EVERYTHING not in standing):
+    if foreign or (standing and CALIBRATION_DOCUMENT_FILE not in standing):
         raise InputError(
             "the output folder holds something other than a calibration",
             where=str(folder),
@@ -92,13 +104,13 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
 def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, str | bytes]:
     """What a calibration leaves on disk besides its page, texts by their files' names.
 
-    document : of :func:`document_of`.
+    document : of :func:`calibration_document`.
     """
     from pkmcal.cameras.files import camera_text
 
     texts: dict[str, str | bytes] = {
-        MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document),
+        CALIBRATED_MECHANISM_FILE: calibrated_mechanism_text(calibration),
+        CALIBRATION_DOCUMENT_FILE: json_text(document),
     }
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
@@ -124,14 +136,15 @@ def calibrated_mechanism_text(calibration: Calibration) -> str:
         f" (method {calibration.method}, seed {calibration.seed}).",
         verdict.headline if verdict.usable else "NOT TO BE USED: " + " ".join(verdict.reasons),
         f"Frames: {calibration.estimate.gauge}. Lengths in metres.",
-        f"Standard deviations, covariance and all else: {EVERYTHING}; for people: {REPORT}.",
+        f"Standard deviations, covariance and all else: {CALIBRATION_DOCUMENT_FILE}; for people:"
+        f" {CALIBRATION_REPORT_FILE}.",
     ]
     # A session's name may hold a line break; what follows it must stay a comment.
     comment = "".join(f"# {' '.join(line.split())}\n" for line in lines)
     return comment + mechanism_text(calibration.machine)
 
 
-def document_of(
+def calibration_document(
     calibration: Calibration,
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
@@ -149,8 +162,8 @@ def document_of(
     bed = calibration.findings.bed
     seen = digests(session) if photographs is None else photographs
     document = {
-        FORMAT_KEY: FORMAT,
-        "conventions": CONVENTIONS,
+        FORMAT_KEY: CALIBRATION_FORMAT,
+        "conventions": CALIBRATION_CONVENTIONS,
         "verdict": asdict(calibration.verdict),
         "method": calibration.method,
         "model": calibration.session.model,
@@ -183,7 +196,7 @@ def document_of(
         "versions": versions(),
         "timings": {name: round(value, 3) for name, value in calibration.timings.items()},
     }
-    return plain(document)
+    return json_value(document)
 
 
 def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
@@ -202,7 +215,7 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
 def versions() -> Mapping[str, str]:
     """Versions of pkmcal, Python and the packages that numbers depend on."""
     found = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
-    for name in PACKAGES:
+    for name in PACKAGES_WITH_VERSION:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -315,7 +328,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
             size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"
         sigma = np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0.0))
-        known = [float(x) if x < OPEN else None for x in sigma]
+        known = [float(x) if x < UNTOLD_TARGET_SIGMA else None for x in sigma]
         out.append(
             {
                 "name": mount.name,

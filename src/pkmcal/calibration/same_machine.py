@@ -12,12 +12,12 @@ from pkmcal.errors import InputError
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
-FAR = 10.0
+OTHER_MACHINE_TOLERANCES = 10.0
 """Tolerances by which two drawings of one machine may differ: a corrected number, not another
 machine's."""
 
 
-def read(
+def read_same_machine(
     calibration: SavedCalibration | Path | str, session: Session | Path | str
 ) -> tuple[SavedCalibration, Session]:
     """Both, where they are not loaded. Raises InputError where the session is another machine's."""
@@ -47,7 +47,7 @@ def _check_machine(saved: SavedCalibration, session: Session) -> None:
     values = table.unit_axes(drawn.values)[own]
     before = saved.drawing[rows], machine.values[rows]
     off = [np.abs(values - v) / table.tolerance[own] for v in before]
-    if min(o.max(initial=0.0) for o in off) > FAR:
+    if min(o.max(initial=0.0) for o in off) > OTHER_MACHINE_TOLERANCES:
         k = int(np.argmax(off[0]))
         raise _another(
             f"{wanted[own[k]]} {before[0][k]:.6g} in its drawing",

@@ -14,9 +14,9 @@ from pydantic import ConfigDict, Field
 
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.results import (
+    CALIBRATION_DOCUMENT_FILE,
+    CALIBRATION_FORMAT,
     EDGE_WEIGHT,
-    EVERYTHING,
-    FORMAT,
     FORMAT_KEY,
     POSE_WEIGHT,
     of_inverse_poses,
@@ -24,14 +24,14 @@ from pkmcal.calibration.results import (
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, read_json, validate
+from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Statistics
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
 from pkmcal.wording import listed
 
-EXACT = 1e-9
+SAVED_NUMBER_ROUNDING = 1e-9
 """Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
 change by hand a millionth."""
 
@@ -265,7 +265,7 @@ class _Saved(_Part):
 def load(source: Path | str) -> SavedCalibration:
     """Read a calibration from its folder or its calibration.json, and check that it is whole."""
     document = _read(Path(source))
-    saved = validate(document, _Saved)
+    saved = validated_document(document, _Saved)
     machine = checked_machine(_mechanism(saved), document, "mechanism")
     _check_parameters(document, saved, machine)
     for group, key in (
@@ -317,22 +317,22 @@ def _mechanism(saved: _Saved) -> MechanismDocument:
 
 
 def _read(source: Path) -> Document:
-    path = source / EVERYTHING if source.is_dir() else source
+    path = source / CALIBRATION_DOCUMENT_FILE if source.is_dir() else source
     if not path.is_file():
         raise InputError(
             "there is no calibration here",
             where=str(source),
-            expected=f"a folder that pkmcal calibrate wrote, or its {EVERYTHING}",
+            expected=f"a folder that pkmcal calibrate wrote, or its {CALIBRATION_DOCUMENT_FILE}",
         )
     document = read_json(path, label=str(path))
     found = document.data.get(FORMAT_KEY)
-    if found != FORMAT:
+    if found != CALIBRATION_FORMAT:
         raise InputError(
             "this is not a calibration of a version that is known" if found else
             "this is not a calibration",
             where=f"{path}, {FORMAT_KEY}",
             found=found,
-            expected=str(FORMAT),
+            expected=str(CALIBRATION_FORMAT),
         )  # fmt: skip
     return document
 
@@ -342,7 +342,9 @@ def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> No
     if names != machine.parameters.names:
         raise _edited(document, "parameters", "the names of the mechanism's parameters")
     values = np.array([p.value for p in saved.parameters])
-    if not np.allclose(values, machine.values, rtol=EXACT, atol=EXACT**2):
+    if not np.allclose(
+        values, machine.values, rtol=SAVED_NUMBER_ROUNDING, atol=SAVED_NUMBER_ROUNDING**2
+    ):
         k = int(np.argmax(np.abs(values - machine.values)))
         raise _edited(document, f"parameters[{k + 1}].value", f"the value of {names[k]}")
 
@@ -389,11 +391,13 @@ def _check_covariance(document: Document, key: str, matrix: Array) -> None:
     """Raise `InputError` for a matrix that is not symmetric or not positive semidefinite."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     limit = scale[:, None] * scale
-    good = not np.any(np.abs(matrix - matrix.T) > EXACT * limit) and np.all(np.diag(matrix) >= 0)
+    good = not np.any(np.abs(matrix - matrix.T) > SAVED_NUMBER_ROUNDING * limit) and np.all(
+        np.diag(matrix) >= 0
+    )
     if good:
         unit = np.where(limit > 0, matrix / np.where(limit > 0, limit, 1.0), 0.0)
         least = float(np.linalg.eigvalsh(0.5 * (unit + unit.T)).min(initial=0.0))
-        good = least > -EXACT * len(matrix)
+        good = least > -SAVED_NUMBER_ROUNDING * len(matrix)
     if not good:
         raise InputError(
             "the covariance is not that of any numbers: not symmetric, or a combination of them has"

@@ -160,9 +160,9 @@ class ShownCalibration(ABC):
 
         ax : axes to draw into; new ones unless given. Needs ``pip install 'pkmcal[plot]'``.
         """
-        from pkmcal.calibration.plots import residuals
+        from pkmcal.calibration.plots import draw_residuals
 
-        return residuals(self.overview().residuals, ax)
+        return draw_residuals(self.overview().residuals, ax)
 
     def plot_parameters(self, ax: Axes | None = None) -> Axes:
         """How far each parameter is from its drawing, with two standard deviations, in tolerances

@@ -12,7 +12,11 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import EVERYTHING, MECHANISM, refined_camera
+from pkmcal.calibration.results import (
+    CALIBRATED_MECHANISM_FILE,
+    CALIBRATION_DOCUMENT_FILE,
+    refined_camera,
+)
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera
@@ -25,7 +29,7 @@ SESSION_FILE = "session.yaml"
 
 
 @dataclass(frozen=True)
-class Source:
+class MachineSource:
     """A machine to export or to control, and how far to trust it.
 
     machine : with the values to use. sigma, covariance : (P,) and (P, P) of its parameters;
@@ -101,7 +105,7 @@ class Source:
         return out
 
 
-def load_source(origin: Path | str, session: Path | None = None) -> Source:
+def load_source(origin: Path | str, session: Path | None = None) -> MachineSource:
     """A calibration's folder, a mechanism file, or a built-in machine by its name.
 
     session : the calibration's session, for its cameras; else it is looked for around the folder.
@@ -111,7 +115,9 @@ def load_source(origin: Path | str, session: Path | None = None) -> Source:
     if isinstance(found, SavedCalibration):
         return _of_calibration(found, session)
     built_in = str(origin) in catalogue()
-    return Source(found, origin=f"the built-in machine {origin}" if built_in else Path(origin).name)
+    return MachineSource(
+        found, origin=f"the built-in machine {origin}" if built_in else Path(origin).name
+    )
 
 
 def loaded(origin: Path | str) -> SavedCalibration | Machine:
@@ -120,11 +126,14 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
     Raises InputError where `origin` is none of these.
     """
     path = Path(origin)
-    if str(origin) in catalogue() and not (path / EVERYTHING).is_file():
+    if str(origin) in catalogue() and not (path / CALIBRATION_DOCUMENT_FILE).is_file():
         return load_mechanism(str(origin))
-    if path.name == MECHANISM and (path.parent / EVERYTHING).is_file():
+    if (
+        path.name == CALIBRATED_MECHANISM_FILE
+        and (path.parent / CALIBRATION_DOCUMENT_FILE).is_file()
+    ):
         path = path.parent  # a calibration's own mechanism file: the rest lies beside it
-    if path.is_dir() or path.name == EVERYTHING:
+    if path.is_dir() or path.name == CALIBRATION_DOCUMENT_FILE:
         return load(path)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
@@ -137,7 +146,7 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
     return load_mechanism(path)
 
 
-def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
+def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSource:
     folder = saved.path.parent
     told = saved.document.get("session") or {}
     session_words = " ".join(
@@ -149,7 +158,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
         for name, file in files.items()
         if (found := _camera_file(folder, file, _session_folder(saved, session))) is not None
     }
-    return Source(
+    return MachineSource(
         machine=saved.machine,
         sigma=saved.sigma,
         cameras=MappingProxyType(cameras),

@@ -17,27 +17,27 @@ from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.region import Region, poses_in
-from pkmcal.mechanisms.workspace import ROUGH, Limits, reachable
+from pkmcal.mechanisms.workspace import ROUGH_EFFORT, Limits, reachable
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-SPREAD = 250
+TOOL_MAP_POSES = 250
 """Poses spread over the region, from which figures are told."""
-CELLS = 20
+CELLS_ALONG_SLICE = 20
 """Cells along a slice's longer side."""
-HEIGHTS = (0.15, 0.5, 0.85)
+SLICE_HEIGHT_SHARES = (0.15, 0.5, 0.85)
 """Where slices lie between the lowest and the highest of those poses."""
-MORE = 0.08
+SLICE_MARGIN_SHARE = 0.08
 """What slices reach beyond those poses to either side, in their extent."""
 NO_EXTENT = 1e-3
 """Part of those poses' widest extent below which an axis has none."""
-LEAST_CELLS, FILLED = 3, 0.4
+LEAST_CELLS, LEAST_FILLED_SHARE = 3, 0.4
 """Rows and columns of cells, and their part that the machine can take, below which it is no slice:
 a platform that only moves aside as it turns is at one orientation in few places."""
-ASIDE = 0.25
+MOST_OFF_CELL_MIDDLE = 0.25
 """Of a cell: how far from its middle a pose may be put by rods and axes."""
-TURNED = np.deg2rad(3.0)
+MOST_SLICE_TURN = np.deg2rad(3.0)
 """Turns that crooked axes force on a platform that should only shift; a slice is of one
 orientation."""
 
@@ -130,7 +130,7 @@ def map_of(
     """
     region = region or Region()
     limits = calibrated.limits()
-    even = poses_in(limits, region, SPREAD)
+    even = poses_in(limits, region, TOOL_MAP_POSES)
     slices, more = _slices(limits, region, even)
     poses = np.concatenate([even, *more])
     table = calibrated.parameters
@@ -165,13 +165,13 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     places = even[:, :3, 3]
     low, high = places.min(axis=0), places.max(axis=0)
     wide = high - low
-    box = low - MORE * wide, high + MORE * wide
+    box = low - SLICE_MARGIN_SHARE * wide, high + SLICE_MARGIN_SHARE * wide
     flat = wide <= NO_EXTENT * wide.max()
     middle = (low + high) / 2
     if flat[2]:
         planes = [(0, 1, float(middle[2]))]
     else:
-        planes = [(0, 1, float(low[2] + share * wide[2])) for share in HEIGHTS]
+        planes = [(0, 1, float(low[2] + share * wide[2])) for share in SLICE_HEIGHT_SHARES]
         across = int(np.argmax(wide[:2]))
         planes.append((across, 2, float(middle[1 - across])))
     out: list[Slice] = []
@@ -183,7 +183,7 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
         made, taken = _slice(limits, region, (across, up, level), box, first)
         there = made.rows >= 0
         rows, columns = there.any(axis=1).sum(), there.any(axis=0).sum()
-        if min(rows, columns) >= LEAST_CELLS and len(taken) >= FILLED * rows * columns:
+        if min(rows, columns) >= LEAST_CELLS and len(taken) >= LEAST_FILLED_SHARE * rows * columns:
             out.append(made)
             poses.append(taken)
             first += len(taken)
@@ -200,7 +200,7 @@ def _slice(
     """A slice within a box, its rows counted from ``first``, and its poses."""
     across, up, level = plane
     low, high = box
-    cell = max(high[across] - low[across], high[up] - low[up]) / CELLS
+    cell = max(high[across] - low[across], high[up] - low[up]) / CELLS_ALONG_SLICE
     u, v = (
         low[k] + cell * (np.arange(max(round((high[k] - low[k]) / cell), 1)) + 0.5)
         for k in (across, up)
@@ -208,11 +208,11 @@ def _slice(
     at = np.full((len(v), len(u), 3), level)
     at[..., across], at[..., up] = u, v[:, None]
     wanted = pose(limits.home[:3, :3], at.reshape(-1, 3))
-    closed = on_manifold(limits.layout, limits.theta, wanted, ROUGH.newton)
+    closed = on_manifold(limits.layout, limits.theta, wanted, ROUGH_EFFORT.newton)
     there = closed.T_base_platform
     off = pose_difference(there, wanted)
-    good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < ASIDE * cell)
-    good &= np.linalg.norm(off[:, :3], axis=1) < TURNED
+    good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < MOST_OFF_CELL_MIDDLE * cell)
+    good &= np.linalg.norm(off[:, :3], axis=1) < MOST_SLICE_TURN
     good &= reachable(limits, there).inside & region.holds(limits, wanted)
     rows = np.full(len(good), -1)
     rows[good] = first + np.arange(np.count_nonzero(good))

@@ -20,7 +20,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import WORKERS, Progress
+from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -35,24 +35,24 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.profiles import SHIFTS
+from pkmcal.observe.profiles import EDGE_SHIFTS
 from pkmcal.observe.repeats import combined
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
-ROUNDS = 3
+MOST_EDGE_LOOKS = 3
 """Most looks at the edges, each from the estimate before."""
-SETTLED = 0.15
+SETTLED_EDGE_DISTANCE = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
 far."""
-ASTRAY = float(SHIFTS[-1]) / 3
+ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
-FEWEST_EDGES = 24
+FEWEST_EDGES_TO_IDENTIFY = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
@@ -72,7 +72,10 @@ class Turns(NamedTuple):
 
 
 def take_turns(
-    seen: SeenSession, cameras: CameraRefinement, told: Progress, lap: Callable[[str], None]
+    seen: SeenSession,
+    cameras: CameraRefinement,
+    told: CalibrationProgress,
+    lap: Callable[[str], None],
 ) -> Turns:
     """Observation and identification in turns, the search narrowing.
 
@@ -84,8 +87,8 @@ def take_turns(
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
-    for turn in range(ROUNDS):
-        share = 0.45 + 0.5 * turn / ROUNDS
+    for turn in range(MOST_EDGE_LOOKS):
+        share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
@@ -96,17 +99,19 @@ def take_turns(
         lap("observe")
         told("Identifying", share + 0.05)
         start, moved = _at_cameras(estimate.state, cameras), max(look.moved for look in looks)
-        if turn == 0 and moved > ASTRAY:
+        if turn == 0 and moved > ASTRAY_EDGE_DISTANCE:
             start = better_start(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
         lap("identify")
-        if moved < SETTLED and not cameras.active:
+        if moved < SETTLED_EDGE_DISTANCE and not cameras.active:
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
 
 
-def _counted(told: Progress, text: str, total: int, share: float) -> legs.Done:
+def _counted(
+    told: CalibrationProgress, text: str, total: int, share: float
+) -> legs.PhotographsLookedAt:
     """A callback of photographs looked at, told with how many there are of them."""
     lock, seen = Lock(), [0]
     told(text, share)
@@ -145,7 +150,7 @@ def identify_poses(
     boards: Boards,
     T_camera_base: Array,
     cameras: CameraRefinement,
-    told: Progress,
+    told: CalibrationProgress,
 ) -> Turns:
     """The same without legs: what poses say does not depend on the estimate, but for the cameras
     that are refined with it.
@@ -155,8 +160,8 @@ def identify_poses(
     measurements = measurements_of(session, boards, None, cameras)
     start = _reached(session, measurements, start_state(machine, measurements, T_camera_base))
     estimate = bundle(machine, measurements, start)
-    for turn in range(1, ROUNDS if cameras.active else 1):
-        told("Identifying with the cameras", 0.6 + 0.3 * turn / ROUNDS)
+    for turn in range(1, MOST_EDGE_LOOKS if cameras.active else 1):
+        told("Identifying with the cameras", 0.6 + 0.3 * turn / MOST_EDGE_LOOKS)
         cameras = cameras.moved(estimate)
         measurements = measurements_of(session, boards, None, cameras)
         estimate = bundle(machine, measurements, _at_cameras(estimate.state, cameras))
@@ -190,7 +195,7 @@ def _reached(session: Session, measurements: Measurements, start: State) -> Stat
 
 
 def _first_estimate(
-    seen: SeenSession, total: int, told: Progress, lap: Callable[[str], None]
+    seen: SeenSession, total: int, told: CalibrationProgress, lap: Callable[[str], None]
 ) -> Estimate:
     """Of photographs by hand, from what was measured when they were placed; else from legs that are
     looked for as wholes, where they should be, and, unless nearly all were there, again where the
@@ -204,8 +209,8 @@ def _first_estimate(
         return bundle(session.machine, measurements, start)
     start: State | None = None
     for text, reach, share in (
-        ("Finding the legs", legs.REACH, 0.35),
-        ("Finding the legs again", legs.AGAIN, 0.4),
+        ("Finding the legs", legs.LEG_SEARCH_REACH, 0.35),
+        ("Finding the legs again", legs.REPEATED_SEARCH_REACH, 0.4),
     ):
         done = _counted(told, text, total, share)
         search = partial(_whole_legs, known=known, reach=reach, done=done)
@@ -234,7 +239,7 @@ def _share_agreeing(looks: list[legs.StationEdges], edges: EdgeSet, estimate: Es
 
 
 def _whole_legs(
-    photographs: legs.Photographs, known: KnownScene, reach: float, done: legs.Done
+    photographs: legs.Photographs, known: KnownScene, reach: float, done: legs.PhotographsLookedAt
 ) -> legs.StationEdges:
     machine, T_camera_base, poses = known[:3]
     at = T_camera_base[photographs.station], poses[photographs.configuration]
@@ -246,7 +251,7 @@ def _measure(
     estimate: Estimate,
     blur: dict[int, float | None],
     refine: bool,
-    done: legs.Done,
+    done: legs.PhotographsLookedAt,
 ) -> legs.StationEdges:
     state = estimate.state
     return legs.measure(
@@ -264,16 +269,16 @@ def _each(
     photographs: list[legs.Photographs],
     look: Callable[[legs.Photographs], legs.StationEdges],
 ) -> list[legs.StationEdges]:
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
         return [combined(seen) for seen in pool.map(look, photographs)]
 
 
 def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
     edges = concatenate([look.edges for look in looks])
-    if len(edges) < FEWEST_EDGES:
+    if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
         raise ResultError(
             f"only {len(edges)} edges of legs were found in all photographs",
-            expected=f"at least {FEWEST_EDGES}",
+            expected=f"at least {FEWEST_EDGES_TO_IDENTIFY}",
             next_step="Look whether the photographs show the legs sharply and brightly enough",
         )
     return edges

@@ -18,7 +18,7 @@ from pkmcal.files import (
     parse_yaml,
     read_text,
     shown,
-    validate,
+    validated_document,
     yaml_text,
 )
 from pkmcal.wording import count as count_of
@@ -70,7 +70,7 @@ def camera_from_document(document: Document) -> Camera:
             else "OpenCV's files have camera_matrix, image_width and image_height; ROS's"
             " camera_matrix; Kalibr's camera_model under cam0",
         )
-    fields = validate(document, models[name].schema)
+    fields = validated_document(document, models[name].schema)
     camera = models[name].from_document(fields)
     width, height = camera.image_size
     if not np.isfinite(camera.ray(np.array([[(width - 1) / 2, (height - 1) / 2]]))).all():
@@ -112,8 +112,8 @@ def camera_text(camera: Camera) -> str:
     return yaml_text(document)
 
 
-FORMATS = ("opencv", "ros", "kalibr")
-SAME = 1e-12
+CAMERA_FILE_FORMATS = ("opencv", "ros", "kalibr")
+CAMERA_NUMBER_ROUNDING = 1e-12
 """Relative difference of a number before and after; decimal text of sixteen digits keeps it."""
 _ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 _KALIBR = {
@@ -138,11 +138,11 @@ def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
     form : opencv (XML where the path ends so, else YAML), ros or kalibr.
     """
     path = Path(path)
-    if form not in FORMATS:
+    if form not in CAMERA_FILE_FORMATS:
         raise InputError(
             "no such format of camera files",
             found=form,
-            expected=closest(form, FORMATS) or listed(FORMATS),
+            expected=closest(form, CAMERA_FILE_FORMATS) or listed(CAMERA_FILE_FORMATS),
         )
     if form == "opencv":
         text = _opencv_text(camera, xml=path.suffix.lower() == ".xml")
@@ -154,7 +154,9 @@ def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
         text = yaml_text({"cam0": _kalibr_data(camera)})
         again = _from_kalibr(parse_yaml(text, path), ["cam0"], None)
     same = type(again) is type(camera) and tuple(again.image_size) == tuple(camera.image_size)
-    if not same or not np.allclose(again.parameters, camera.parameters, rtol=SAME, atol=1e-300):
+    if not same or not np.allclose(
+        again.parameters, camera.parameters, rtol=CAMERA_NUMBER_ROUNDING, atol=1e-300
+    ):
         raise InputError(
             f"the format {form} does not keep this camera", where=path.name, found=again.model
         )

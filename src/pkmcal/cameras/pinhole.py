@@ -76,7 +76,7 @@ def undistort(target: Array, k: Array) -> Array:
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
         value, slope = distort(xy, k)
-        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & unfolded(xy, slope, k)
+        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & before_image_fold(xy, slope, k)
     return np.where(good[..., None], xy, np.nan)
 
 
@@ -101,7 +101,7 @@ def moved_in_pixels(parameters: Array, moved: Sequence[Array], by_xy: Array | No
     return of_components(focal[0] * x, focal[1] * y)
 
 
-def unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
+def before_image_fold(xy: Array, by_xy: Array, k: Array) -> Booleans:
     """True before the place where the lens model folds the image back.
 
     xy : (..., 2) undistorted; by_xy : (..., 2, 2) derivative of :func:`distort` there. The radial
@@ -225,4 +225,4 @@ class Pinhole(Camera):
             return front & np.isfinite(xy[..., 0] + xy[..., 1]), z, xy, xy, None
         with np.errstate(over="ignore", invalid="ignore"):  # of points almost beside the camera
             distorted, by_xy = distort(xy, lens)
-            return front & unfolded(xy, by_xy, lens), z, xy, distorted, by_xy
+            return front & before_image_fold(xy, by_xy, lens), z, xy, distorted, by_xy

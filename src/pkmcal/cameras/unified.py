@@ -16,12 +16,12 @@ from pydantic import Field
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.cameras.pinhole import (
+    before_image_fold,
     distort,
     distort_by_coefficients,
     in_pixels,
     moved_in_pixels,
     undistort,
-    unfolded,
 )
 from pkmcal.geometry.rigid import dot, of_components
 
@@ -131,5 +131,5 @@ class Unified(Camera):
             return (distance, depth), xy, xy, inside & np.isfinite(xy[..., 0] + xy[..., 1]), None
         with np.errstate(over="ignore", invalid="ignore"):  # of points at the field's border
             distorted, by_xy = distort(xy, self._five())
-            good = inside & unfolded(xy, by_xy, self._five())
+            good = inside & before_image_fold(xy, by_xy, self._five())
         return (distance, depth), xy, distorted, good, by_xy

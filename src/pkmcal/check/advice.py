@@ -14,21 +14,21 @@ from pkmcal.check.forecast import Forecast, LegForecast
 from pkmcal.check.look import Look, StationLook
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.profiles import INSIDE, SATURATED
-from pkmcal.observe.quality import BLACK
+from pkmcal.observe.profiles import PROFILE_REACH_INSIDE, SATURATED_GREY_LEVEL
+from pkmcal.observe.quality import BLACK_GREY_LEVEL
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.planning.first import EdgesOf
-from pkmcal.simulation.placement import PANORAMIC, view_angle
+from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.wording import brief, capital, count, listed, named
 
-WORTH = 1.2
+ADVICE_WORTH_FACTOR = 1.2
 """Factor on a standard deviation from which its cause is worth advice: as much as half as many
 photographs again would gain."""
-LOST = 1 - 1 / WORTH**2
+INFORMATION_LOST_SHARE = 1 - 1 / ADVICE_WORTH_FACTOR**2
 """Share of the information that is lost by then."""
 POOR_LEG = 0.5
 """Share of what legs tell on average below which one of them is named."""
-LEGEND = (
+EDGE_SHARES_LEGEND = (
     "Shares of what all edges tell about the machine, by leg and station.",
     "Variance: of the platform's position, what comes from the leg's edges: where",
     "it is large, a better view of that leg gains most.",
@@ -52,7 +52,7 @@ def advice(look: Look, forecast: Forecast | None) -> tuple[str, ...]:
 
 def _second_place(forecast: Forecast | None) -> list[str]:
     """Whether another place would do more than more photographs from this one."""
-    if forecast is None or not forecast.second * WORTH < forecast.position:
+    if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
         return []
     return [
         f"Take half of the photographs from a second place, a quarter round the machine:"
@@ -69,14 +69,17 @@ def _from_one_side(look: Look) -> list[str]:
     between the two.
     """
     cameras = [station.photographs.camera for station in look.stations]
-    if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC for camera in cameras):
+    if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC_HALF_VIEW for camera in cameras):
         return []
     centres = look.session.machine.base_centers()
     middle = np.concatenate([centres, look.poses[:, :3, 3]]).mean(axis=0)
     eyes = inverse(np.stack([station.found for station in look.stations]))[:, :3, 3]
     way = (middle - eyes) / np.linalg.norm(middle - eyes, axis=-1, keepdims=True)
     sine = np.linalg.norm(np.cross(way[:, None], way), axis=-1)
-    if not all(station.recognised for station in look.stations) or sine.max() * WORTH > 1:
+    if (
+        not all(station.recognised for station in look.stations)
+        or sine.max() * ADVICE_WORTH_FACTOR > 1
+    ):
         return []
     angle = math.degrees(math.asin(float(sine.max())))
     return [
@@ -96,7 +99,7 @@ def _hidden(look: Look) -> list[str]:
     least = hidden[best, np.arange(hidden.shape[1])]
     out: list[str] = []
     for s, station in enumerate(seen):
-        bad = np.flatnonzero((least > LOST) & (best == s))
+        bad = np.flatnonzero((least > INFORMATION_LOST_SHARE) & (best == s))
         if not bad.size:
             continue
         share = f"{least[bad].mean():.0%}"
@@ -112,7 +115,7 @@ def _hidden(look: Look) -> list[str]:
 
 def _slim(look: Look) -> list[str]:
     """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
-    tubes, least = tubes_of(look.session.machine), 2 * INSIDE
+    tubes, least = tubes_of(look.session.machine), 2 * PROFILE_REACH_INSIDE
     out: list[str] = []
     for station in look.stations:
         if station.quality is None:
@@ -137,7 +140,7 @@ def _slim(look: Look) -> list[str]:
 def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
     """Why edges that ought to be seen are lost, where these are many."""
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.found
-    if station.quality is None or not expected or lost.sum() <= LOST * expected:
+    if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
         return []
     level, behind = (
         part[edges.photographs] for part in (station.quality.level, station.quality.behind)
@@ -147,7 +150,7 @@ def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
     usual = float(np.median(usual)) if usual.size else math.nan
     known = lost & np.isfinite(contrast)
     brighter = np.fmax(level, behind)
-    kinds = {"white": brighter >= SATURATED, "black": brighter <= BLACK}
+    kinds = {"white": brighter >= SATURATED_GREY_LEVEL, "black": brighter <= BLACK_GREY_LEVEL}
     kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(known & of)) for name, of in kinds.items()}
@@ -243,7 +246,9 @@ def forecast_part(told: Forecast) -> Part:
             "all", tuple(_part(x) for x in (*together, sum(together), variance)), mark="good"
         )
         head = ("Leg", *stations, "Together", "Variance")
-        shares = Table("", head, (*rows, all_), " ".join(LEGEND), legend=LEGEND)
+        shares = Table(
+            "", head, (*rows, all_), " ".join(EDGE_SHARES_LEGEND), legend=EDGE_SHARES_LEGEND
+        )
         tables = (shares, details)
     return Part("forecast", "What a full capture would give", said=_said(told, poor), tables=tables)
 
@@ -264,9 +269,9 @@ def _said(told: Forecast, poor: list[int]) -> tuple[str, ...]:
         mine = [leg for leg in told.legs if leg.leg == j]
         why: list[str] = []
         for leg in mine:
-            if leg.seen < 1 - LOST:
+            if leg.seen < 1 - INFORMATION_LOST_SHARE:
                 why.append(f"{1 - leg.seen:.0%} hidden from {leg.station}")
-            elif leg.found < 1 - LOST:
+            elif leg.found < 1 - INFORMATION_LOST_SHARE:
                 why.append(f"{1 - leg.found:.0%} of its edges lost at {leg.station}")
         because = f": {listed(why, 3)}" if why else ""
         share = f"{sum(leg.tells for leg in mine):.0%}"

@@ -20,7 +20,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.stations import board_of, station_board
 from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.calibration.byhand import search_by_hand, why_lost
-from pkmcal.calibration.calibrate import Progress
+from pkmcal.calibration.calibrate import CalibrationProgress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
 from pkmcal.calibration.known import KnownScene
@@ -43,11 +43,11 @@ from pkmcal.check.look import Look, StationLook
 from pkmcal.check.words import board_findings, joint_findings, station_findings
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.verdict import POOR
+from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
-from pkmcal.observe.images import KEPT, Pictures, decode
+from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
 from pkmcal.outcome import Finding, Level, doubtful, note, wrong
@@ -56,16 +56,16 @@ from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
-NAMED = 10
+BROKEN_PHOTOGRAPHS_NAMED = 10
 """Broken photographs of a station that are named one by one; the others are counted."""
 OTHER_MODE = np.deg2rad(20.0)
 """Turn to another assembly below which one could be taken for the other."""
-END = 0.15
+STROKE_END_SHARE = 0.15
 """Part of a joint's range, at either end, in which a reading is an extreme one."""
 
 
 def check_session(
-    folder: Path | str, *, seed: int = 0, progress: Progress | None = None
+    folder: Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> SessionCheck:
     """Look through a session; what is wrong comes back as findings, nothing is raised.
 
@@ -76,7 +76,7 @@ def check_session(
         return _check(Path(folder), seed, progress or (lambda _text, _share: None))
 
 
-def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
+def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     """:func:`check_session`, step by step."""
     told("Reading the session", 0.0)
     findings = [doubtful(text) for text in untouched_files(folder)]
@@ -130,7 +130,7 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
     """Each station's photographs of legs; those that cannot be decoded are findings."""
     out: list[legs.Photographs | None] = []
     findings: list[Finding] = []
-    room = KEPT
+    room = KEPT_PHOTOGRAPH_BYTES
     for number, station in enumerate(session.stations):
         if "legs" not in station.observe:  # decoded one by one where the board is looked for
             out.append(None)
@@ -145,15 +145,19 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
                 image = decode(photo.path, station.camera.image_size, label)
             except InputError as error:
                 broken += 1
-                if broken <= NAMED:
+                if broken <= BROKEN_PHOTOGRAPHS_NAMED:
                     findings.append(wrong(error, station.name))
                 continue
             if image.size <= room:
                 kept[len(rows)], room = image, room - image.size
             rows.append(photo.configuration)
             files.append((photo.path, label))
-        if broken > NAMED:
-            findings.append(wrong(_more_broken(session, number, broken - NAMED), station.name))
+        if broken > BROKEN_PHOTOGRAPHS_NAMED:
+            findings.append(
+                wrong(
+                    _more_broken(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED), station.name
+                )
+            )
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], kept)  # fmt: skip
@@ -251,7 +255,7 @@ def _observed(
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
     if not lost:
-        boards = check_boards(session, board_images(session, whole))
+        boards = look_for_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
         return _Observed(unlooked(), boards.findings)
@@ -339,7 +343,7 @@ class BoardsCheck:
     findings: tuple[Finding, ...] = ()
 
 
-def check_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> BoardsCheck:
+def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> BoardsCheck:
     """Look for the board in every station that observes it, nothing raised.
 
     images : all decoded photographs by the station's number.
@@ -400,7 +404,10 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
     for k, name in enumerate(session.document["joints"]["columns"]):
         values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
         stroke = high - low
-        ends = (int(np.sum(values < low + END * stroke)), int(np.sum(values > high - END * stroke)))
+        ends = (
+            int(np.sum(values < low + STROKE_END_SHARE * stroke)),
+            int(np.sum(values > high - STROKE_END_SHARE * stroke)),
+        )
         used = float(np.ptp(values) / stroke)
         found.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
     return tuple(found)
@@ -431,7 +438,7 @@ def _fit(session: Session, boards: Boards) -> list[Finding]:
     richer = richer_models(session, turns.measurements, turns.estimate)
     check_poses(session, turns.measurements, turns.estimate, richer)
     scale = turns.estimate.statistics.pose_scale
-    if scale <= POOR:
+    if scale <= POOR_MODEL_POSE_SCALE:
         return []
     better = min(richer, key=lambda model: model.scale, default=None)
     told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""

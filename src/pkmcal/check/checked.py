@@ -9,7 +9,7 @@ from typing import Any
 
 from pkmcal.check.forecast import Forecast
 from pkmcal.check.look import Look
-from pkmcal.files import plain
+from pkmcal.files import json_value
 from pkmcal.outcome import Finding, Level, first_error
 
 
@@ -99,7 +99,7 @@ class SessionCheck:
     def as_dict(self) -> dict[str, Any]:
         """Everything under its name, for ``--json``, and the first error as every command's."""
         seen = self.forecast and replace(self.forecast, edges=())
-        out = plain(asdict(replace(self, look=None, forecast=seen, findings=())))
+        out = json_value(asdict(replace(self, look=None, forecast=seen, findings=())))
         out.pop("look")
         out["findings"] = [finding.document() for finding in self.findings]
         if self.forecast:

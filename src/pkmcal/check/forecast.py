@@ -22,16 +22,16 @@ from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
 from pkmcal.planning.information import tool_by_free
-from pkmcal.planning.plan import CAPTURE
+from pkmcal.planning.plan import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
-from pkmcal.simulation.placement import PANORAMIC, draw_configurations, view_angle
+from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, draw_configurations, view_angle
 
 NEAR_END = 0.15
 """Part of a joint's range, at either end, in which a reading is an extreme one."""
-QUARTER = np.pi / 2
+SECOND_PLACE_TURN = np.pi / 2
 """How far round the machine a second place is tried: what one camera sees worst, along its line of
 sight, the other sees best."""
-SEED = 7
+FORECAST_SEED = 7
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Forecast:
     edges: tuple[EdgesOf, ...] = ()
 
 
-def forecast(look: Look, photographs: int = CAPTURE) -> Forecast | None:
+def forecast(look: Look, photographs: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
     """The forecast from the first photographs; None where these do not carry one.
 
     By the legs alone, whatever boards and trackers say besides.
@@ -100,7 +100,7 @@ def forecast(look: Look, photographs: int = CAPTURE) -> Forecast | None:
     told = _told(capture)
     second = np.nan
     one = stations[0].photographs
-    if len(stations) == 1 and view_angle(one.camera) < PANORAMIC:
+    if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
         second = _told(_two_places(capture)).position
     return Forecast(
         photographs=photographs,
@@ -144,7 +144,7 @@ def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
     rows = [set(s.photographs.configuration.tolist()) for s in stations]
     shared = len(rows) > 1 and len(set.union(*rows)) < sum(map(len, rows)) / 2
     wanted = photographs * (1 if shared else len(stations))
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(FORECAST_SEED)
     poses, readings = draw_configurations(machine, wanted, float(ends.mean()), rng)
     number = np.arange(photographs)
     pairs = [all_pairs([s], number + (0 if shared else photographs * s)) for s in range(len(rows))]
@@ -167,7 +167,7 @@ def _two_places(capture: _Capture) -> _Capture:
     rig = capture.rig
     (one,) = (x for x in rig.instruments if isinstance(x, LegsFrom))
     middle = np.concatenate([rig.machine.base_centers(), capture.T_base_platform[:, :3, 3]])
-    turn, centre = rotation(np.array([0.0, 0.0, QUARTER])), middle.mean(axis=0)
+    turn, centre = rotation(np.array([0.0, 0.0, SECOND_PLACE_TURN])), middle.mean(axis=0)
     there = one.T_camera_base @ inverse(pose(turn, centre - turn @ centre))
     pairs = capture.pairs.copy()
     pairs[1::2, 0] = 1
@@ -191,7 +191,7 @@ def _told(capture: _Capture) -> _Told:
     """
     rig, machine = capture.rig, capture.rig.machine
     n_stations = len(rig.names)
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(FORECAST_SEED)
     measurements = rig.measured(capture.joints, capture.T_base_platform, capture.pairs, rng)
     edges = measurements.edges
     assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)

@@ -18,15 +18,15 @@ from pkmcal.check.look import Look, StationLook
 from pkmcal.files import staged_folder
 from pkmcal.outcome import Part
 from pkmcal.pages import page
-from pkmcal.pages.drawn import Drawn, Picture, Spot, laid_over
+from pkmcal.pages.drawn import Drawn, Picture, Spot, machine_laid_over
 from pkmcal.pages.jpegs import jpeg
 from pkmcal.pages.page import N_COLOURS
 
-SHIFT = 4
+DRAWN_PIXEL_BINARY_DIGITS = 4
 """Binary digits of a pixel to which cv2 draws."""
-BAR = 26
+CAPTION_BAR_HEIGHT = 26
 """Height (px) of the line above each picture that says what it shows."""
-GAP = 6
+PANE_GAP = 6
 """Pixels between the two."""
 
 
@@ -41,7 +41,7 @@ def with_pictures(look: Look) -> Part:
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
             for said, T_camera_base in poses_of(station):
-                edges, spots = overlay(look, station, T_camera_base, int(k))
+                edges, spots = drawing_over_photograph(look, station, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
@@ -56,7 +56,7 @@ def with_pictures(look: Look) -> Part:
                     )
                 )
             pairs.append(tuple(pictures))
-    html = page.render("overlay.html.j2", n_legs=look.session.machine.n_legs, pairs=pairs)
+    html = page.filled_template("overlay.html.j2", n_legs=look.session.machine.n_legs, pairs=pairs)
     return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
 
 
@@ -69,14 +69,14 @@ def poses_of(station: StationLook) -> tuple[tuple[str, Array], ...]:
     return *by_hand, (after, station.found)
 
 
-def overlay(
+def drawing_over_photograph(
     look: Look, station: StationLook, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
     joint centres.
     """
     configuration = int(station.photographs.configuration[k])
-    return laid_over(
+    return machine_laid_over(
         look.session.machine,
         station.photographs.camera,
         T_camera_base,
@@ -118,13 +118,13 @@ def picture(look: Look, station: StationLook, k: int) -> Any:
     panes: list[Any] = []
     for said, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(station.photographs.images[k]), cv2.COLOR_GRAY2BGR)
-        edges, spots = overlay(look, station, T_camera_base, k)
+        edges, spots = drawing_over_photograph(look, station, T_camera_base, k)
         _draw(pane, edges, spots)
-        bar = np.full((BAR, pane.shape[1], 3), 32, dtype=np.uint8)
+        bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
         text = f"{station.name} / {name}: {said}"
         cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
         panes.append(np.concatenate([bar, pane]))
-    gap = np.full((len(panes[0]), GAP, 3), 32, dtype=np.uint8)
+    gap = np.full((len(panes[0]), PANE_GAP, 3), 32, dtype=np.uint8)
     joined = [part for pane in panes for part in (gap, pane)][1:]
     return np.concatenate(joined, axis=1)
 
@@ -134,19 +134,19 @@ def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
     import cv2
 
     def fixed(points: Any) -> Any:
-        return np.rint(np.asarray(points) * 2**SHIFT).astype(np.int32)
+        return np.rint(np.asarray(points) * 2**DRAWN_PIXEL_BINARY_DIGITS).astype(np.int32)
 
     radius = pane.shape[1] / 110
     for width, dark in ((3, True), (1, False)):
         for edge in edges:
             colour = (0, 0, 0) if dark else _colour(edge.leg)
             line = [fixed(edge.points)[:, None]]
-            cv2.polylines(pane, line, False, colour, width, cv2.LINE_AA, SHIFT)
+            cv2.polylines(pane, line, False, colour, width, cv2.LINE_AA, DRAWN_PIXEL_BINARY_DIGITS)
         for spot in spots:
             colour = (0, 0, 0) if dark else _colour(spot.leg)
             x, y = fixed(spot.calibrated).tolist()
-            size = round(radius * 2**SHIFT)
-            cv2.circle(pane, (x, y), size, colour, width, cv2.LINE_AA, SHIFT)
+            size = round(radius * 2**DRAWN_PIXEL_BINARY_DIGITS)
+            cv2.circle(pane, (x, y), size, colour, width, cv2.LINE_AA, DRAWN_PIXEL_BINARY_DIGITS)
             if spot.labelled:
                 at = (
                     round(spot.calibrated[0] + 1.4 * radius),

@@ -16,11 +16,11 @@ from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import listed
 
-OVEREXPOSED = 0.25
+OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
 TOO_DARK = 0.5
 """Share of black pixels on the legs beyond which the legs have no shading left."""
-BLURRED = 1.7
+BLUR_STILL_MEASURED = 1.7
 """Blur (px) beyond which edges are not measured well: the model of an edge ends at 1.5."""
 FEW_LEGS = 0.5
 """Share of the legs found in a station's photographs below which it hardly contributes."""
@@ -40,7 +40,7 @@ BOARD_LEGEND = (
     "Seen: photographs that show it. Off: corners from their predicted places.",
     "Wander: of the board on the base between photographs; a still one stays below 0.1 px.",
 )
-KINEMATICS = (
+KINEMATICS_SENTENCE = (
     "The drawing's machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
     " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
 )
@@ -49,7 +49,7 @@ KINEMATICS = (
 def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
     """What is doubtful about a station's photographs, of a machine of so many legs."""
     texts: list[str] = []
-    if station.saturated > OVEREXPOSED:
+    if station.saturated > OVEREXPOSED_PIXEL_SHARE:
         where = "the legs" if station.recognised else "the pictures"
         texts.append(
             f"{station.saturated:.0%} of {where} are overexposed: edges vanish in white. Take the"
@@ -61,7 +61,7 @@ def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
             f"{station.black:.0%} of {where} are black. Take the photographs again with a longer"
             " exposure, or more light."
         )
-    if station.blur > BLURRED:
+    if station.blur > BLUR_STILL_MEASURED:
         texts.append(
             f"The edges are blurred over {station.blur:.1f} px. Focus on the legs, close the"
             " aperture, and wait until the machine stands still."
@@ -182,7 +182,7 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         name = Path(name).resolve().name or name
     parts: tuple[Part, ...] = ()
     if found.machine:
-        said = KINEMATICS.format(found) if math.isfinite(found.singularity) else ""
+        said = KINEMATICS_SENTENCE.format(found) if math.isfinite(found.singularity) else ""
         tables = (_stations_table(found), _boards_table(found), _joints_table(found.joints))
         parts = (
             Part(

@@ -45,9 +45,9 @@ def board(
     console.print_points(
         console.out(),
         [
-            (console.MARKS["good"], f"The board is in {target}, for paper of size {name}."),
+            (console.MARK_SIGNS["good"], f"The board is in {target}, for paper of size {name}."),
             (
-                console.MARKS["note"],
+                console.MARK_SIGNS["note"],
                 "Print it in actual size (100 %), measure the two rulers, and write what the"
                 f" board measures over all into {source.name}.",
             ),

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import PAGE, answer, write
+from pkmcal.commands.finish import PAGE_DESCRIPTION, answer, write_outcome
 
-FILES = {
-    "report.html": PAGE,
+CALIBRATION_FILES = {
+    "report.html": PAGE_DESCRIPTION,
     "mechanism.yaml": "the calibrated machine",
     "calibration.json": "everything, with covariances",
 }
@@ -54,7 +54,7 @@ def calibrate(
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
-    from pkmcal.calibration.calibrate import calibrate as run
+    from pkmcal.calibration.calibrate import calibrate_session as run
     from pkmcal.calibration.kept import keep_earlier
     from pkmcal.calibration.results import check_output
     from pkmcal.report.calibration import outcome_of
@@ -79,8 +79,8 @@ def calibrate(
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
         kept = None if force else keep_earlier(folder, outcome.texts)
-        write(outcome, folder, FILES, over)
-        files = dict(FILES)
+        write_outcome(outcome, folder, CALIBRATION_FILES, over)
+        files = dict(CALIBRATION_FILES)
         if rrd is not None:
             write_rrd(found, rrd)
             files[str(rrd.absolute())] = "rerun opens it"

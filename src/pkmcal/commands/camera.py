@@ -10,17 +10,21 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import PAGE, finish
+from pkmcal.commands.finish import PAGE_DESCRIPTION, finish
 
-FILES = {
-    "camera.html": PAGE,
+CAMERA_FILES = {
+    "camera.html": PAGE_DESCRIPTION,
     "camera.yaml": "the camera, for a session's cameras/",
     "camera.json": "everything, with covariances",
 }
-OTHERS = {"opencv": "camera.opencv.yaml", "ros": "camera.ros.yaml", "kalibr": "camera.kalibr.yaml"}
+OTHER_CAMERA_FILES = {
+    "opencv": "camera.opencv.yaml",
+    "ros": "camera.ros.yaml",
+    "kalibr": "camera.kalibr.yaml",
+}
 
 
-class Form(StrEnum):
+class CameraFileForm(StrEnum):
     """Other programs' camera files."""
 
     OPENCV = "opencv"
@@ -46,7 +50,7 @@ def camera(
     ] = "auto",
     out: Annotated[Path, console.folder("Where the results go.")] = Path("camera"),
     to: Annotated[
-        list[Form] | None,
+        list[CameraFileForm] | None,
         typer.Option(metavar="NAME", help="Write it for opencv, ros or kalibr as well."),
     ] = None,
     as_json: console.Json = False,
@@ -60,31 +64,31 @@ def camera(
     from pkmcal.report.camera import outcome_of
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():
-        paths, there = of_session(images[0])
+        paths, there = session_board_photographs(images[0])
     else:
-        paths, there = photographs(images), board or beside(images)
+        paths, there = photographs(images), board or board_file_of(images)
     described = load_board(board or there)
     check_writable(out)
-    others = [(OTHERS[form.value], form.value) for form in to or []]
+    others = [(OTHER_CAMERA_FILES[form.value], form.value) for form in to or []]
     with console.progress(as_json) as told:
         told(f"Looking for the board in {len(paths)} photographs", 0.1)
         found = calibrate_photographs(paths, described, model)
         told("Writing the report", 0.9)
         outcome = outcome_of(found, paths, others)
-    files = {**FILES, **{name: "for that program" for name, _ in others}}
+    files = {**CAMERA_FILES, **{name: "for that program" for name, _ in others}}
     outcome = replace(outcome, summary={**outcome.document, "files": list(files)})
     return finish(outcome, out, files, as_json=as_json)
 
 
-def of_session(folder: Path) -> tuple[list[Path], Path]:
+def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
-    from pkmcal.files import read_yaml, validate, wanted_file
+    from pkmcal.files import read_yaml, validated_document, wanted_file
     from pkmcal.session.schema import SessionDocument
     from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
-    schema = validate(session, SessionDocument)
+    schema = validated_document(session, SessionDocument)
     seen = [schema.cameras[name] for name in schema.observers("board")]
     if not seen or schema.board is None:
         raise InputError(
@@ -121,17 +125,18 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
 def photographs(images: list[Path]) -> list[Path]:
     """The photographs named, folders opened; in the order of their names."""
     from pkmcal.errors import InputError
-    from pkmcal.files import ENDINGS
+    from pkmcal.files import IMAGE_FILE_ENDINGS
 
     out: list[Path] = []
     for path in images:
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS)
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_FILE_ENDINGS)
             if not inside:
                 raise InputError(
                     "the folder holds no photographs",
                     where=str(path),
-                    expected=f"some in it ({', '.join(sorted(ENDINGS))}), or a session.yaml that"
+                    expected=f"some in it ({', '.join(sorted(IMAGE_FILE_ENDINGS))}), or a"
+                    f" session.yaml that"
                     " names them",
                 )
             out += inside
@@ -142,7 +147,7 @@ def photographs(images: list[Path]) -> list[Path]:
     return list(dict.fromkeys(out))
 
 
-def beside(images: list[Path]) -> Path:
+def board_file_of(images: list[Path]) -> Path:
     """board.yaml in the photographs' folder, or in the one above it."""
     from pkmcal.errors import InputError
 

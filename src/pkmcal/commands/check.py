@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, answer, write
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, write_outcome
 
-FILES = {"check.html": PAGE, "check.json": NUMBERS}
-DRAWN = "the drawing over each photograph"
+CHECK_FILES = {"check.html": PAGE_DESCRIPTION, "check.json": NUMBERS_DESCRIPTION}
+DRAWINGS_DESCRIPTION = "the drawing over each photograph"
 
 
 def check(
@@ -35,7 +35,7 @@ def check(
     from pkmcal.files import check_own_folder, check_writable
 
     if out is not None:
-        check_own_folder(out, FILES, "a check")
+        check_own_folder(out, CHECK_FILES, "a check")
     if pictures is not None:
         check_writable(pictures)
     study = None
@@ -57,13 +57,13 @@ def check(
             names = picture_names(found.look).values()
             check_own_folder(pictures, names, "pictures of a check", "an earlier check's")
             write_pictures(found.look, pictures)
-            files[str(pictures)] = DRAWN
+            files[str(pictures)] = DRAWINGS_DESCRIPTION
         if out is not None:
             if found.look:
                 from pkmcal.check.pictures import with_pictures
 
                 told("Writing the page", 0.97)
                 outcome = replace(outcome, parts=(*outcome.parts, with_pictures(found.look)))
-            write(outcome, out, FILES)
-            files |= {str(out / name): what for name, what in FILES.items()}
+            write_outcome(outcome, out, CHECK_FILES)
+            files |= {str(out / name): what for name, what in CHECK_FILES.items()}
     return answer(outcome, Path(), files, as_json=as_json)

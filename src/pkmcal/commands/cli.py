@@ -26,19 +26,19 @@ from pkmcal.commands.console import print_error
 from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError
 
-DEFECT = 70
+INTERNAL_ERROR_EXIT = 70
 """sysexits.h's EX_SOFTWARE: an internal error, which is nothing that a user did."""
-INTERRUPTED = 130
+INTERRUPTED_EXIT = 130
 """What shells give a program that was ended by Ctrl-C."""
-DEBUG = "PKMCAL_DEBUG"
-UNCOLLECTED = 20_000
+DEBUG_VARIABLE = "PKMCAL_DEBUG"
+UNCOLLECTED_OBJECTS_ALLOWED = 20_000
 """Objects more than before at which Python looks for circles among them, instead of 700: a command
 makes 80,000 as it is loaded, which live until it ends."""
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 """The base of all complaints about options; typer gives it no public name."""
 
-COMMANDS = (
+COMMANDS_IN_ORDER = (
     "demo",
     "new",
     "check",
@@ -64,10 +64,12 @@ class _Commands(typer.core.TyperGroup):
     """The commands, each loaded when it is asked for."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*COMMANDS, *super().list_commands(ctx)]
+        return [*COMMANDS_IN_ORDER, *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return _made(cmd_name) if cmd_name in COMMANDS else super().get_command(ctx, cmd_name)
+        return (
+            _made(cmd_name) if cmd_name in COMMANDS_IN_ORDER else super().get_command(ctx, cmd_name)
+        )
 
 
 @cache
@@ -116,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # a process of its own: at its end no circle need be looked for
-        gc.set_threshold(UNCOLLECTED)
+        gc.set_threshold(UNCOLLECTED_OBJECTS_ALLOWED)
         atexit.register(gc.freeze)
     # What OpenCV cannot read is told in sentences of our own.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
@@ -125,17 +127,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
             sys.stdout.flush()
         except KeyboardInterrupt:
-            code = INTERRUPTED
+            code = INTERRUPTED_EXIT
         except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
             return _failed(error, words)
-        if code == INTERRUPTED:  # typer turns Ctrl-C into this code
+        if code == INTERRUPTED_EXIT:  # typer turns Ctrl-C into this code
             return _failed(KeyboardInterrupt(), words)
         return code if isinstance(code, int) else 0
 
 
 def _failed(error: BaseException, words: list[str]) -> int:
     """Tell an error in words, or as JSON where that was asked for; returns the exit code."""
-    if os.environ.get(DEBUG):
+    if os.environ.get(DEBUG_VARIABLE):
         traceback.print_exception(error, file=sys.stderr)
     told, code = _in_words(error, words)
     if "--json" in words and not isinstance(error, LostOutput):
@@ -155,11 +157,11 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     if isinstance(error, PkmcalError):
         return error, error.exit_code
     if isinstance(error, _UsageError):
-        command = words[0] + " " if words and words[0] in COMMANDS else ""
+        command = words[0] + " " if words and words[0] in COMMANDS_IN_ORDER else ""
         said = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
         return said, said.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
-        return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED
+        return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED_EXIT
     if isinstance(error, MemoryError):
         said = InputError(
             "there is not enough memory",
@@ -176,9 +178,9 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
         return said, said.exit_code
     defect = PkmcalError(
         f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
-        next_step=f"Set {DEBUG}=1, run the command again, and report what it then prints",
+        next_step=f"Set {DEBUG_VARIABLE}=1, run the command again, and report what it then prints",
     )
-    return defect, DEFECT
+    return defect, INTERNAL_ERROR_EXIT
 
 
 _SUGGESTED = re.compile(r"\.? *(Did you mean|\(Possible options:).*")
@@ -202,7 +204,7 @@ def _usage(error: Exception) -> str:
         bare = {name.lstrip("-"): name for name in known if name.startswith("--")}
         guess = bare.get(closest(option[1], bare) or "")
     elif command := re.match(r"No such command '(.+)'", message):
-        guess = closest(command[1], COMMANDS)
+        guess = closest(command[1], COMMANDS_IN_ORDER)
     elif choice := re.search(r"'([^']*)' is not one of (.+)", message):
         guess = closest(choice[1], re.findall(r"'([^']+)'", choice[2]))
     return f"{message}, did you mean {guess}" if guess else message

@@ -18,7 +18,7 @@ from pkmcal.simulation import Truth, load_truth
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-WITHIN = 2.0
+WITHIN_TRUTH_SIGMAS = 2.0
 """Standard deviations within which 95 % of the values should lie."""
 
 
@@ -48,7 +48,7 @@ class AgainstTruth:
     within: int
 
 
-def compare(calibration: Calibration, session_folder: Path) -> AgainstTruth:
+def compare_with_truth(calibration: Calibration, session_folder: Path) -> AgainstTruth:
     """Compare with ``truth.json`` in the session's folder."""
     drawing = calibration.session.machine
     truth = load_truth(session_folder, drawing)
@@ -57,7 +57,7 @@ def compare(calibration: Calibration, session_folder: Path) -> AgainstTruth:
         drawing=_errors(drawing, truth),
         calibrated=_errors(calibration.machine, truth),
         count=off.size,
-        within=int(np.sum(off < WITHIN)),
+        within=int(np.sum(off < WITHIN_TRUTH_SIGMAS)),
     )
 
 

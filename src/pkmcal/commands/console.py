@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pkmcal.outcome import Table
 
-Progress = Callable[[str, float], None]
+ToldProgress = Callable[[str, float], None]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of all random draws.")]
@@ -37,15 +37,15 @@ CamerasOf = Annotated[
     typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
 ]
 
-MARKS = {
+MARK_SIGNS = {
     "good": "[green]✓[/]",
     "note": "[cyan]·[/]",
     "doubtful": "[yellow]![/]",
     "wrong": "[red]✗[/]",
 }
-STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
+ROW_SOURCE_STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
 """Of a table's rows, by whose figures they are."""
-EVERY = 10.0
+PROGRESS_LINE_INTERVAL = 10.0
 """Seconds from one line about the progress to the next, where there is no terminal."""
 WIDEST_NAME = 32
 """Letters of a row's name up to which it stays on one line."""
@@ -136,9 +136,9 @@ def print_table(console: Console, table: Table) -> None:
         left = place == 0 or place in table.words
         shown.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
     for row in table.rows:
-        mark = [MARKS[row.mark] if row.mark else ""] if marked else []
+        mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        shown.add_row(*mark, *cells, style=STYLES[row.source])
+        shown.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
     console.print()
     if table.title:
         console.print(table.title, style="bold", markup=False)
@@ -155,9 +155,9 @@ def escaped(text: str) -> str:
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Generator[Progress]:
+def progress(quiet: bool = False) -> Generator[ToldProgress]:
     """A bar on stderr for as long as the block runs; where that is no terminal, such as a log or a
-    pipe, a plain line every EVERY seconds.
+    pipe, a plain line every PROGRESS_LINE_INTERVAL seconds.
     """
     if quiet:
         yield lambda _text, _share: None
@@ -177,7 +177,7 @@ def progress(quiet: bool = False) -> Generator[Progress]:
 
 
 @contextmanager
-def _lines() -> Generator[Progress]:
+def _lines() -> Generator[ToldProgress]:
     """Lines about what is being done, as long as the block runs; none of what ends before."""
     begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
 
@@ -185,7 +185,7 @@ def _lines() -> Generator[Progress]:
         step[0] = text, share
 
     def tell() -> None:
-        while not over.wait(EVERY):
+        while not over.wait(PROGRESS_LINE_INTERVAL):
             text, share = step[0]
             if text:
                 passed = f"{share:.0%}, {time.monotonic() - begin:.0f} s"
@@ -201,7 +201,7 @@ def _lines() -> Generator[Progress]:
         thread.join()
 
 
-def counted(told: Progress, upto: float = 1.0) -> Callable[[int, int], None]:
+def counted(told: ToldProgress, upto: float = 1.0) -> Callable[[int, int], None]:
     """A callback of photographs done and in all, told as a share of `upto`."""
     return lambda done, total: told(f"Photograph {done} of {total}", upto * done / total)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.calibrate import FILES
-from pkmcal.commands.finish import answer, write
+from pkmcal.commands.calibrate import CALIBRATION_FILES
+from pkmcal.commands.finish import answer, write_outcome
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
     from pkmcal.commands.comparison import AgainstTruth
 
-HERE = Path("pkmcal-demo")
-SESSION, CALIBRATION = "session", "calibration"
+DEMO_FOLDER = Path("pkmcal-demo")
+DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
 FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
-SIMULATING = 0.85
+SIMULATING_SHARE = 0.85
 """Share of the time that rendering takes."""
 
 
 def demo(
-    out: Annotated[Path, console.folder("Output folder.")] = HERE,
+    out: Annotated[Path, console.folder("Output folder.")] = DEMO_FOLDER,
     no_open: Annotated[
         bool, typer.Option("--no-open", help="Do not open the report in a browser.")
     ] = False,
@@ -37,35 +37,41 @@ def demo(
     """Simulate, calibrate, compare with the truth, open the report."""
     from dataclasses import asdict, replace
 
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.calibration.results import check_output
-    from pkmcal.commands.comparison import compare
+    from pkmcal.commands.comparison import compare_with_truth
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.report.calibration import outcome_of
     from pkmcal.simulation import simulate_session
-    from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
+    from pkmcal.simulation.demo import (
+        DEMO_MECHANISM,
+        DEMO_SEED,
+        DEMO_SETTINGS,
+        camera_of_size,
+        demo_camera,
+    )
 
-    session, result = out / SESSION, out / CALIBRATION
+    session, result = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
     _make_room(out)
     check_output(result)
     with console.progress(as_json) as told:
         simulate_session(
             session,
-            load_mechanism(MECHANISM),
+            load_mechanism(DEMO_MECHANISM),
             camera_of_size(FAST_SIZE) if fast else demo_camera(),
-            replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS,
-            seed=SEED,
-            progress=console.counted(told, upto=SIMULATING),
+            replace(DEMO_SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else DEMO_SETTINGS,
+            seed=DEMO_SEED,
+            progress=console.counted(told, upto=SIMULATING_SHARE),
         )
-        rest = 0.97 - SIMULATING
-        calibration = calibrate(
-            session, progress=lambda text, share: told(text, SIMULATING + rest * share)
+        rest = 0.97 - SIMULATING_SHARE
+        calibration = calibrate_session(
+            session, progress=lambda text, share: told(text, SIMULATING_SHARE + rest * share)
         )
         told("Writing the report", 0.98)
         found = outcome_of(calibration)
-        write(found, result, FILES)
+        write_outcome(found, result, CALIBRATION_FILES)
     # Only now, with everything written, is the truth looked at.
-    comparison = compare(calibration, session)
+    comparison = compare_with_truth(calibration, session)
     photographs = sum(len(station.photographs) for station in calibration.session.stations)
     found = replace(
         found,
@@ -77,7 +83,7 @@ def demo(
             "comparison": asdict(comparison),
         },
     )
-    code = answer(found, result, FILES, as_json=as_json)
+    code = answer(found, result, CALIBRATION_FILES, as_json=as_json)
     if not as_json:
         _tell_comparison(console.out(), comparison)
         if not no_open and console.can_show():
@@ -94,7 +100,10 @@ def _make_room(out: Path) -> None:
     standing = entries(out)
     if not standing:
         return
-    if not (out / SESSION / "truth.json").is_file() or set(standing) - {SESSION, CALIBRATION}:
+    if not (out / DEMO_SESSION_NAME / "truth.json").is_file() or set(standing) - {
+        DEMO_SESSION_NAME,
+        DEMO_CALIBRATION_NAME,
+    }:
         raise InputError(
             "the folder for the demonstration holds something else",
             where=str(out),

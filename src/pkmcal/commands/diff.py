@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 
-REPORT, DOCUMENT = "diff.html", "diff.json"
-FILES = {REPORT: PAGE, DOCUMENT: NUMBERS}
+DIFFERENCE_PAGE, DIFFERENCE_DOCUMENT = "diff.html", "diff.json"
+DIFFERENCE_FILES = {DIFFERENCE_PAGE: PAGE_DESCRIPTION, DIFFERENCE_DOCUMENT: NUMBERS_DESCRIPTION}
 
 
 def diff(
@@ -40,7 +40,7 @@ def diff(
     from pkmcal.report.difference import outcome_of
 
     if out is not None:
-        check_own_folder(out, FILES, "a difference")
+        check_own_folder(out, DIFFERENCE_FILES, "a difference")
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
         told("Comparing", 0.1)
         found = difference(a, b)
@@ -50,8 +50,8 @@ def diff(
         if saved is not None:
             beside, here = saved.path.resolve().parent.parent / "diff", Path.cwd()
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
-        check_own_folder(folder, FILES, "a difference")
+        check_own_folder(folder, DIFFERENCE_FILES, "a difference")
     outcome = outcome_of(found)
-    texts = {DOCUMENT: json_text(outcome.document)}
-    kept = None if force else keep_earlier(folder, texts, DOCUMENT, REPORT)
-    return finish(outcome, folder, FILES, kept=kept, as_json=as_json)
+    texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
+    kept = None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
+    return finish(outcome, folder, DIFFERENCE_FILES, kept=kept, as_json=as_json)

@@ -13,7 +13,7 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.calibration.source import Source
+    from pkmcal.calibration.source import MachineSource
     from pkmcal.export.contract import Export
 
 
@@ -41,18 +41,18 @@ def export(
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
     from pkmcal.calibration.source import load_source
-    from pkmcal.export.contract import export as run
-    from pkmcal.export.contract import exporter_of, write
+    from pkmcal.export.contract import exporter_of, write_export
+    from pkmcal.export.contract import make_export as run
 
     exporter_of(to)
     source = load_source(calibration, session)
     folder = out or _beside(calibration, to)
     made = run(source, to, force=force)
-    write(made, folder)
+    write_export(made, folder)
     if as_json:
         console.print_json(summary(made, source, folder))
     else:
-        tell(console.out(), made, source, folder)
+        tell_export(console.out(), made, source, folder)
     return 0
 
 
@@ -65,7 +65,7 @@ def _beside(calibration: str, to: str) -> Path:
     return Path(f"export-{to}")
 
 
-def summary(made: Export, source: Source, folder: Path) -> dict[str, Any]:
+def summary(made: Export, source: MachineSource, folder: Path) -> dict[str, Any]:
     """What the command says, for programs."""
     return {
         "exit_code": 0,
@@ -90,18 +90,18 @@ def _trial(made: Export, folder: Path) -> str | None:
     return f"(cd {shlex.quote(str(folder))} && {trial})" if trial else None
 
 
-def tell(out: Console, made: Export, source: Source, folder: Path) -> None:
+def tell_export(out: Console, made: Export, source: MachineSource, folder: Path) -> None:
     """What the command says, for people."""
     state = "good" if source.calibrated and source.usable else "doubtful"
-    console.print_points(out, [(console.MARKS[state], f"{source.origin}: {source.headline}")])
+    console.print_points(out, [(console.MARK_SIGNS[state], f"{source.origin}: {source.headline}")])
     points = [
         (
-            console.MARKS["good"],
+            console.MARK_SIGNS["good"],
             f"Read again and compared: {d.what}, {d.largest:.2g} {d.unit} at most.",
         )
         for d in made.differences
     ]
-    points += [(console.MARKS[note.level.value], note.text) for note in made.notes]
+    points += [(console.MARK_SIGNS[note.level.value], note.text) for note in made.notes]
     console.print_points(out, points)
     out.print()
     console.print_files(out, [(str(folder / name), made.exporter.title) for name in made.files])

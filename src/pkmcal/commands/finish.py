@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from pkmcal.outcome import Outcome
 
-PAGE = "open it in a browser"
-NUMBERS = "everything, for programs"
+PAGE_DESCRIPTION = "open it in a browser"
+NUMBERS_DESCRIPTION = "everything, for programs"
 
 
 def finish(
@@ -39,11 +39,11 @@ def finish(
     """
     with console.progress(as_json) as told:
         told("Writing the report", 0.97)
-        write(outcome, folder, files, over)
+        write_outcome(outcome, folder, files, over)
     return answer(outcome, folder, files, kept=kept, as_json=as_json)
 
 
-def write(
+def write_outcome(
     outcome: Outcome, folder: Path, files: Mapping[str, str], over: Collection[str] = ()
 ) -> None:
     """Write the files, whole or not at all."""
@@ -70,7 +70,7 @@ def answer(
         console.print_json({**printed(outcome, folder, files), **earlier})
     elif not quiet:
         out = console.out()
-        tell(out, outcome)
+        tell_outcome(out, outcome)
         if files:
             out.print()
             told = [(str(folder / name), what) for name, what in files.items()]
@@ -108,13 +108,13 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     }
 
 
-def tell(out: Console, outcome: Outcome) -> None:
+def tell_outcome(out: Console, outcome: Outcome) -> None:
     """What a command found, for people: the verdict, numbers, and what to look at."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:
         console.print_points(out, [("", outcome.subject)])
         out.print()
-    console.print_points(out, [(console.MARKS[outcome.mark], verdict.headline)])
+    console.print_points(out, [(console.MARK_SIGNS[outcome.mark], verdict.headline)])
     console.print_points(out, [("  [red]•[/]", reason) for reason in verdict.reasons])
     brief = any(table.brief for part in outcome.parts for table in part.tables)
     if outcome.figures and not brief:
@@ -133,11 +133,11 @@ def tell(out: Console, outcome: Outcome) -> None:
     checks = [check for part in outcome.parts for check in part.checks]
     for points in (
         [
-            *((console.MARKS[finding.level], finding.text) for finding in findings),
-            *((console.MARKS["doubtful"], text) for text in verdict.warnings),
+            *((console.MARK_SIGNS[finding.level], finding.text) for finding in findings),
+            *((console.MARK_SIGNS["doubtful"], text) for text in verdict.warnings),
             *(("[cyan]→[/]", text) for text in verdict.advice),
         ],
-        [(console.MARKS["good" if c.passed else "wrong"], c.sentence) for c in checks],
+        [(console.MARK_SIGNS["good" if c.passed else "wrong"], c.sentence) for c in checks],
     ):
         if points:
             out.print()

@@ -12,23 +12,23 @@ import typer
 from pkmcal.commands import console
 
 if TYPE_CHECKING:
-    from pkmcal.session.starter import Seen
+    from pkmcal.session.starter import SeenChoice
 
-WHAT = {
+SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
     "mechanism.yaml": "the drawing of your machine",
     "cameras/front.yaml": "the calibration of your camera",
     "board.yaml": "the board on the platform",
     "joints.csv": "one row of readings for each configuration",
 }
-FELT = {
+FELT_FILE_DESCRIPTIONS = {
     "session.yaml": "how good the probe is: see whether it is yours",
     "mechanism.yaml": "the printer by its firmware: see whether its tolerances are right",
     "joints.csv": "the carriages when the bed was felt",
     "poses.csv": "the tool's height above the bed there",
 }
 """Of a session that is whole."""
-PHOTOGRAPHS = "where the photographs go"
+PHOTOGRAPHS_DESCRIPTION = "where the photographs go"
 
 
 def new(
@@ -63,7 +63,9 @@ def new(
     if printer is not None or probed is not None:
         others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
         return _of_printer(folder, printer, probed, board, places or 1, others, as_json)
-    seen: Seen | None = "both" if board and legs else "board" if board else "legs" if legs else None
+    seen: SeenChoice | None = (
+        "both" if board and legs else "board" if board else "legs" if legs else None
+    )
     plain = machine is None and seen is None and places is None
     if plain and not as_json and on_terminal():
         machine, seen, places = _asked()
@@ -114,11 +116,13 @@ def _told(
         return 0
     out = console.out()
     out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
-    drawn = {"mechanism.yaml": FELT["mechanism.yaml"]} if of_printer else {}
-    what = {**WHAT, **(FELT if done else drawn)}
+    drawn = {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
+    what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else drawn)}
     known = [name for name in what if name in names]
     others = sorted(set(names) - set(known))
-    rows = [(name, what[name]) for name in known] + [(name, PHOTOGRAPHS) for name in others]
+    rows = [(name, what[name]) for name in known] + [
+        (name, PHOTOGRAPHS_DESCRIPTION) for name in others
+    ]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
     place = console.escaped(str(folder))
     out.print(
@@ -134,7 +138,7 @@ def on_terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _asked() -> tuple[str | None, Seen | None, int]:
+def _asked() -> tuple[str | None, SeenChoice | None, int]:
     """What somebody at a terminal wants: the machine, what is seen of it, from how many places."""
     from rich.prompt import IntPrompt, Prompt
 
@@ -147,7 +151,7 @@ def _asked() -> tuple[str | None, Seen | None, int]:
         choices=names, show_choices=False, default="gough-stewart",
     )  # fmt: skip
     drawn = load_mechanism(machine)
-    seen: Seen | None = None
+    seen: SeenChoice | None = None
     if any(leg.tubes for leg in drawn.document.legs):
         answer = Prompt.ask(
             "What does the camera see of it",

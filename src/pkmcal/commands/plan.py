@@ -9,15 +9,15 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 from pkmcal.errors import InputError
 
-FILES = {
-    "plan.html": PAGE,
+PLAN_FILES = {
+    "plan.html": PAGE_DESCRIPTION,
     "plan.csv": "the readings, in the order to be measured",
-    "plan.json": NUMBERS,
+    "plan.json": NUMBERS_DESCRIPTION,
 }
-STATIONS = {"stations.yaml": "the places, for session.yaml"}
+STATION_PLACES_FILES = {"stations.yaml": "the places, for session.yaml"}
 
 
 def plan(
@@ -94,21 +94,23 @@ def plan(
     from pkmcal.commands.simulate import parsed_size
     from pkmcal.files import check_own_folder
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.planning.plan import plan as run
+    from pkmcal.planning.plan import plan_measurements as run
     from pkmcal.planning.subject import as_it_stands, of_machine
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import load_session, session_folder
     from pkmcal.simulation import board_for
     from pkmcal.simulation.demo import camera_of_size
-    from pkmcal.simulation.placement import PANORAMIC, view_angle
+    from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 
     console.check_positive("--edge-noise", edge_noise, 100)
     console.check_positive("--corner-noise", corner_noise, 100)
     console.check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
-    files = {**FILES, **(STATIONS if places or best_of else {})}
-    over = check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
+    files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}
+    over = check_own_folder(
+        folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"
+    )
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
         told("Looking at what there is", 0.0)
         region = None
@@ -131,7 +133,7 @@ def plan(
             _only_of("a session", given)
             machine = load_mechanism(subject, label=None)
             eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-            number = 1 if board or places or view_angle(eye) > PANORAMIC else 3
+            number = 1 if board or places or view_angle(eye) > PANORAMIC_HALF_VIEW else 3
             noise = None if tracker is None else _tracker(tracker)
             try:
                 source = of_machine(

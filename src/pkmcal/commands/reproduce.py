@@ -38,13 +38,16 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
-    from pkmcal.commands.finish import NUMBERS, PAGE, answer, contents
+    from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, contents
     from pkmcal.files import check_own_folder, write_folder
     from pkmcal.studies.reproduction import Options
-    from pkmcal.studies.reproduction import reproduce as computed
+    from pkmcal.studies.reproduction import reproduce_paper as computed
 
     files = {
-        paper.value: {f"paper-{paper.value}.html": PAGE, f"paper-{paper.value}.json": NUMBERS}
+        paper.value: {
+            f"paper-{paper.value}.html": PAGE_DESCRIPTION,
+            f"paper-{paper.value}.json": NUMBERS_DESCRIPTION,
+        }
         for paper in Paper
     }
     ours = {name for names in files.values() for name in names}

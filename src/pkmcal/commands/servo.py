@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 from pkmcal.errors import InputError
 
-FILES = {"servo.html": PAGE, "servo.json": NUMBERS}
+SERVO_FILES = {"servo.html": PAGE_DESCRIPTION, "servo.json": NUMBERS_DESCRIPTION}
 MOST_SAMPLES = 5000
 """Samples of a run; more take minutes and hundreds of megabytes."""
 
@@ -80,8 +80,8 @@ def servo(
 
     from pkmcal.control.laws import law_named
     from pkmcal.control.simulation import LoopSettings
-    from pkmcal.control.source import controlled, legs_of, pose_of
-    from pkmcal.control.study import Plan, study
+    from pkmcal.control.source import legs_of_text, load_plant, pose_of_text
+    from pkmcal.control.study import Plan, study_servoing
     from pkmcal.files import check_own_folder
     from pkmcal.report.servo import outcome_of
     from pkmcal.simulation.edges import EdgeNoise
@@ -107,19 +107,19 @@ def servo(
             found=str(loop.samples), expected=f"at most {MOST_SAMPLES}, a rate times a duration",
         )  # fmt: skip
     first, last = (
-        None if text is None else pose_of(text, where)
+        None if text is None else pose_of_text(text, where)
         for text, where in ((start, "--start"), (goal, "--goal"))
     )
     plan = Plan(loop, runs, seed, hand_position, float(np.deg2rad(hand_rotation)), first, last)
     folder = out or Path("servo")
-    check_own_folder(folder, FILES, "a study of servoing", "an earlier study")
-    numbers = None if legs is None else legs_of(legs)
-    scene = controlled(
+    check_own_folder(folder, SERVO_FILES, "a study of servoing", "an earlier study")
+    numbers = None if legs is None else legs_of_text(legs)
+    scene = load_plant(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
     )
     try:
         with console.progress(as_json) as told:
-            outcome = outcome_of(study(scene, plan, told))
+            outcome = outcome_of(study_servoing(scene, plan, told))
     except InputError as error:  # what a camera does not see is told with its file
         raise error if error.where or camera is None else error.located(str(camera)) from None
-    return finish(outcome, folder, FILES, as_json=as_json)
+    return finish(outcome, folder, SERVO_FILES, as_json=as_json)

@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 if TYPE_CHECKING:
     from pkmcal.cameras import Camera
 
-SMALLEST, LARGEST = 64, 8192
+SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
 """Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
 
 
@@ -131,7 +131,7 @@ def simulate(
     places = "1 place" if len(truth.stations) == 1 else f"{len(truth.stations)} places"
     points = [
         (
-            console.MARKS["good"],
+            console.MARK_SIGNS["good"],
             f"{count} photographs of {machine.name} from {places} in {folder}; the"
             " truth is in its truth.json, which no calibration reads.",
         )
@@ -139,7 +139,7 @@ def simulate(
     if machine is not drawing:
         points.append(
             (
-                console.MARKS["note"],
+                console.MARK_SIGNS["note"],
                 f"The drawing of {machine.name} gives its rods no visible cylinders, so they are"
                 " drawn as such; see tubes in the session's mechanism.yaml.",
             )
@@ -153,11 +153,12 @@ def parsed_size(text: str) -> tuple[int, int]:
     """(width, height) of a text such as 800x600."""
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
     size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if min(size) < SMALLEST or max(size) > LARGEST:
+    if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
         raise InputError(
             "no size of a photograph",
             where="--size",
             found=text,
-            expected=f"width x height, each {SMALLEST} to {LARGEST}, such as 800x600",
+            expected=f"width x height, each {SMALLEST_PICTURE_SIDE} to {LARGEST_PICTURE_SIDE},"
+            f" such as 800x600",
         )
     return size

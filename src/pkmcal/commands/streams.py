@@ -20,7 +20,7 @@ from pkmcal.errors import InputError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-LEFT = {errno.EPIPE} | ({errno.EINVAL} if os.name == "nt" else set())
+READER_GONE_ERRORS = {errno.EPIPE} | ({errno.EINVAL} if os.name == "nt" else set())
 """What a pipe says whose reader has gone; Windows has a word of its own."""
 
 
@@ -77,7 +77,7 @@ class _Stream(io.FileIO):
             told, self._told = self._told, False
             os.dup2(nowhere := os.open(os.devnull, os.O_WRONLY), self.fileno())
             os.close(nowhere)
-            if told and error.errno not in LEFT:
+            if told and error.errno not in READER_GONE_ERRORS:
                 raise LostOutput(
                     f"standard output cannot be written ({error.strerror})",
                     next_step="Make room, or send it elsewhere; files that were written are whole",

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 from pkmcal.errors import InputError
 
-ROWS = "one row a run"
+RUN_ROWS_DESCRIPTION = "one row a run"
 
 
 def study(
@@ -45,7 +45,7 @@ def study(
 
     from pkmcal.files import check_own_folder
     from pkmcal.studies.findings import study as simulated
-    from pkmcal.studies.store import FOLDER
+    from pkmcal.studies.store import BATCHES_FOLDER
     from pkmcal.studies.study_report import outcome_of
 
     if table == "parquet" and find_spec("pyarrow") is None:
@@ -55,8 +55,12 @@ def study(
             next_step="Install it with: pip install 'pkmcal[parquet]', or leave the option out",
         )
     name = f"study.{table}"
-    files = {"study.html": PAGE, "study.json": NUMBERS, name: ROWS}
-    ours = {"study.html", "study.json", "study.csv", "study.parquet", FOLDER}
+    files = {
+        "study.html": PAGE_DESCRIPTION,
+        "study.json": NUMBERS_DESCRIPTION,
+        name: RUN_ROWS_DESCRIPTION,
+    }
+    ours = {"study.html", "study.json", "study.csv", "study.parquet", BATCHES_FOLDER}
     over = check_own_folder(out, ours, "a study", "an earlier study")
     try:
         with console.progress(as_json) as told:

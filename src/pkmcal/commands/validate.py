@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 
-FILES = {"validation.html": PAGE, "validation.json": NUMBERS}
+VALIDATION_FILES = {"validation.html": PAGE_DESCRIPTION, "validation.json": NUMBERS_DESCRIPTION}
 
 
 def validate(
@@ -28,13 +28,13 @@ def validate(
 ) -> int:
     """Errors on data that the calibration did not see."""
     from pkmcal.files import check_own_folder
-    from pkmcal.judge.validate import validate as run
+    from pkmcal.judge.validate import validate_calibration as run
     from pkmcal.report.validation import outcome_of
     from pkmcal.session.load import load_session
 
     loaded = load_session(session)
     folder = out or loaded.folder / "validation"
-    check_own_folder(folder, FILES, "a validation")
+    check_own_folder(folder, VALIDATION_FILES, "a validation")
     with console.progress(as_json) as told:
         found = run(calibration, loaded, regions=regions, seed=seed, progress=told)
-    return finish(outcome_of(found), folder, FILES, as_json=as_json)
+    return finish(outcome_of(found), folder, VALIDATION_FILES, as_json=as_json)

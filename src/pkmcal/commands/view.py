@@ -28,7 +28,13 @@ def view(
     """Show photographs with the machine laid over; move it there."""
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
-    from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
+    from pkmcal.view.server import (
+        LOOPBACK_ADDRESS,
+        application,
+        listening_socket,
+        new_token,
+        serve_until_interrupted,
+    )
     from pkmcal.view.viewed import Viewed
 
     loaded = load_session(session)
@@ -45,9 +51,9 @@ def view(
     if calibration is not None:
         _ = viewed.saved  # a wrong one is told before a page stands
     token = new_token()
-    with listening(port) as found:
+    with listening_socket(port) as found:
         port = found.getsockname()[1]
-        address = f"http://{LOOPBACK}:{port}/{token}/"
+        address = f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
         app = application(viewed, token, port)
         if as_json:
             console.print_json({"url": address})
@@ -60,5 +66,5 @@ def view(
             import webbrowser
 
             webbrowser.open(address)
-        serve(app, found)
+        serve_until_interrupted(app, found)
     return 0

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 
-FILES = {"watch.html": PAGE, "watch.json": NUMBERS}
+WATCH_FILES = {"watch.html": PAGE_DESCRIPTION, "watch.json": NUMBERS_DESCRIPTION}
 
 
 def watch(
@@ -34,14 +34,14 @@ def watch(
     """Is the machine still as calibrated? Tests each leg."""
     from pkmcal.files import check_own_folder
     from pkmcal.judge.watch import check_alpha
-    from pkmcal.judge.watch import watch as run
+    from pkmcal.judge.watch import watch_machine as run
     from pkmcal.report.watch import outcome_of
     from pkmcal.session.load import load_session
 
     check_alpha(alpha)
     loaded = load_session(session)
     folder = out or loaded.folder / "watch"
-    check_own_folder(folder, FILES, "what watch writes", "an earlier look")
+    check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")
     with console.progress(as_json) as told:
         found = run(
             calibration,
@@ -51,4 +51,4 @@ def watch(
             same_place=same_place or (),
             progress=told,
         )
-    return finish(outcome_of(found), folder, FILES, as_json=as_json)
+    return finish(outcome_of(found), folder, WATCH_FILES, as_json=as_json)

@@ -21,18 +21,18 @@ from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.velocities import assembly_sign
 
-BLIND = 1e-6
+UNSEEN_MOTION_VISIBILITY = 1e-6
 """Visibility below which a motion is not seen at all: rounding leaves 1e-9."""
-FADING = 0.1
+FADING_VISIBILITY_SHARE = 0.1
 """Part of its usual visibility below which a pose is near one where a motion is not seen."""
-STEPS = 80
-RESTS = 1e-13
+MOST_DESCENT_STEPS = 80
+DESCENT_END_STEP = 1e-13
 """m or rad; a descent whose steps are shorter has ended."""
-ALIKE = 1e-7
+LOOKS_ALIKE_ERROR = 1e-7
 """Norm of e below which two poses look the same: a tenth of a thousandth of a pixel."""
-FLAT = 1e-6
+CANCELLED_ERROR_SHARE = 1e-6
 """Norm of N^T e, as a part of |N| |e|, below which the errors cancel."""
-APART = 1e-3
+DIFFERENT_POSE_DISTANCE = 1e-3
 """m, root mean square of the platform's joints, beyond which two poses are different ones."""
 
 
@@ -70,12 +70,12 @@ class Subset:
     @property
     def blind(self) -> bool:
         """Whether some motion is seen nowhere."""
-        return self.usual < BLIND
+        return self.usual < UNSEEN_MOTION_VISIBILITY
 
     @property
     def fading(self) -> bool:
         """Whether some motion is hardly seen at some poses."""
-        return self.worst < FADING * self.usual
+        return self.worst < FADING_VISIBILITY_SHARE * self.usual
 
 
 def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
@@ -135,9 +135,11 @@ def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equi
     inside = ~outside(machine, readings)
     here, there = (assembly_sign(machine.layout, seen.theta, T) for T in (poses, goal))
     inside &= here * there >= 0
-    looks = size < ALIKE
-    flat = np.sqrt(dot(slope, slope)) < FLAT * largest * np.maximum(size, ALIKE)
-    at_goal = looks & (distance < APART)
+    looks = size < LOOKS_ALIKE_ERROR
+    flat = np.sqrt(dot(slope, slope)) < CANCELLED_ERROR_SHARE * largest * np.maximum(
+        size, LOOKS_ALIKE_ERROR
+    )
+    at_goal = looks & (distance < DIFFERENT_POSE_DISTANCE)
     other = inside & ~at_goal & (looks | flat)
     goal_of = np.repeat(np.arange(g), s)
     kept = _distinct(platform_joints(machine, poses), other, goal_of)
@@ -160,9 +162,9 @@ def _descended(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Array:
     bound = layout.n_equations > layout.driven_rows.size or layout.shares_motors
     damping = np.full(len(poses), 1e-3)
     now = _Slope.of(_task(seen, law, poses, goal))
-    for _ in range(STEPS):
+    for _ in range(MOST_DESCENT_STEPS):
         step = now.step(damping, poses)
-        if np.abs(step).max() < RESTS:
+        if np.abs(step).max() < DESCENT_END_STEP:
             break
         trial = perturb(poses, step)
         if bound:
@@ -219,6 +221,9 @@ def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
     for row in np.flatnonzero(which):  # few distinct ones: a loop over results
         same = [k for k in kept if goal_of[k] == goal_of[row]]
         off = joints[same] - joints[row]
-        if not same or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > APART:
+        if (
+            not same
+            or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > DIFFERENT_POSE_DISTANCE
+        ):
             kept.append(int(row))
     return np.array(kept, dtype=int)

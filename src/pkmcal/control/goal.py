@@ -16,7 +16,7 @@ from pkmcal.control.seen import (
     seen_ends,
     true_edges,
 )
-from pkmcal.control.track import Sight, start_state, track
+from pkmcal.control.track import Sight, first_track_state, track
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.cylinders import line_through
 from pkmcal.geometry.rigid import dot
@@ -25,7 +25,7 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.wording import named
 
-UNIT = 1e-6
+UNIT_LENGTH_TOLERANCE = 1e-6
 """By how much a normal's length may differ from 1: six digits written to a file."""
 
 
@@ -178,7 +178,7 @@ def checked_normals(seen: SeenMachine, normals: Array, name: str) -> Array:
             expected=f"({len(seen.legs)}, 2, 3), two normals for each seen leg",
         )
     length = dot(array, array)
-    if np.any(np.abs(length - 1) > 2 * UNIT):  # NaN passes: a leg that is not seen
+    if np.any(np.abs(length - 1) > 2 * UNIT_LENGTH_TOLERANCE):  # NaN passes: a leg that is not seen
         raise InputError(
             what=f"{name} are not unit vectors",
             found=f"length {float(np.sqrt(np.nanmax(np.abs(length - 1)) + 1)):.6g}",
@@ -250,7 +250,7 @@ def _check_closes(seen: SeenMachine, T_base_platform: Array) -> None:
         return  # said better by what follows
     found = machine.forward_result(readings, T_base_platform)
     moved = np.abs(found.T_base_platform - T_base_platform).max()
-    if not bool(found.converged) or moved > UNIT:
+    if not bool(found.converged) or moved > UNIT_LENGTH_TOLERANCE:
         raise InputError(
             what="the machine cannot take the goal's pose",
             expected=f"a pose that a machine of motion {machine.document.motion!r} can take",
@@ -270,7 +270,7 @@ def _of_photograph(sight: Sight | None, seen: SeenMachine, goal: GoalPhotograph)
             "a goal photograph needs the camera", next_step="give camera to VisualServo"
         )
     readings = np.asarray(goal.readings, dtype=float)
-    found = track(sight, start_state(seen), goal.image, readings)
+    found = track(sight, first_track_state(seen), goal.image, readings)
     if not found.closed:
         raise GeometryError(
             what="no pose of the machine fits the readings of the goal photograph",

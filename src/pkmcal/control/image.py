@@ -26,7 +26,7 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.simulation.edges import EdgeNoise, disturbed, responses
 
-PLACES = 5
+IMAGED_EDGE_PLACES = 5
 """Places along an edge; more change its noise by less than a tenth."""
 IN_VIEW = 0.5
 """Part of a leg's edge that must be in the image; with less, a tracker has lost it."""
@@ -55,7 +55,7 @@ class Eye:
         picked = np.array(rows)
         return cls(true, camera, TubeList(*(column[picked] for column in vars(every).values())))
 
-    def points(self, poses: Array, readings: Array, places: int = PLACES) -> EdgePoints:
+    def points(self, poses: Array, readings: Array, places: int = IMAGED_EDGE_PLACES) -> EdgePoints:
         """Places (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""
         legs = legs_in_camera(self.true.machine, self.true.T_camera_base, poses, readings)
         return edge_points(self.true.machine, self.camera, legs, self.tubes, places)
@@ -71,7 +71,7 @@ class Eye:
         """(R, s) legs of which more than half stands behind another leg."""
         machine = self.true.machine
         legs = legs_in_camera(machine, self.true.T_camera_base, poses, readings)
-        points = edge_points(machine, self.camera, legs, self.tubes, PLACES)
+        points = edge_points(machine, self.camera, legs, self.tubes, IMAGED_EDGE_PLACES)
         clear = unobstructed(machine, self.camera, legs, self.tubes, points, 0.0)
         with np.errstate(invalid="ignore"):
             inside = points.valid & self.camera.in_image(points.pixel, margin=4.0)

@@ -29,9 +29,9 @@ from pkmcal.control.seen import Legs, SeenMachine, directions_of, legs_from_imag
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, cross, dot, skew
 
-Where = Literal["measured", "goal", "mean"]
+MatrixPlace = Literal["measured", "goal", "mean"]
 
-BLIND = 1e-4
+UNCOMMANDED_MOTION_SHARE = 1e-4
 """Singular value of the scaled interaction, as a part of the largest, below which a motion counts
 as unseen and is not commanded. Edges of all legs of a hexapod have 0.02 to 0.2, of three legs
 0.001."""
@@ -198,15 +198,17 @@ class EdgeLaw(Law):
         return -skew(goal) @ edge_interaction(seen, legs, normals, rate)
 
 
-LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
+CONTROL_LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
 """By name; edges first, which hold the platform an order of magnitude steadier."""
 
 
 def law_named(name: str) -> type[Law]:
     """A law by its name. Raises InputError for an unknown one."""
-    if name not in LAWS:
-        raise InputError("there is no such law of control", found=name, expected=" or ".join(LAWS))
-    return LAWS[name]
+    if name not in CONTROL_LAWS:
+        raise InputError(
+            "there is no such law of control", found=name, expected=" or ".join(CONTROL_LAWS)
+        )
+    return CONTROL_LAWS[name]
 
 
 @dataclass(frozen=True)
@@ -231,7 +233,7 @@ def task_of(
     goal: Array,
     legs: Legs,
     goal_legs: Legs | None = None,
-    at: Where = "measured",
+    at: MatrixPlace = "measured",
 ) -> Task:
     """The law's linear problem for normals (..., s, 2, 3), measured and wanted.
 
@@ -262,7 +264,8 @@ def task_of(
 
 
 def solution(task: Task) -> Array:
-    """N+ e (..., f), by least squares; what the legs do not see, :data:`BLIND`, stays at rest.
+    """N+ e (..., f), by least squares; what the legs do not see, :data:`UNCOMMANDED_MOTION_SHARE`,
+    stays at rest.
 
     NaN where an edge or a limb has no place.
     """
@@ -272,7 +275,7 @@ def solution(task: Task) -> Array:
     error = np.where(known[..., None], task.error, 0.0)
     turned = matrix.mT
     values, vectors = np.linalg.eigh(turned @ matrix)
-    seen = values > BLIND**2 * values[..., -1:]
+    seen = values > UNCOMMANDED_MOTION_SHARE**2 * values[..., -1:]
     weights = np.where(seen & (values > 0), 1 / np.where(seen & (values > 0), values, 1.0), 0.0)
     wanted = vectors.mT @ (turned @ error[..., None])
     step = (vectors @ (weights[..., None] * wanted))[..., 0]
@@ -287,7 +290,7 @@ def joint_velocities(
     readings: Array,
     gain: float,
     *,
-    at: Where = "measured",
+    at: MatrixPlace = "measured",
     goal_readings: Array | None = None,
 ) -> Array:
     """The drives' rates -gain D N+ e, (..., m) per second; errata, "Servoing".

@@ -25,19 +25,26 @@ from pkmcal.control.goal import (
     range_sentence,
     vague_sentence,
 )
-from pkmcal.control.laws import BLIND, Task, law_named, limited, solution, task_of
+from pkmcal.control.laws import (
+    UNCOMMANDED_MOTION_SHARE,
+    Task,
+    law_named,
+    limited,
+    solution,
+    task_of,
+)
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
 from pkmcal.control.track import (
-    FITS,
-    LAG,
+    READINGS_LAG_SIGMA,
+    SAME_ASSEMBLY_ANGLE,
     LegLines,
     Sight,
     assembly_sentence,
     check_image,
+    first_track_state,
     misfit,
-    start_state,
     track,
-    weighted,
+    weighted_task,
 )
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import dot, inverse
@@ -45,20 +52,25 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.wording import named
 
-__all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
+__all__ = [
+    "GoalPhotograph",
+    "Status",
+    "Step",
+    "VisualServo",
+]
 
-TOLERANCE = 5e-4
+GOAL_READING_TOLERANCE = 5e-4
 """Reading (m or rad) by which the machine may still be off at the goal: one photograph of 640x480
 pixels tells it to 0.3 mm."""
-BESIDE = 3 * LAG
+UNEXPLAINED_READINGS_LAG = 3 * READINGS_LAG_SIGMA
 """Metres between a photograph and its readings that a control loop's delay does not explain."""
-VAGUE = 4.0
+VAGUE_WAY_TOLERANCES = 4.0
 """Tolerances that the standard deviation of a reading's way to the goal may have without a word."""
-SIGMAS = 5.0
+AT_GOAL_DEVIATIONS = 5.0
 """The same in standard deviations, where a photograph says what these are."""
-UNSEEN = 0.05
+UNSEEN_READING_SIGMA = 0.05
 """m or rad of a reading: what a photograph tells worse than that it does not show."""
-ELSEWHERE = 0.02
+OTHER_PLACE_ANGLE = 0.02
 """Root mean square angle (rad) that is no noise: where readings are to stay and the edges are this
 far from the goal, the law has come to rest in another place."""
 NOT_FOUND = (
@@ -107,7 +119,7 @@ class VisualServo:
         rate_limits: float | Array | None = None,
         legs: Integers | None = None,
         start: Array | None = None,
-        tolerance: float = TOLERANCE,
+        tolerance: float = GOAL_READING_TOLERANCE,
         period: float = 0.0,
         edge_shift: float = 0.0,
     ) -> None:
@@ -176,7 +188,7 @@ class VisualServo:
         """Forget all samples; the next one is a first one near ``start`` (4, 4), or home."""
         self._start = np.asarray(self.machine.home() if start is None else start, dtype=float)
         self._pose, self._started = self._start, False
-        self._track = start_state(self.seen, self._start)
+        self._track = first_track_state(self.seen, self._start)
 
     def step_edges(self, normals: Array, readings: Array) -> Step:
         """Velocities from the edges (s, 2, 3) of the seen legs, camera frame, NaN for a leg that
@@ -221,7 +233,7 @@ class VisualServo:
         if not self._started:
             check_sides(self.seen, sample.normals, pose)
             off = misfit(self.seen, sample.normals, pose, sample.readings)
-            if off > FITS:
+            if off > SAME_ASSEMBLY_ANGLE:
                 why = assembly_sentence(self.seen, sample.normals, pose, sample.readings)
                 return self._stopped(sample, Status.WRONG_ASSEMBLY, why)
         self._pose = pose
@@ -235,7 +247,7 @@ class VisualServo:
         task = task_of(self.law, seen, sample.normals[used], self.goal.normals[used], legs)
         error, noise = _root_mean_square(task.error), float("nan")
         if sample.lines is not None:
-            task, noise = weighted(self.law, task, sample.lines, used)
+            task, noise = weighted_task(self.law, task, sample.lines, used)
         return self._answer(sample, used, task, error, noise)
 
     def _answer(
@@ -248,7 +260,7 @@ class VisualServo:
         known = noise > 0
         sigma = noise * _spread(task) if known else np.full(self.machine.n_joints, np.nan)
         vague = float(sigma.max()) if known else 0.0
-        if vague > UNSEEN:
+        if vague > UNSEEN_READING_SIGMA:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
         self._started = True
         off = task.readings @ solution(task)
@@ -262,7 +274,7 @@ class VisualServo:
         still = bool(np.max(np.abs(off)) <= self.tolerance)
         # a leg's direction scatters by more than that, so photographs are asked in sigmas
         typical = _root_mean_square(task.error / np.sqrt(3)) / noise if known else np.inf
-        converged = still and (error < ELSEWHERE or typical < SIGMAS)
+        converged = still and (error < OTHER_PLACE_ANGLE or typical < AT_GOAL_DEVIATIONS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:
             elsewhere = (
@@ -271,7 +283,7 @@ class VisualServo:
                 " place"
             )
             warnings = (*warnings, elsewhere)
-        if vague > VAGUE * self.tolerance:
+        if vague > VAGUE_WAY_TOLERANCES * self.tolerance:
             warnings = (*warnings, vague_sentence(self.machine, sigma))
         status = Status.CONVERGED if converged else Status.RUNNING
         return Step(
@@ -289,7 +301,7 @@ class VisualServo:
             why = f"smallest singular value {least:.2g}; {NEAR_SINGULAR} is the least allowed"
             return self._stopped(sample, Status.SINGULAR, why)
         squares = np.linalg.eigvalsh(task.matrix.T @ task.matrix)
-        if squares[0] < BLIND**2 * squares[-1]:
+        if squares[0] < UNCOMMANDED_MOTION_SHARE**2 * squares[-1]:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
         if aspect_of(self.machine, task.legs) * self.goal.aspect < 0:
             why = "it was crossed, or the goal is in another assembly: choose a goal on this side"
@@ -351,7 +363,7 @@ class VisualServo:
         self, sample: _Sample, used: Booleans, slowed: bool, outside: Booleans
     ) -> tuple[str, ...]:
         out = self._lost(sample, used)
-        if sample.beside > BESIDE:
+        if sample.beside > UNEXPLAINED_READINGS_LAG:
             out.append(
                 f"the photograph contradicts the readings by {sample.beside * 1e3:.1f} mm in a"
                 " rod's length: they are of another time, or not this machine's"

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.image import Eye
-from pkmcal.control.laws import Where, joint_velocities, law_named, limited, solution, task_of
+from pkmcal.control.laws import MatrixPlace, joint_velocities, law_named, limited, solution, task_of
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
@@ -22,23 +22,23 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
 from pkmcal.mechanisms.velocities import assembly_sign
 from pkmcal.simulation.edges import EdgeNoise
 
-DRAWS = 24
+IMAGES_A_GOAL = 24
 """Images of each goal; the standard deviation over all goals is then good to a few percent."""
-SETTLED = 0.02
+ARRIVED_WAY_SHARE = 0.02
 """Part of the way at which a platform counts as arrived, as control engineers have it."""
 LEAST_WAY = 5e-4
 """m, of the platform's joints, within which a goal is reached however short the way was."""
-LAST = 0.1
+FINAL_RUN_SHARE = 0.1
 """Part of a run, at its end, whose mean decides where it ended."""
-NOISY = 3.0
+AT_GOAL_NOISE_DEVIATIONS = 3.0
 """Standard deviations of the noise at the goal within which a platform is there."""
-STILL = 0.1
+TREMBLING_WAY_SHARE = 0.1
 """Part of the way beyond which a platform that trembles is not at its goal."""
 AT_REST = 0.02
 """Part of the rate that the error would ask for, below which a run stands still."""
 AT_STOP = 1e-9
 """m or rad by which a reading may be beyond its range: rounding."""
-SILENT = EdgeNoise(shift=0.0, tilt=0.0)
+NO_EDGE_NOISE = EdgeNoise(shift=0.0, tilt=0.0)
 """A camera without errors."""
 
 
@@ -119,7 +119,7 @@ class End(Enum):
         return f"{what} {self.help[0].upper()}{self.help[1:]}." if self.help else what
 
 
-ENDS = tuple(End)
+RUN_ENDS = tuple(End)
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def one_image(
     readings: Array,
     noise: EdgeNoise,
     rng: np.random.Generator,
-    draws: int = DRAWS,
+    draws: int = IMAGES_A_GOAL,
 ) -> Stillness:
     """The platform's apparent displacement at goals (R, 4, 4) by the noise of single images."""
     points = eye.points(goals, readings)
@@ -203,7 +203,7 @@ class LoopSettings:
     joint_noise: float = 3e-6
     speed: Array | None = None
     duration: float = 10.0
-    at: Where = "measured"
+    at: MatrixPlace = "measured"
 
     @property
     def samples(self) -> int:
@@ -212,7 +212,7 @@ class LoopSettings:
 
 
 @dataclass(frozen=True)
-class Runs:
+class ServoRuns:
     """R runs of K samples.
 
     time : (K,) s. error : (R, K) norm of e. way : (R, K) m, root mean square distance of the
@@ -237,7 +237,7 @@ class Runs:
         return np.array([end.good for end in self.end])
 
 
-def simulate(
+def simulate_servo_runs(
     eye: Eye,
     believed: SeenMachine,
     starts: Array,
@@ -245,14 +245,14 @@ def simulate(
     loop: LoopSettings,
     rng: np.random.Generator,
     progress: Callable[[float], None] = lambda _: None,
-) -> Runs:
+) -> ServoRuns:
     """R runs from starts to goals (R, 4, 4), the true platform's poses.
 
     believed : its values (R, P) or (P,), its camera's place (R, 4, 4) or (4, 4). The wanted edges
     are the true ones at the goal, taught there without noise.
     """
     kind, goal_readings = law_named(loop.law), eye.true.machine.inverse(goals)
-    wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), SILENT, rng)
+    wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), NO_EDGE_NOISE, rng)
     now = _begin(eye, starts, goals)
     record = _Record.empty(eye.true.machine, starts, goals, now.readings.shape[-1], loop.samples)
     floor = _floor(eye, goals, np.nan_to_num(goal_readings), loop, rng)
@@ -277,7 +277,8 @@ def simulate(
 
 @dataclass(frozen=True)
 class _Now:
-    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in ``ENDS``,
+    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in
+    ``RUN_ENDS``,
     -1 for none yet. last : (R,) sample at which it came.
     """
 
@@ -312,7 +313,7 @@ def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
     which = which & now.active
     return replace(
         now,
-        end=np.where(which, ENDS.index(end), now.end),
+        end=np.where(which, RUN_ENDS.index(end), now.end),
         last=np.where(which, sample, now.last),
     )
 
@@ -387,13 +388,13 @@ class _Record:
         self.past[:, sample] = -ahead / np.where(whole > 0, whole, np.inf)
         self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
 
-    def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> Runs:
+    def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> ServoRuns:
         """What the runs were, with their ends judged."""
         last = np.where(now.active, loop.samples - 1, now.last)
         judged = _judged(self.error, self.way, loop, floor)
-        ends = [ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
+        ends = [RUN_ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
         time = np.arange(loop.samples) / loop.rate
-        return Runs(
+        return ServoRuns(
             time, self.error, self.way, self.past, self.poses, self.readings, tuple(ends), last,
             goals,
         )  # fmt: skip
@@ -405,7 +406,9 @@ def _floor(
     """Distance (R,) m of the platform's joints from the goal that the noise alone explains."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
-    return np.nan_to_num(NOISY * still.joints * (part if np.isfinite(part) else 0.0))
+    return np.nan_to_num(
+        AT_GOAL_NOISE_DEVIATIONS * still.joints * (part if np.isfinite(part) else 0.0)
+    )
 
 
 def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[End]:
@@ -413,15 +416,15 @@ def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[
 
     floor : (R,) m, what noise alone explains.
     """
-    n = max(1, round(LAST * error.shape[1]))
+    n = max(1, round(FINAL_RUN_SHARE * error.shape[1]))
     e, w = error[:, -n:].mean(axis=1), way[:, -n:].mean(axis=1)
     before = way[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
-    near = np.maximum(SETTLED * way[:, 0], LEAST_WAY)
-    arrived = w < np.maximum(near, np.minimum(floor, STILL * way[:, 0]))
+    near = np.maximum(ARRIVED_WAY_SHARE * way[:, 0], LEAST_WAY)
+    arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_WAY_SHARE * way[:, 0]))
     shaken = w < floor
     # what an exponential of this gain would still go in that time, were the control not at rest
     rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
-    alike = e < SETTLED * error[:, 0]
+    alike = e < ARRIVED_WAY_SHARE * error[:, 0]
     worse = w > way[:, 0]
     return [_end(*case) for case in zip(arrived, shaken, alike, rest, worse, strict=True)]
 

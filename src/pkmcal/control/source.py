@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.saved import SavedCalibration, SavedStation, load
-from pkmcal.calibration.source import Source, load_source
+from pkmcal.calibration.source import MachineSource, load_source
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine
 from pkmcal.control.study import Plant, Uncertainty
@@ -18,7 +18,7 @@ from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.placement import default_stations
 from pkmcal.simulation.truth import stream, true_machine
 
-CALIBRATED = 1 / 30
+CALIBRATED_TOLERANCE_SHARE = 1 / 30
 """What a calibration leaves of a drawing's tolerances: 2 mm become 0.06 mm, as in the
 demonstration."""
 CAMERA_ROTATION = float(np.deg2rad(0.02))
@@ -26,7 +26,7 @@ CAMERA_POSITION = 2e-4
 """rad and m, standard deviations of a camera's place by the same demonstration."""
 
 
-def controlled(
+def load_plant(
     what: str,
     *,
     session: Path | None = None,
@@ -56,7 +56,7 @@ def controlled(
 
 def _of_calibration(
     saved: SavedCalibration,
-    source: Source,
+    source: MachineSource,
     station: str | None,
     eye: Camera | None,
     legs: tuple[int, ...] | None,
@@ -87,7 +87,7 @@ def _of_calibration(
 
 
 def _station(
-    saved: SavedCalibration, source: Source, name: str | None, eye: Camera | None
+    saved: SavedCalibration, source: MachineSource, name: str | None, eye: Camera | None
 ) -> SavedStation:
     """The station asked for, or the first one whose camera is known."""
     names = [one.name for one in saved.stations]
@@ -110,14 +110,16 @@ def _station(
     return known[0]
 
 
-def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed: int) -> Plant:
+def _of_drawing(
+    source: MachineSource, eye: Camera, legs: tuple[int, ...] | None, seed: int
+) -> Plant:
     """A machine built within its drawing's tolerances."""
     machine = source.machine
     seen_machine(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
     rng = np.random.default_rng(stream(seed, "stations"))
     place = default_stations(machine, (eye,), rng)[0]
     table = machine.parameters
-    free = table.free_matrix() * (CALIBRATED * table.tolerances_free())
+    free = table.free_matrix() * (CALIBRATED_TOLERANCE_SHARE * table.tolerances_free())
     truth = true_machine(machine, 1.0, np.random.default_rng(stream(seed, "machine")))
     x, y, z = place.position
     origin = (
@@ -138,7 +140,7 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
     )
 
 
-def pose_of(text: str, where: str) -> Array:
+def pose_of_text(text: str, where: str) -> Array:
     """A pose (4, 4) of six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
     try:
         numbers = np.array([float(part) for part in text.split(",")])
@@ -154,7 +156,7 @@ def pose_of(text: str, where: str) -> Array:
     return pose(rotation(numbers[3:]), numbers[:3])
 
 
-def legs_of(text: str) -> tuple[int, ...]:
+def legs_of_text(text: str) -> tuple[int, ...]:
     """Numbers from 0 of legs told from 1, such as 1,3,5."""
     try:
         numbers = [int(part) for part in text.split(",")]

@@ -20,15 +20,15 @@ from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, s
 from pkmcal.control.image import Eye
 from pkmcal.control.seen import SeenMachine, seen_machine
 from pkmcal.control.simulation import (
-    SETTLED,
+    ARRIVED_WAY_SHARE,
     End,
     LoopSettings,
-    Runs,
+    ServoRuns,
     Stillness,
     loop_factor,
     one_image,
     platform_joints,
-    simulate,
+    simulate_servo_runs,
 )
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose, register, rotation
@@ -40,16 +40,16 @@ from pkmcal.simulation.placement import draw_configurations
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))
 """m and rad by which a camera's place is wrong that was measured by ruler and eye."""
-INSIDE = 0.15
+RANGE_END_SHARE = 0.15
 """Part of a reading's range at both ends in which no way begins or ends: a platform that is led
 by its image does not go straight in its readings."""
-WORKSPACE = 60
+VISIBILITY_POSES = 60
 """Poses of the workspace at which visibility is judged."""
-CLOSED = 1e-6
+TOLD_POSE_ROUNDING = 1e-6
 """m; a pose told with six decimals leaves so much."""
 MOST_LEGS = 8
 """Legs of which all choices are compared."""
-GOALS, STARTS = 5, 40
+EQUILIBRIA_GOALS, EQUILIBRIA_STARTS = 5, 40
 """Goals for which other equilibria are sought, and starts of the search for each."""
 
 
@@ -186,13 +186,13 @@ class Trials:
 
     overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
     largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
-    s after which the platform is within SETTLED of its way, NaN where it never is. astray : (R,) m,
-    root mean square of the platform's joints, by which the platform left the way that it takes with
-    the true geometry, at most.
+    s after which the platform is within ARRIVED_WAY_SHARE of its way, NaN where it never is. astray
+    : (R,) m, root mean square of the platform's joints, by which the platform left the way that it
+    takes with the true geometry, at most.
     """
 
     estimate: Belief
-    runs: Runs
+    runs: ServoRuns
     overshoot: Array
     rise: Array
     settling: Array
@@ -238,7 +238,7 @@ class Study:
         return next(o for o in self.outcomes if o.estimate.name == name)
 
 
-def study(
+def study_servoing(
     scene: Plant, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
 ) -> Study:
     """Simulate the loop with every estimate, and analyse what the legs show.
@@ -250,8 +250,10 @@ def study(
     seeds = np.random.SeedSequence(plan.seed).spawn(5)
     eye = Eye.of(scene.seen(), scene.camera)
     progress("Looking at the workspace", 0.02)
-    drawn = draw_configurations(scene.machine, WORKSPACE, 0.2, np.random.default_rng(seeds[0]))
-    workspace = drawn[0][:WORKSPACE]
+    drawn = draw_configurations(
+        scene.machine, VISIBILITY_POSES, 0.2, np.random.default_rng(seeds[0])
+    )
+    workspace = drawn[0][:VISIBILITY_POSES]
     starts, goals = _ways(eye, plan, np.random.default_rng(seeds[1]))
     beliefs = estimates(
         eye.true, scene.drawing, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
@@ -262,7 +264,7 @@ def study(
         told = _told(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
         # the same noise for all, so that differences are the estimates'
         rng = np.random.default_rng(seeds[3])
-        runs = simulate(eye, belief.seen, starts, goals, plan.loop, rng, told)
+        runs = simulate_servo_runs(eye, belief.seen, starts, goals, plan.loop, rng, told)
         ideal = outcomes[0].runs if outcomes else runs
         outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
     progress("Looking for other equilibria", 0.87)
@@ -282,7 +284,9 @@ def study(
         held=image.held(loop.gain / loop.rate, loop.delay),
         hidden=eye.hidden(ends, np.nan_to_num(scene.machine.inverse(ends))).mean(axis=0),
         choices=subsets(matrix_at(seen, loop.law, workspace), seen.legs),
-        equilibria=equilibria(eye.true, loop.law, goals[:GOALS], workspace[:STARTS]),
+        equilibria=equilibria(
+            eye.true, loop.law, goals[:EQUILIBRIA_GOALS], workspace[:EQUILIBRIA_STARTS]
+        ),
     )
 
 
@@ -303,7 +307,7 @@ def check_loop(loop: LoopSettings) -> None:
     )
 
 
-def outcome(true: Machine, estimate: Belief, runs: Runs, ideal: Runs) -> Trials:
+def outcome(true: Machine, estimate: Belief, runs: ServoRuns, ideal: ServoRuns) -> Trials:
     """The figures of an estimate's runs. ideal : the same with the true machine's geometry."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
@@ -319,7 +323,7 @@ def outcome(true: Machine, estimate: Belief, runs: Runs, ideal: Runs) -> Trials:
     )
 
 
-def _astray(machine: Machine, runs: Runs, ideal: Runs) -> Array:
+def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
     """How far (R,) m the platform's joints were from their nearest place on the ideal way."""
     out = np.zeros(len(runs.end))
     for r, (last, end) in enumerate(zip(runs.last, ideal.last, strict=True)):
@@ -332,9 +336,11 @@ def _astray(machine: Machine, runs: Runs, ideal: Runs) -> Array:
     return out
 
 
-def _settling(runs: Runs) -> Array:
-    """Time (R,) after which the platform stays within SETTLED of its way; NaN where never."""
-    far = runs.way > SETTLED * runs.way[:, :1]
+def _settling(runs: ServoRuns) -> Array:
+    """Time (R,) after which the platform stays within ARRIVED_WAY_SHARE of its way; NaN where
+    never.
+    """
+    far = runs.way > ARRIVED_WAY_SHARE * runs.way[:, :1]
     n = far.shape[1]
     after = n - np.argmax(far[:, ::-1], axis=1)
     after = np.where(far.any(axis=1), after, 0)
@@ -369,7 +375,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
     unreached = np.flatnonzero(~np.isfinite(readings))
     c = closure(layout, theta, np.nan_to_num(readings), T_base_platform, internal)
     gap = float(np.abs(c.rows.value).max())
-    if unreached.size or gap > CLOSED:
+    if unreached.size or gap > TOLD_POSE_ROUNDING:
         raise InputError(
             "the machine cannot take this pose",
             where=where,
@@ -398,7 +404,7 @@ def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
             break
         poses, joints = draw_configurations(machine, 4 * count + 20, 0.0, rng)
         with np.errstate(invalid="ignore"):
-            edge = INSIDE * (high - low)
+            edge = RANGE_END_SHARE * (high - low)
             out = (joints < low + edge) | (joints > high - edge)
         in_view = eye.in_view(eye.points(poses, joints)).all(axis=-1)
         good = ~np.asarray(out.any(axis=-1)) & np.asarray(in_view)

@@ -23,24 +23,24 @@ from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.legs import Photographs, StationEdges, measure, search
 
-FITS = float(np.deg2rad(5.0))
+SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
 assembly that was expected: a camera placed by hand is right to a few degrees, other assemblies
 lie tens of degrees away."""
-SHADING = 0.1
+SHADING_EDGE_SHIFT = 0.1
 """Pixels by which a whole edge may lie off, whatever its own sigma: shading that the edge model
 leaves out (docs/observation.md measures 0.14 and 0.22 px a place)."""
-ASIDE = 0.1
+LEG_ENDS_ASIDE_SIGMA = 0.1
 """Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
 it keeps the line of a leg with one edge finite until that leg is found to be lost."""
-LAG = 0.001
+READINGS_LAG_SIGMA = 0.001
 """Metres by which a reading may lie beside the photograph: 50 mm/s for 20 ms between the two. Edges
 tell some motions of the platform a hundred times worse than others, and there readings decide."""
-AGREE = 16.0
+ONE_LEG_MISFIT = 16.0
 """Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
-SIDES = np.array([0, 1])
-HIDDEN = "hidden behind another leg or outside the photograph"
-FAR = 0.7
+LEG_EDGE_SIDES = np.array([0, 1])
+LEG_OUT_OF_SIGHT = "hidden behind another leg or outside the photograph"
+LOST_EDGE_DISTANCE = 0.7
 """Median distance (px) of edges from their prediction from which none is believed: of legs that
 turned away more than that, the ends that still lie within reach pass for whole edges."""
 SEARCH_ROUNDS = 3
@@ -114,7 +114,7 @@ def edge_misfits(
     radius = machine.radii_of(edges.leg, edges.tube)
     at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
     to_tangent = edges.basis.mT
-    off = SHADING * edges.shift
+    off = SHADING_EDGE_SHIFT * edges.shift
     covariance = edges.covariance + off[:, :, None] * off[:, None, :]
     return EdgeMisfits(
         leg=leg,
@@ -142,20 +142,22 @@ def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     e = across[rows.leg]
     jac = np.concatenate([rows.by_a @ e, rows.by_b @ e], axis=-1)
     to_right = jac.mT @ rows.information
-    covariance = np.linalg.inv(np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / ASIDE**2)
+    covariance = np.linalg.inv(
+        np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / LEG_ENDS_ASIDE_SIGMA**2
+    )
     right = pick @ (to_right @ rows.misfit[..., None])[..., 0]
     moved = (covariance @ right[..., None])[..., 0]
     left = rows.misfit - (jac @ moved[rows.leg][..., None])[..., 0]
     square = pick @ dot(left, (rows.information @ left[..., None])[..., 0])
-    agrees = square < AGREE * np.maximum(2 * pick.sum(axis=1) - 4, 1)
-    both = np.logical_and(*(pick @ (rows.side == side) > 0 for side in SIDES))
+    agrees = square < ONE_LEG_MISFIT * np.maximum(2 * pick.sum(axis=1) - 4, 1)
+    both = np.logical_and(*(pick @ (rows.side == side) > 0 for side in LEG_EDGE_SIDES))
     a, b = (
         p + (across @ m[..., None])[..., 0]
         for p, m in ((rows.a, moved[:, :2]), (rows.b, moved[:, 2:]))
     )
     # and as the edges that a cylinder of the controller's radius would show
     radius = seen.radius[:, None]
-    at = edge_normal_jacobians(a[:, None], b[:, None], radius, SIDES)
+    at = edge_normal_jacobians(a[:, None], b[:, None], radius, LEG_EDGE_SIDES)
     middle = (a + b)[:, None] / 2 + radius[..., None] * at.n
     basis = tangent_basis(at.n, middle / np.sqrt(dot(middle, middle))[..., None])
     by_move = np.concatenate([at.dn_da @ across[:, None], at.dn_db @ across[:, None]], axis=-1)
@@ -166,7 +168,7 @@ def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     return LegLines(normal, np.where(lost[..., None], np.nan, basis), joint, agrees, both & agrees)
 
 
-def weighted(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Task, float]:
+def weighted_task(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Task, float]:
     """A task with its rows weighed by what the photograph tells of the legs used, (s,); and the
     standard deviation (rad) that every row then has.
 
@@ -228,9 +230,12 @@ def corrected_pose(
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
     to_right = jac.mT @ information * weight[:, None, None]
-    closing = c.rows.by_pose @ motion / LAG
+    closing = c.rows.by_pose @ motion / READINGS_LAG_SIGMA
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
-    right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.rows.value / LAG
+    right = (
+        np.sum(to_right @ misfit[..., None], axis=0)[:, 0]
+        - closing.T @ c.rows.value / READINGS_LAG_SIGMA
+    )
     return perturb(T_base_platform, motion @ np.linalg.solve(normal, right))
 
 
@@ -282,7 +287,7 @@ class TrackedLegs:
     state: TrackState
 
 
-def start_state(seen: SeenMachine, start: Array | None = None) -> TrackState:
+def first_track_state(seen: SeenMachine, start: Array | None = None) -> TrackState:
     """Before the first photograph; start : (4, 4) pose near which the machine stands."""
     begin = seen.machine.home() if start is None else start
     none = np.zeros(len(seen.legs), dtype=bool)
@@ -365,7 +370,7 @@ def _look(sight: Sight, photograph: Photographs, predicted: Array, blur: float) 
     known = None if np.isnan(blur) else blur
     look = measure(photograph, seen.machine, seen.T_camera_base, predicted[None], known)
     rows = edge_misfits(seen, photograph.joints[0], predicted, look.edges, sight.edge_shift)
-    far = look.moved > FAR
+    far = look.moved > LOST_EDGE_DISTANCE
     lines = LegLines.nothing(len(seen.legs)) if far else leg_lines(seen, rows)
     return _Look(predicted, look, rows, lines, far)
 
@@ -387,7 +392,7 @@ def _reasons(sight: Sight, at: _Look) -> tuple[str, ...]:
     out: list[str] = []
     for leg, found, agrees in zip(sight.seen.legs, at.lines.found, at.lines.agrees, strict=True):
         mine = [r.reason for r in at.look.rejected if r.leg == leg]
-        shown = [reason for reason in mine if reason != HIDDEN]
+        shown = [reason for reason in mine if reason != LEG_OUT_OF_SIGHT]
         why = (shown or mine or ["only one of its sides is seen"])[0]
         out.append("" if found else why if agrees else "its edges do not belong to one leg")
     return tuple(out)
@@ -439,7 +444,7 @@ def assembly_sentence(seen: SeenMachine, normals: Array, expected: Array, readin
     off = np.rad2deg(misfit(seen, normals, expected, readings))
     text = f"the legs point {off:.0f} degrees away from where the start and the readings put them"
     found = nearest_assembly(seen, normals, readings)
-    if found is None or found[1] > FITS:
+    if found is None or found[1] > SAME_ASSEMBLY_ANGLE:
         return (
             f"{text}, and no other assembly fits them: check the readings' order and units,"
             " and the camera's place"

@@ -9,15 +9,15 @@ from pkmcal.control.study import Study, Trials
 from pkmcal.outcome import Verdict
 from pkmcal.wording import named
 
-ENOUGH = 0.9
+ENOUGH_REACHED_SHARE = 0.9
 """Part of the runs with the identified geometry that must reach their goal."""
-HIDDEN = 0.05
+UNMENTIONED_HIDDEN_SHARE = 0.05
 """Part of the poses at which a leg may stand behind another without a warning."""
-OVERSHOOT = 0.05
+UNMENTIONED_OVERSHOOT = 0.05
 """Part of the way by which a platform may pass its goal without a word."""
-ASTRAY = 0.01
+UNMENTIONED_DEVIATION = 0.01
 """Part of the way by which a platform may leave it without a word."""
-COARSE = 0.02
+UNMENTIONED_GOAL_NOISE = 0.02
 """Noise at the goal, as a part of the usual way, that deserves a word."""
 
 
@@ -26,7 +26,7 @@ def judgement(found: Study) -> Verdict:
     own, good = found.own, found.outcome("identified")
     reasons = (*_blind(found), *_failures(good))
     share = good.reached / len(good.runs.end)
-    usable = not own.blind and share >= ENOUGH
+    usable = not own.blind and share >= ENOUGH_REACHED_SHARE
     law = found.plan.loop.law
     legs = chosen_legs(own, found)
     headline = (
@@ -107,7 +107,7 @@ def _hidden(found: Study) -> tuple[str, ...]:
     legs = [
         f"leg {j + 1} ({100 * part:.0f} %)"
         for j, part in zip(found.eye.true.legs, found.hidden, strict=True)
-        if part > HIDDEN
+        if part > UNMENTIONED_HIDDEN_SHARE
     ]
     if not legs:
         return ()
@@ -133,14 +133,16 @@ def _by_hand(found: Study) -> tuple[str, ...]:
         float(np.median(o.astray[o.runs.reached])) if o.reached else 0.0
         for o in (hand, found.outcome("identified"))
     )
-    if off > max(ASTRAY * float(np.median(hand.runs.way[:, 0])), 2 * own):
+    if off > max(UNMENTIONED_DEVIATION * float(np.median(hand.runs.way[:, 0])), 2 * own):
         text.append(
             "With the camera's place by hand the platform gets there beside its way, by"
             f" {1e3 * off:.2g} mm in half of the runs and up to"
             f" {1e3 * float(hand.astray[good].max()):.2g} mm; identified, by {1e3 * own:.2g} mm."
         )
     over = float(hand.overshoot[good].max(initial=0.0))
-    if over > max(OVERSHOOT, 2 * float(found.outcome("identified").overshoot.max(initial=0.0))):
+    if over > max(
+        UNMENTIONED_OVERSHOOT, 2 * float(found.outcome("identified").overshoot.max(initial=0.0))
+    ):
         text.append(
             f"With the camera's place by hand the platform passes its goal by up to"
             f" {100 * over:.0f} % of its way."
@@ -151,7 +153,7 @@ def _by_hand(found: Study) -> tuple[str, ...]:
 def _noise(found: Study) -> tuple[str, ...]:
     way = float(np.median(found.outcome("true").runs.way[:, 0]))
     held = float(np.sqrt(np.mean(found.held.joints**2)))
-    if not way > 0 or held < COARSE * way:
+    if not way > 0 or held < UNMENTIONED_GOAL_NOISE * way:
         return ()
     better = " The edges hold it steadier." if found.plan.loop.law == "directions" else ""
     return (

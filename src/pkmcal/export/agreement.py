@@ -12,9 +12,9 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 
-POSES = 8
-ROUNDING = 1e-12
-FORWARD = 1e-9
+AGREEMENT_POSES = 8
+MODEL_GEOMETRY_ROUNDING = 1e-12
+MODEL_POSE_ROUNDING = 1e-9
 """m, rad: rounding of 1e-14 in a length, told through the poses' nearness to singular ones."""
 
 
@@ -30,10 +30,10 @@ def differences(model: ReadModel, machine: Machine) -> list[Difference]:
     loops = largest(model.gaps(model.key))
     return [
         *_centres(model, machine),
-        Difference("loops at home", loops, ROUNDING),
-        Difference("tubes' radii", largest(found, list(known.values())), ROUNDING),
-        Difference(f"platform's place at {n} poses", shifted, FORWARD),
-        Difference(f"platform's turn at {n} poses", turned, FORWARD, "rad"),
+        Difference("loops at home", loops, MODEL_GEOMETRY_ROUNDING),
+        Difference("tubes' radii", largest(found, list(known.values())), MODEL_GEOMETRY_ROUNDING),
+        Difference(f"platform's place at {n} poses", shifted, MODEL_POSE_ROUNDING),
+        Difference(f"platform's turn at {n} poses", turned, MODEL_POSE_ROUNDING, "rad"),
     ]
 
 
@@ -49,17 +49,17 @@ def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
     for site, what in told.items():
         read_again = np.array([places[f"leg{j + 1}_{site}"] for j in range(machine.n_legs)])
         gap = largest(read_again, ends.a if site == "base" else ends.b)
-        out.append(Difference(f"{what} at home", gap, ROUNDING))
+        out.append(Difference(f"{what} at home", gap, MODEL_GEOMETRY_ROUNDING))
     readings = largest(model.gear * model.key[model.actuated], model.ctrl)
-    return [*out, Difference("readings at home", readings, ROUNDING)]
+    return [*out, Difference("readings at home", readings, MODEL_GEOMETRY_ROUNDING)]
 
 
 def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
     """How far, rad and m, the model's platform is from the machine's where both have the same
     readings, and at how many poses.
     """
-    poses, readings = samples(machine, POSES)
+    poses, readings = samples(machine, AGREEMENT_POSES)
     x = model.at(readings, poses)
     away: Array = pose_difference(model.places(x)["platform"], poses)
-    away[np.abs(model.gaps(x)).max(axis=1) > ROUNDING] = np.nan
+    away[np.abs(model.gaps(x)).max(axis=1) > MODEL_GEOMETRY_ROUNDING] = np.nan
     return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

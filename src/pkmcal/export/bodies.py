@@ -15,14 +15,21 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.home import SAME, UP, HomeState, home_state, joint_axis, universal_axes
-from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN
+from pkmcal.export.home import (
+    BASE_FRAME_UP,
+    SAME_HINGE_DIFFERENCE,
+    HomeState,
+    home_state,
+    joint_axis,
+    universal_hinges,
+)
+from pkmcal.export.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.carriers.contract import PLANAR, platform_carriers
+from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, platform_carriers
 from pkmcal.outcome import Finding, Level
 
-COLOURS = {
+BODY_COLOURS = {
     "base": "0.35 0.35 0.38 1",
     "rod": "0.55 0.60 0.68 1",
     "piston": "0.80 0.82 0.85 1",
@@ -201,13 +208,13 @@ def _add_platform(
     )
     if not platform.free:
         own = home.rot.T  # joints' axes are told in the body's frame
-        for k, axis in enumerate("xy" if motion in PLANAR else "xyz"):
+        for k, axis in enumerate("xy" if motion in PLANAR_MOTIONS else "xyz"):
             name = f"platform_{axis}"
             platform.joints.append(BodyJoint(name, "slide", own[:, k], float(at[k])))
         if "translation" not in motion:
             # its value is a turn about z; another orientation is what the value is counted from
             omega = rotation_vector(home.rot)
-            turn = float(omega[2]) if np.abs(omega[:2]).max() < SAME else 0.0
+            turn = float(omega[2]) if np.abs(omega[:2]).max() < SAME_HINGE_DIFFERENCE else 0.0
             platform.joints.append(BodyJoint("platform_turn", "hinge", own[:, 2], turn))
     held = _holders(bodies, couplings, home)
     for j, (body, point) in enumerate(held):
@@ -224,7 +231,7 @@ def _holders(
     limbs, out = home.limbs, list[tuple[TreeBody, Array]]()
     known: dict[str, tuple[int, TreeBody]] = {}
     for j, held in enumerate(limbs.held):
-        if held == FIXED:
+        if held == FIXED_CARRIER:
             out.append((bodies[1], limbs.platform[j]))
             continue
         node = home.leg(j).platform
@@ -234,7 +241,7 @@ def _holders(
             known[name] = j, _side_bar(bodies, couplings, home, j, name)
         first, bar = known[name]
         hinges = np.stack([limbs.platform, limbs.hinge_axis], axis=1)
-        if np.abs(hinges[j] - hinges[first]).max() > SAME:
+        if np.abs(hinges[j] - hinges[first]).max() > SAME_HINGE_DIFFERENCE:
             raise InputError(
                 f"leg {j + 1} has another hinge than the other legs on its bar, and one body has"
                 " one",
@@ -252,7 +259,7 @@ def _side_bar(
     platform, hinge, axis = bodies[1], home.limbs.platform[j], home.limbs.hinge_axis[j]
     platform.shapes.append(RoundBar(home.middle, hinge, home.size / 60, "motor"))
     reach = 2 * float(np.linalg.norm(home.limbs.bar[j]))
-    if home.limbs.held[j] == TURN:
+    if home.limbs.held[j] == TURN_CARRIER:
         phi = float(home.internal[home.limbs.hinge[j]])
         place = pose(rotation(phi * axis), hinge)
         bar = _body(bodies, TreeBody(name, platform, place, np.zeros(3), reach))
@@ -260,7 +267,7 @@ def _side_bar(
         return bar
     bar = _body(bodies, TreeBody(name, platform, pose(home.rot.T, hinge), np.zeros(3), reach))
     if "translation" not in home.machine.document.motion:
-        bar.joints.append(BodyJoint(f"{name}_turn", "hinge", UP))
+        bar.joints.append(BodyJoint(f"{name}_turn", "hinge", BASE_FRAME_UP))
         said = (
             f"{name} keeps its direction: it turns back by what the platform turns. Its forearms' "
             "parallelograms, each drawn as one rod, do this in the machine."
@@ -299,10 +306,10 @@ def _words(home: HomeState, j: int) -> str:
     leg, found = home.leg(j), home.equations[j]
     rod = "a rod of constant length"
     if home.gives_way(j):
-        driven = home.limbs.drive[j] == TELESCOPE
+        driven = home.limbs.drive[j] == TELESCOPE_ROD
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not found and home.machine.document.motion not in PLANAR:
+    if not found and home.machine.document.motion not in PLANAR_MOTIONS:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
@@ -320,17 +327,17 @@ def _carrier(
     motor share.
     """
     limbs, column, thick = home.limbs, home.column(j), home.size / 40
-    if limbs.drive[j] not in (SLIDE, TURN):
+    if limbs.drive[j] not in (SLIDE_CARRIER, TURN_CARRIER):
         bodies[0].shapes.append(RoundBar(home.a[j], None, thick, "base"))
         return bodies[0]
-    axis, turns = limbs.axis[j], limbs.drive[j] == TURN
+    axis, turns = limbs.axis[j], limbs.drive[j] == TURN_CARRIER
     if column not in made:
         made[column] = _motor(bodies, home, column, limbs.base[j] if turns else home.a[j], axis)
     body = made[column]
     first = home.motor_legs(column)[0]
     # a carriage has no line of its own
     off = cross(limbs.base[j] - limbs.base[first], axis) if turns else np.zeros(3)
-    if max(np.abs(axis - limbs.axis[first]).max(), np.abs(off).max()) > SAME:
+    if max(np.abs(axis - limbs.axis[first]).max(), np.abs(off).max()) > SAME_HINGE_DIFFERENCE:
         raise InputError(
             f"legs {first + 1} and {j + 1} are on one motor, but move about two axes, which "
             "one body cannot do",
@@ -352,7 +359,7 @@ def _motor(
 ) -> TreeBody:
     """A crank or carriage, by what its motor has moved."""
     name, thick, base = home.reading_name(column), home.size / 40, bodies[0]
-    turns = home.limbs.drive[home.motor_legs(column)[0]] == TURN
+    turns = home.limbs.drive[home.motor_legs(column)[0]] == TURN_CARRIER
     size = home.lever(column) if turns else home.size / 10
     word = "crank" if turns else "carriage"
     out = _body(
@@ -373,14 +380,14 @@ def _motor(
 def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
     """Names and axes (3,) of a leg's hinges on the base side, in their order."""
     found = home.equations[j]
-    if home.machine.document.motion in PLANAR:
-        yield "base", UP
+    if home.machine.document.motion in PLANAR_MOTIONS:
+        yield "base", BASE_FRAME_UP
         return
     if "revolute base" in found:
         axis = joint_axis(home, "base", j)
-        yield "base", UP if axis is None else axis
+        yield "base", BASE_FRAME_UP if axis is None else axis
     else:
-        first, second = universal_axes(home, j)
+        first, second = universal_hinges(home, j)
         yield "base_first", first
         yield "base_second", second
     if "revolute platform" in found:
@@ -391,7 +398,7 @@ def _end_hinges(home: HomeState, j: int) -> tuple[tuple[str, Array], ...]:
     """Likewise on the platform side where its axes count; none for a ball."""
     found, own = home.equations[j], joint_axis(home, "platform", j)
     if own is not None and "torsion" in found:
-        second = universal_axes(home, j)[1]
+        second = universal_hinges(home, j)[1]
         return ("platform_second", second), ("platform_first", home.rot @ own)
     if own is not None and "revolute platform" in found:
         return (("platform", home.rot @ own),)
@@ -402,7 +409,7 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
     """The body at the rod's far end and the end in it (3,): the rod, or the piston in it."""
     u, length, column = home.u[j], float(home.distance[j]), home.column(j)
     reach = length  # m, that the leg may have
-    if home.limbs.drive[j] == TELESCOPE:
+    if home.limbs.drive[j] == TELESCOPE_ROD:
         now, _, high = home.values(column).tolist()
         reach = high + length - now if np.isfinite(high) else length
     tubes = _tubes(home, j, reach)

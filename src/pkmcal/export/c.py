@@ -15,23 +15,34 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.export.contract import Difference, Exporter, exact, largest
-from pkmcal.export.limbs import CONSTANT, FLOAT, SLIDE, TURN, Limbs, rods_of
+from pkmcal.export.limbs import (
+    CONSTANT_ROD,
+    FLOAT_CARRIER,
+    SLIDE_CARRIER,
+    TURN_CARRIER,
+    Limbs,
+    rod_limbs,
+)
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import cross, dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import Finding, Level
 
-FOLDER = Path(__file__).parent / "c_source"
-HEADER, SOURCE, SELFTEST = "pkmcal_kinematics.h", "pkmcal_kinematics.c", "pkmcal_selftest.c"
-PROGRAM = "pkmcal_selftest"
-BEGIN = "/* ---- the machine ---- */\n"
-END = "/* ---- what follows is the same for every machine ---- */\n"
+C_SOURCE_FOLDER = Path(__file__).parent / "c_source"
+C_HEADER_FILE, C_SOURCE_FILE, C_SELFTEST_FILE = (
+    "pkmcal_kinematics.h",
+    "pkmcal_kinematics.c",
+    "pkmcal_selftest.c",
+)
+SELFTEST_PROGRAM = "pkmcal_selftest"
+MACHINE_NUMBERS_BEGIN = "/* ---- the machine ---- */\n"
+MACHINE_NUMBERS_END = "/* ---- what follows is the same for every machine ---- */\n"
 NEXT_LINE = "\n    "
-PAIRS = 12
-ROUNDING = 1e-12
+SELFTEST_PAIRS = 12
+C_SOURCE_ROUNDING = 1e-12
 """m, rad: a thousand times the rounding of a double at 1 m; poses themselves close to it."""
 CONVENTIONS = (
     "Units: m and rad.",
@@ -51,12 +62,14 @@ class CSource(Exporter):
 
     name: ClassVar = "c"
     title: ClassVar = "C99 header and source: inverse and forward kinematics"
-    trial: ClassVar = f"cc -std=c99 -O2 pkmcal_*.c -lm -o {PROGRAM} && ./{PROGRAM}"
-    leaves: ClassVar = (PROGRAM, f"{PROGRAM}.exe")
+    trial: ClassVar = (
+        f"cc -std=c99 -O2 pkmcal_*.c -lm -o {SELFTEST_PROGRAM} && ./{SELFTEST_PROGRAM}"
+    )
+    leaves: ClassVar = (SELFTEST_PROGRAM, f"{SELFTEST_PROGRAM}.exe")
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """Header, source and self-test."""
-        rods = rods_of(source.machine)
+        rods = rod_limbs(source.machine)
         about = source.header(*CONVENTIONS)
         sigmas = (
             "",
@@ -70,41 +83,41 @@ class CSource(Exporter):
             self.trial,
         )
         return {
-            HEADER: _filled(HEADER, about, _sizes(source.machine, rods)),
-            SOURCE: _filled(SOURCE, (*about, *sigmas), _tables(source.machine, rods)),
-            SELFTEST: _filled(SELFTEST, (*source.header(), *test), _pairs(source)),
+            C_HEADER_FILE: _filled(C_HEADER_FILE, about, _sizes(source.machine, rods)),
+            C_SOURCE_FILE: _filled(C_SOURCE_FILE, (*about, *sigmas), _tables(source.machine, rods)),
+            C_SELFTEST_FILE: _filled(C_SELFTEST_FILE, (*source.header(), *test), _pairs(source)),
         }
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """The numbers as they stand in the text close the machine where it closes."""
         machine = source.machine
         poses, joints = samples(machine)
         hinges = inverse_result(machine.layout, machine.values, poses)[1]
-        off = closure(files[SOURCE], poses, joints, hinges)
-        home, ranges = (numbers_of(files[SOURCE], name) for name in ("HOME", "RANGE"))
+        off = closure_by_source(files[C_SOURCE_FILE], poses, joints, hinges)
+        home, ranges = (numbers_of(files[C_SOURCE_FILE], name) for name in ("HOME", "RANGE"))
         same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
             ranges.reshape(-1, 2), _bounds(machine)
         )
-        pairs = numbers_of(files[SELFTEST], "POSES").reshape(-1, 12)
+        pairs = numbers_of(files[C_SELFTEST_FILE], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
         transform[:, :3, :3], transform[:, :3, 3] = pairs[:, :9].reshape(-1, 3, 3), pairs[:, 9:]
-        readings = numbers_of(files[SELFTEST], "READINGS").reshape(-1, machine.n_joints)
+        readings = numbers_of(files[C_SELFTEST_FILE], "READINGS").reshape(-1, machine.n_joints)
         return [
             Difference(
                 f"closure of the constants read again, at {len(poses)} poses",
                 largest(off),
-                ROUNDING,
+                C_SOURCE_ROUNDING,
             ),
             Difference("home pose and ranges read again", 0.0 if same else np.inf, 0.0),
             Difference(
                 f"readings of the self-test's {len(pairs)} poses",
                 largest(machine.inverse(transform), readings),
-                ROUNDING,
+                C_SOURCE_ROUNDING,
                 "m or rad",
             ),
         ]
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How to run the self-test, and what is not in the source."""
         out = [
             Finding(
@@ -140,10 +153,12 @@ def _bounds(machine: Machine) -> Array:
 
 def _filled(name: str, about: Iterable[str], numbers: str) -> str:
     """A file of the folder with another comment on top and another machine's numbers."""
-    text = (FOLDER / name).read_text(encoding="utf-8")
-    above, _, below = text.partition(BEGIN)
+    text = (C_SOURCE_FOLDER / name).read_text(encoding="utf-8")
+    above, _, below = text.partition(MACHINE_NUMBERS_BEGIN)
     above = above[above.index("*/\n") + 3 :]
-    return f"{c_comment(about)}{above}{BEGIN}\n{numbers}\n{END}{below.partition(END)[2]}"
+    after = below.partition(MACHINE_NUMBERS_END)[2]
+    machine = f"{MACHINE_NUMBERS_BEGIN}\n{numbers}\n{MACHINE_NUMBERS_END}"
+    return f"{c_comment(about)}{above}{machine}{after}"
 
 
 def _sizes(machine: Machine, rods: Limbs) -> str:
@@ -193,18 +208,18 @@ def _rods(machine: Machine, rods: Limbs) -> str:
     foot, swing, rate, floating = np.zeros((4, len(rods), 3))
     for k, held in enumerate(rods.held):
         bar, w = rods.bar[k], rods.hinge_axis[k]
-        if held == TURN:
+        if held == TURN_CARRIER:
             foot[k] = dot(w, bar) * w  # what lies along the hinge does not turn
             swing[k], rate[k] = bar - foot[k], cross(w, bar)
-        if held == FLOAT:
+        if held == FLOAT_CARRIER:
             floating[k] = bar
     out: list[str] = []
     for k, leg in enumerate(rods.leg):
-        driven = rods.drive[k] != CONSTANT
+        driven = rods.drive[k] != CONSTANT_ROD
         middle = rods.scale[k] * machine.layout.middle[leg - 1]
         numbers: dict[str, Any] = {
             "scale": rods.scale[k] if driven else 0.0,
-            "middle": middle if rods.drive[k] in (SLIDE, TURN) else 0.0,
+            "middle": middle if rods.drive[k] in (SLIDE_CARRIER, TURN_CARRIER) else 0.0,
             "length": rods.length[k],
             "base": rods.base[k],
             "arm": rods.arm[k],
@@ -247,10 +262,10 @@ def _axes(machine: Machine, rods: Limbs) -> str:
     return f"/* one row at least */\nstatic const axis_data AXIS[AXES + 1] = {{\n{rows}}};\n"
 
 
-def _pairs(source: Source) -> str:
+def _pairs(source: MachineSource) -> str:
     """Reference poses and readings, with starts nearby."""
     machine = source.machine
-    poses, joints = samples(machine, PAIRS)
+    poses, joints = samples(machine, SELFTEST_PAIRS)
     starts = perturb(poses, 0.02 * machine.layout.motion.sum(axis=1))
     # names may hold anything; in a string they must not end it
     name, identity = (
@@ -348,7 +363,7 @@ def _records(text: str, name: str, first: str) -> list[dict[str, Any]]:
     return out
 
 
-def closure(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
+def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
     """The rods' and axes' equations (n, E), m, by the numbers in a source, in the words of its
     comments.
 

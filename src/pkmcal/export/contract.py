@@ -1,9 +1,9 @@
 """What a format of other programs offers, and an export from start to end.
 
 A format is one file in this folder: a subclass of :class:`Exporter`, which turns a
-:class:`~pkmcal.calibration.source.Source` into texts and reads them again by itself, as the other
-program would: with that program's units, signs and formulas, and with nothing of ours but the text.
-:func:`export` gives out only what agrees with the machine.
+:class:`~pkmcal.calibration.source.MachineSource` into texts and reads them again by itself, as the
+other program would: with that program's units, signs and formulas, and with nothing of ours but the
+text. :func:`make_export` gives out only what agrees with the machine.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome import Finding
@@ -59,17 +59,17 @@ class Exporter(ABC):
     leaves: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """Texts by file name; nothing is written.
 
         Raises InputError with a sentence where the format cannot express the machine.
         """
 
     @abstractmethod
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """The texts read again, as the other program reads them, beside the machine."""
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """What a person should know of the files beside what stands in them."""
         del source
         return ()
@@ -108,7 +108,7 @@ class Export:
     notes: tuple[Finding, ...]
 
 
-def export(source: Source, name: str, *, force: bool = False) -> Export:
+def make_export(source: MachineSource, name: str, *, force: bool = False) -> Export:
     """Make a format's texts, read them again, and compare; nothing is written.
 
     Raises InputError for a machine that the format cannot express, ResultError for a calibration
@@ -137,7 +137,7 @@ def export(source: Source, name: str, *, force: bool = False) -> Export:
     return Export(exporter, files, differences, tuple(exporter.notes(source)))
 
 
-def write(made: Export, folder: Path) -> None:
+def write_export(made: Export, folder: Path) -> None:
     """Write the files, whole or not at all; what a trial of earlier ones left goes."""
     leaves = made.exporter.leaves
     check_own_folder(folder, {*made.files, *leaves}, "this export", "an earlier export")

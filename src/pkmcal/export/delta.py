@@ -19,34 +19,41 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference
-from pkmcal.export.limbs import FLOAT, SLIDE, TURN, Limbs, limbs_of, rods_of
+from pkmcal.export.limbs import (
+    FLOAT_CARRIER,
+    SLIDE_CARRIER,
+    TURN_CARRIER,
+    Limbs,
+    all_limbs,
+    rod_limbs,
+)
 from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 
-WAY = 8
+STEPS_FROM_HOME = 8
 """Steps from home to a pose of the grid."""
-STEPS = 7
+GRID_READINGS_A_MOTOR = 7
 """Readings of each motor in the grid: ends, middle, and two on each side."""
-LEAST = 0.12
+LEAST_DELTA_SINGULARITY = 0.12
 """Least singular value of the scaled inverse Jacobian: a reading's error grows by eight at most."""
-FASTEST = 4.0
+FASTEST_MOTOR_RATIO = 4.0
 """Carriage's or elbow's way per way of the tool, at most: beyond, a rod stands nearly square to the
 motion of its motor, and firmwares divide by that angle."""
-UPRIGHT = 0.8
+LEAST_UPRIGHT_PART = 0.8
 """Least vertical part of a tower, and radial part of an arm's plane: 37 degrees off at most."""
-MM = 1e3
-DEGREE = 180 / np.pi
-FOLLOWS = 0.05
+MM_A_METRE = 1e3
+DEGREES_A_RADIAN = 180 / np.pi
+UNWARNED_TOOL_ERROR = 0.05
 """mm at the tool beyond which a person is warned: a good kit's repeatability."""
-REFUSED = 5.0
+MOST_TOOL_ERROR = 5.0
 """mm at the tool beyond which the parameters describe another machine."""
-TOLD = 1e-9
+UNTOLD_SCALE_DIFFERENCE = 1e-9
 """Difference of a scale from 1 that is told: beyond the digits of the files."""
-ROUNDING = 2e-6
+TOOL_ROUNDING = 2e-6
 """m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
 _STATED = re.compile(r"off by ([0-9.]+) mm at most")
@@ -98,13 +105,13 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
 
     program, bed : as of :class:`Delta`.
     """
-    limbs, motion = limbs_of(machine), machine.document.motion
-    if motion != "translation" or set(limbs.drive) not in ({SLIDE}, {TURN}):
+    limbs, motion = all_limbs(machine), machine.document.motion
+    if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
         joints = sorted({leg.base.joint for leg in machine.document.legs})
         found = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
         raise _no_delta(machine, program, found)
-    rods = rods_of(machine)
-    if len(rods) != 3 or machine.n_joints != 3 or FLOAT in rods.held:
+    rods = rod_limbs(machine)
+    if len(rods) != 3 or machine.n_joints != 3 or FLOAT_CARRIER in rods.held:
         raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
     ranges = machine.joint_ranges[rods.joint]
     if not np.isfinite(ranges).all():
@@ -113,7 +120,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
             expected="range: [min, max] at every slider or crank",
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
         )
-    linear = rods.drive[0] == SLIDE
+    linear = rods.drive[0] == SLIDE_CARRIER
     rate, zero = _towers(rods) if linear else _arms(rods, rods.scale * ranges.mean(axis=1))
     rate = rods.scale * rate
     if np.isnan(zero).any():
@@ -152,7 +159,9 @@ def _no_delta(machine: Machine, program: str, found: str) -> InputError:
 def _towers(rods: Limbs) -> tuple[Array, Array]:
     """Rate (mm/m of their way) and zero (mm) of ideal towers; NaN where they lean."""
     up = rods.axis[:, 2]
-    return np.sign(up) * MM, np.where(np.abs(up) > UPRIGHT, MM * rods.base[:, 2], np.nan)
+    return np.sign(up) * MM_A_METRE, np.where(
+        np.abs(up) > LEAST_UPRIGHT_PART, MM_A_METRE * rods.base[:, 2], np.nan
+    )
 
 
 def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
@@ -167,28 +176,30 @@ def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
     out, d_out = dot(at, radial), dot(ahead, radial)
     sign = np.sign(out * ahead[:, 2] - at[:, 2] * d_out)
     zero = np.arctan2(at[:, 2], out) - sign * middle
-    return sign * DEGREE, np.where(np.hypot(out, d_out) > UPRIGHT, DEGREE * zero, np.nan)
+    return sign * DEGREES_A_RADIAN, np.where(
+        np.hypot(out, d_out) > LEAST_UPRIGHT_PART, DEGREES_A_RADIAN * zero, np.nan
+    )
 
 
 def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Array, Array]:
     """Poses of a grid of readings that are well held, readings by leg, and position by reading."""
     ends = machine.joint_ranges
-    axes = [np.linspace(low, high, STEPS) for low, high in ends]
+    axes = [np.linspace(low, high, GRID_READINGS_A_MOTOR) for low, high in ends]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(ends))
     # from home on in small steps: from afar the tool is also found above the carriages
     home = machine.home()
     begin = machine.inverse(home)
     begin = np.where(np.isfinite(begin), begin, grid)  # of a motor that cannot reach home
     found = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
-    for share in np.linspace(0, 1, WAY + 1)[1:]:
+    for share in np.linspace(0, 1, STEPS_FROM_HOME + 1)[1:]:
         here = begin + share * (grid - begin)
         found = machine.forward_result(here, found.T_base_platform)
     poses = found.T_base_platform
     back = machine.inverse(poses)
-    good = found.converged & (found.singularity > LEAST)
+    good = found.converged & (found.singularity > LEAST_DELTA_SINGULARITY)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
     ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
-    good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST
+    good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
     if not good.any():
         raise InputError(
             f"mechanism {machine.name!r} closes nowhere within its ranges",
@@ -280,7 +291,7 @@ class Fit:
         """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame; of an arm's two the
         one nearest to ``near`` (n, 3) degrees.
         """
-        angle = self.angle / DEGREE
+        angle = self.angle / DEGREES_A_RADIAN
         along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle) - self.radius
         across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
         square = self.rod**2 - across**2
@@ -290,21 +301,21 @@ class Fit:
         away = np.hypot(along, up)
         share = (away**2 + self.arm**2 - square) / (2 * self.arm * away)
         half = np.arccos(np.clip(share, -1.0, 1.0))
-        both = (np.arctan2(up, along) + np.stack([half, -half])) * DEGREE
+        both = (np.arctan2(up, along) + np.stack([half, -half])) * DEGREES_A_RADIAN
         both = both + 360 * np.round((near - both) / 360)
         return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
 
 
-def fit_of(source: Source, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
+def fit_of(source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
     """A firmware's parameters for a source's machine; by its kind what they leave free."""
     delta = delta_of(source.machine, program, source.bed)
-    return fitted(delta, linear if delta.kind == "linear" else rotary)
+    return nearest_fit(delta, linear if delta.kind == "linear" else rotary)
 
 
-def fitted(delta: Delta, freedoms: Freedoms) -> Fit:
+def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
     """The parameters that put the tool nearest to where it should be, over the workspace.
 
-    Raises InputError where they leave an error of more than :data:`REFUSED`.
+    Raises InputError where they leave an error of more than :data:`MOST_TOOL_ERROR`.
     """
     from scipy.optimize import least_squares
 
@@ -312,7 +323,7 @@ def fitted(delta: Delta, freedoms: Freedoms) -> Fit:
     packed = _Packed(start, freedoms)
     points = delta.positions
     readings = delta.readings[:, start.order]
-    by_reading = MM * delta.by_reading[:, :, start.order]
+    by_reading = MM_A_METRE * delta.by_reading[:, :, start.order]
 
     def off(x: Array) -> Array:
         return _tool_error(packed.fit(x), points, readings, by_reading).ravel()
@@ -324,11 +335,11 @@ def fitted(delta: Delta, freedoms: Freedoms) -> Fit:
     found = replace(
         found, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
     )
-    if not found.largest <= REFUSED:
+    if not found.largest <= MOST_TOOL_ERROR:
         raise InputError(
             f"{delta.program} cannot follow this machine: its parameters leave the tool off",
             found=f"{found.largest:.2f} mm",
-            expected=f"at most {REFUSED:g} mm over the workspace",
+            expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
             next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
         )
     return found
@@ -336,7 +347,7 @@ def fitted(delta: Delta, freedoms: Freedoms) -> Fit:
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
     """How far (n, 3) mm the tool goes wrong, to first order, where the firmware commands it."""
-    points = MM * apply(fit.T_firmware_base, positions)
+    points = MM_A_METRE * apply(fit.T_firmware_base, positions)
     own = fit.rate * readings + fit.zero
     wrong = (fit.motors(points, own) - own) / fit.rate
     return (by_reading @ wrong[..., None])[..., 0]
@@ -370,8 +381,8 @@ class _Packed:
             for name in ("rod", "angle", "arm", "height", "zero")
             if name in by
         }
-        turn = np.concatenate([by["tilt"], by.get("yaw", np.zeros(1))]) / DEGREE
-        shift = np.concatenate([by["shift"], by.get("lift", np.zeros(1))]) / MM
+        turn = np.concatenate([by["tilt"], by.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
+        shift = np.concatenate([by["shift"], by.get("lift", np.zeros(1))]) / MM_A_METRE
         placed = self.start.T_firmware_base
         placed = pose(rotation(turn) @ placed[:3, :3], placed[:3, 3] + shift)
         radius = self.start.radius + float(by["radius"][0])
@@ -380,10 +391,10 @@ class _Packed:
 
 def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     """The machine taken as ideal: circle through the three hinges, order by their directions."""
-    hinge = MM * delta.hinge
+    hinge = MM_A_METRE * delta.hinge
     centre = _circle(hinge[:, :2])
     away = hinge[:, :2] - centre
-    azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREE
+    azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREES_A_RADIAN
     nominal = np.array(freedoms.nominal)
     order = _order(azimuth, nominal)
     off = _wrapped(azimuth[order] - nominal)
@@ -395,12 +406,12 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     if not freedoms.heights or freedoms.flat:
         height = np.full(3, height.mean())
     height = np.zeros(3) if freedoms.flat else height + lift
-    turn = rotation(np.array([0.0, 0.0, yaw / DEGREE]))
+    turn = rotation(np.array([0.0, 0.0, yaw / DEGREES_A_RADIAN]))
     shift = np.array([0.0, 0.0, lift]) - turn @ np.append(centre, 0.0)
     each = (freedoms.rods, freedoms.arms)
     rod, arm = (
         v[order] if own else np.full(3, v.mean())
-        for v, own in zip((MM * delta.rod, MM * delta.arm), each, strict=True)
+        for v, own in zip((MM_A_METRE * delta.rod, MM_A_METRE * delta.arm), each, strict=True)
     )
     zero = delta.zero[order] + (lift if delta.kind == "linear" else 0.0)
     return Fit(
@@ -413,7 +424,7 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
         height=height,
         rate=delta.rate[order],
         zero=zero,
-        T_firmware_base=pose(turn, shift / MM),
+        T_firmware_base=pose(turn, shift / MM_A_METRE),
     )
 
 
@@ -423,8 +434,8 @@ def _lift(delta: Delta) -> float:
     so that no Z is negative.
     """
     if delta.bed is not None:
-        return -MM * delta.bed
-    lowest = float(MM * delta.positions[:, 2].min())
+        return -MM_A_METRE * delta.bed
+    lowest = float(MM_A_METRE * delta.positions[:, 2].min())
     above = delta.machine.home()[2, 3] > 0
     return 0.0 if above or lowest >= 0 else float(np.ceil(-lowest))
 
@@ -452,12 +463,12 @@ def _circle(points: Array) -> Array:
 # The words of the files
 
 
-def mm(value: float) -> str:
+def firmware_length(value: float) -> str:
     """A length as firmwares read it."""
     return _number(value, 4)
 
 
-def degrees(value: float) -> str:
+def firmware_angle(value: float) -> str:
     """An angle as firmwares read it."""
     return _number(value, 5)
 
@@ -469,10 +480,10 @@ def _number(value: float, digits: int) -> str:
 
 def scales_of(fit: Fit) -> Array:
     """Scales of the readings (3,), in the firmware's order."""
-    return np.abs(fit.rate) / (MM if fit.kind == "linear" else DEGREE)
+    return np.abs(fit.rate) / (MM_A_METRE if fit.kind == "linear" else DEGREES_A_RADIAN)
 
 
-def about(source: Source, fit: Fit, names: str, correcting: str) -> list[str]:
+def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[str]:
     """Header lines: conventions, which leg is which motor, the frame, and the error that is left.
 
     names : the motors' letters, in the firmware's order. correcting : what to do about a motor
@@ -492,13 +503,13 @@ def about(source: Source, fit: Fit, names: str, correcting: str) -> list[str]:
     factors = [
         f"Motor {name} goes {factor:.9g} times as far as its reading says."
         for name, factor in zip(names, scales_of(fit), strict=True)
-        if abs(factor - 1) > TOLD
+        if abs(factor - 1) > UNTOLD_SCALE_DIFFERENCE
     ]
     tip = (
         "The point that moves is the platform frame's origin; a tool's length below it is not in"
         " these values."
     )
-    if delta.bed is not None and abs(fit.T_firmware_base[2, 3] + delta.bed) < ROUNDING:
+    if delta.bed is not None and abs(fit.T_firmware_base[2, 3] + delta.bed) < TOOL_ROUNDING:
         tip = "Z is 0 where a height of 0 was measured."
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
     return [
@@ -519,32 +530,32 @@ def about(source: Source, fit: Fit, names: str, correcting: str) -> list[str]:
 
 def _in_mm(transform: Array) -> Array:
     out = np.array(transform)
-    out[:3, 3] *= MM
+    out[:3, 3] *= MM_A_METRE
     return out
 
 
-def placed(text: str) -> Array:
+def read_firmware_from_base(text: str) -> Array:
     """``firmware_from_base`` read again from a text, (4, 4), its shift in m."""
     out = np.eye(4)
     rows = _ROW.findall(text)
     out[:3] = [[float(word) for word in row.split()] for row in rows]
-    out[:3, 3] /= MM
+    out[:3, 3] /= MM_A_METRE
     return out
 
 
 def stated(text: str) -> float:
     """The error that a text admits, m."""
     found = _STATED.search(text)
-    return float(found.group(1)) / MM if found else 0.0
+    return float(found.group(1)) / MM_A_METRE if found else 0.0
 
 
-def tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
     """The firmware's formulas on the text's values, the machine's own forward kinematics after.
 
     zero : (3,) motor positions at reading zero by the text's end switches.
     """
     delta = fit.delta
-    points = MM * apply(placed(text), delta.positions)
+    points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
     readings = np.zeros_like(delta.readings)
     readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
@@ -555,11 +566,11 @@ def tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Diffe
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         largest,
         # the fit is judged to first order, so a large error may be a fiftieth larger
-        1.02 * told + ROUNDING,
+        1.02 * told + TOOL_ROUNDING,
     )
 
 
-def redo(source: Source) -> tuple[Finding, ...]:
+def redo(source: MachineSource) -> tuple[Finding, ...]:
     """What a firmware has to measure again once it has these values; nothing of a drawing."""
     if not source.calibrated:
         return ()
@@ -576,7 +587,7 @@ def redo(source: Source) -> tuple[Finding, ...]:
 def follows(fit: Fit) -> Finding:
     """The note on how well, a doubt where it is not well."""
     text = fit.sentence
-    if fit.largest > FOLLOWS:
+    if fit.largest > UNWARNED_TOOL_ERROR:
         cause = "towers that are not parallel" if fit.kind == "linear" else "tilted arms"
         text += f" It has no values for {cause} and the like; --to c has them all."
         return Finding(Level.DOUBTFUL, text)

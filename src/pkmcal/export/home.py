@@ -9,20 +9,20 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import GeometryError
-from pkmcal.export.limbs import SLIDE, TELESCOPE, TURN, Limbs, limbs_of
+from pkmcal.export.limbs import SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER, Limbs, all_limbs
 from pkmcal.geometry.rigid import cross, dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
 
-SAME = 1e-9
+SAME_HINGE_DIFFERENCE = 1e-9
 """Metres and radians by which two legs' common axis or hinge may differ: rounding."""
-ALONG = 0.5
+LEAST_SINE_TO_LEG = 0.5
 """Sine of the angle between a leg and a first axis of its universal joint, below which another
 axis is taken: at zero the two hinges of the joint would turn alike.
 """
-UP = np.array([0.0, 0.0, 1.0])
+BASE_FRAME_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,13 @@ class HomeState:
     def lever(self, column: int) -> float:
         """What makes a motor's stiffness that of a slide: 1, or a turning arm, m."""
         j = self.motor_legs(column)[0]
-        return float(np.linalg.norm(self.limbs.arm[j])) if self.limbs.drive[j] == TURN else 1.0
+        return (
+            float(np.linalg.norm(self.limbs.arm[j])) if self.limbs.drive[j] == TURN_CARRIER else 1.0
+        )
 
     def gives_way(self, j: int) -> bool:
         """Whether leg j's length changes, by its motor or because it is passive."""
-        return self.limbs.drive[j] == TELESCOPE or not np.isfinite(self.limbs.length[j])
+        return self.limbs.drive[j] == TELESCOPE_ROD or not np.isfinite(self.limbs.length[j])
 
 
 def home_state(machine: Machine) -> HomeState:
@@ -120,7 +122,7 @@ def home_state(machine: Machine) -> HomeState:
     known = equations(machine.document)
     return HomeState(
         machine,
-        limbs_of(machine),
+        all_limbs(machine),
         found.T_base_platform,
         readings,
         found.internal,
@@ -144,7 +146,7 @@ def joint_axis(home: HomeState, side: str, j: int) -> Array | None:
     return None if drawn is None else _unit(np.array(drawn, dtype=float))
 
 
-def universal_axes(home: HomeState, j: int) -> tuple[Array, Array]:
+def universal_hinges(home: HomeState, j: int) -> tuple[Array, Array]:
     """First and second hinge (3,) of leg j's universal joint on the base side, base frame.
 
     The second is square to the first and to the leg. Where a torsion depends on the first it is
@@ -152,14 +154,16 @@ def universal_axes(home: HomeState, j: int) -> tuple[Array, Array]:
     lie along it; else the horizontal one square to the leg.
     """
     u, drive = home.u[j], home.limbs.drive[j]
-    drawn = home.limbs.axis[j] if drive == TURN else joint_axis(home, "base", j)
-    least = SAME if "torsion" in home.equations[j] else ALONG
+    drawn = home.limbs.axis[j] if drive == TURN_CARRIER else joint_axis(home, "base", j)
+    least = SAME_HINGE_DIFFERENCE if "torsion" in home.equations[j] else LEAST_SINE_TO_LEG
     # the axis of a slide is no hinge's
-    if drawn is not None and drive != SLIDE and np.linalg.norm(cross(drawn, u)) > least:
+    if drawn is not None and drive != SLIDE_CARRIER and np.linalg.norm(cross(drawn, u)) > least:
         first = drawn
     else:
-        level = cross(UP, u)
-        first = _unit(level if np.linalg.norm(level) > ALONG / 5 else cross(np.eye(3)[1], u))
+        level = cross(BASE_FRAME_UP, u)
+        first = _unit(
+            level if np.linalg.norm(level) > LEAST_SINE_TO_LEG / 5 else cross(np.eye(3)[1], u)
+        )
     return first, _unit(cross(first, u))
 
 

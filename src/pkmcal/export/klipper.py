@@ -14,37 +14,37 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
-    DEGREE,
+    DEGREES_A_RADIAN,
     Fit,
     Freedoms,
     about,
-    degrees,
+    firmware_angle,
+    firmware_length,
+    firmware_tool_difference,
     fit_of,
     follows,
-    mm,
     redo,
-    tool_difference,
 )
 from pkmcal.outcome import Finding, Level
 
 FILE = "pkmcal_printer.cfg"
 PROGRAM = "Klipper"
-LINEAR = Freedoms((210.0, 330.0, 90.0))
-ROTARY = Freedoms((30.0, 150.0, 270.0), heights=False)
-STEPPERS = "abc"
-MARK = (
+KLIPPER_LINEAR_FREEDOMS = Freedoms((210.0, 330.0, 90.0))
+KLIPPER_ROTARY_FREEDOMS = Freedoms((30.0, 150.0, 270.0), heights=False)
+KLIPPER_STEPPERS = "abc"
+SAVED_MARK_ADVICE = (
     "Below SAVE_CONFIG's header keep the mark '#*# ' before each line: where one is without it,"
     " Klipper drops all that was saved."
 )
 """klippy/configfile.py, _find_autosave_data."""
 
 
-def _fit(source: Source) -> Fit:
-    return fit_of(source, PROGRAM, LINEAR, ROTARY)
+def _fit(source: MachineSource) -> Fit:
+    return fit_of(source, PROGRAM, KLIPPER_LINEAR_FREEDOMS, KLIPPER_ROTARY_FREEDOMS)
 
 
 @final
@@ -54,13 +54,13 @@ class Klipper(Exporter):
     name: ClassVar = "klipper"
     title: ClassVar = "Klipper: values for printer.cfg"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """One file of configuration; pins, speeds and the like are the printer's own."""
         fit = _fit(source)
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
-        lines = about(source, fit, STEPPERS, f"{word} by that.")
+        lines = about(source, fit, KLIPPER_STEPPERS, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
-        lines.append(MARK)
+        lines.append(SAVED_MARK_ADVICE)
         sections = _linear(fit) if fit.kind == "linear" else _rotary(fit)
         body = "".join(
             f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
@@ -68,19 +68,19 @@ class Klipper(Exporter):
         )
         return {FILE: commented(lines, "#") + body}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Read as Klipper does, and moved by its formulas."""
         fit = _fit(source)
         text = files[FILE]
         found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
         found.read_string(text)
-        move = linear_motors if fit.kind == "linear" else rotary_motors
+        move = klipper_carriage_heights if fit.kind == "linear" else klipper_arm_angles
         zero = homed(found) - fit.rate * fit.delta.ends[fit.order]
-        return [tool_difference(text, fit, lambda points: move(found, points), zero)]
+        return [firmware_tool_difference(text, fit, lambda points: move(found, points), zero)]
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        return (follows(_fit(source)), Finding(Level.NOTE, MARK), *redo(source))
+        return (follows(_fit(source)), Finding(Level.NOTE, SAVED_MARK_ADVICE), *redo(source))
 
 
 def _linear(fit: Fit) -> dict[str, dict[str, str]]:
@@ -88,20 +88,20 @@ def _linear(fit: Fit) -> dict[str, dict[str, str]]:
     sections = {
         "printer": {
             "kinematics": "delta",
-            "delta_radius": mm(fit.radius),
+            "delta_radius": firmware_length(fit.radius),
         }
     }
-    for k, name in enumerate(STEPPERS):
+    for k, name in enumerate(KLIPPER_STEPPERS):
         sections[f"stepper_{name}"] = {
-            "arm_length": mm(fit.rod[k]),
-            "angle": degrees(fit.angle[k]),
-            "position_endstop": mm(endstops[k]),
+            "arm_length": firmware_length(fit.rod[k]),
+            "angle": firmware_angle(fit.angle[k]),
+            "position_endstop": firmware_length(endstops[k]),
         }
     return sections
 
 
 def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
-    angle = fit.end_motors / DEGREE
+    angle = fit.end_motors / DEGREES_A_RADIAN
     out = fit.radius + fit.arm * np.cos(angle)
     below = fit.rod**2 - out**2
     if np.any(below <= 0) or fit.radius <= 0:
@@ -114,22 +114,22 @@ def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
     sections = {
         "printer": {
             "kinematics": "rotary_delta",
-            "shoulder_radius": mm(fit.radius),
-            "shoulder_height": mm(fit.height[0]),
+            "shoulder_radius": firmware_length(fit.radius),
+            "shoulder_height": firmware_length(fit.height[0]),
         }
     }
-    for k, name in enumerate(STEPPERS):
+    for k, name in enumerate(KLIPPER_STEPPERS):
         sections[f"stepper_{name}"] = {
-            "upper_arm_length": mm(fit.arm[k]),
-            "lower_arm_length": mm(fit.rod[k]),
-            "angle": degrees(fit.angle[k]),
-            "position_endstop": mm(endstops[k]),
+            "upper_arm_length": firmware_length(fit.arm[k]),
+            "lower_arm_length": firmware_length(fit.rod[k]),
+            "angle": firmware_angle(fit.angle[k]),
+            "position_endstop": firmware_length(endstops[k]),
         }
     return sections
 
 
 def _each(found: ConfigParser, key: str) -> Array:
-    return np.array([found.getfloat(f"stepper_{name}", key) for name in STEPPERS])
+    return np.array([found.getfloat(f"stepper_{name}", key) for name in KLIPPER_STEPPERS])
 
 
 def homed(found: ConfigParser) -> Array:
@@ -140,21 +140,21 @@ def homed(found: ConfigParser) -> Array:
         return ends + np.sqrt(_each(found, "arm_length") ** 2 - radius**2)
     middle = np.zeros((3, 3))
     middle[:, 2] = ends
-    return np.diag(rotary_motors(found, middle))
+    return np.diag(klipper_arm_angles(found, middle))
 
 
-def linear_motors(found: ConfigParser, points: Array) -> Array:
+def klipper_carriage_heights(found: ConfigParser, points: Array) -> Array:
     """Carriages' heights (n, 3) mm at points (n, 3) mm."""
     radius = found.getfloat("printer", "delta_radius")
-    angle = _each(found, "angle") / DEGREE
+    angle = _each(found, "angle") / DEGREES_A_RADIAN
     dx = radius * np.cos(angle) - points[:, :1]
     dy = radius * np.sin(angle) - points[:, 1:2]
     return np.sqrt(_each(found, "arm_length") ** 2 - dx**2 - dy**2) + points[:, 2:]
 
 
-def rotary_motors(found: ConfigParser, points: Array) -> Array:
+def klipper_arm_angles(found: ConfigParser, points: Array) -> Array:
     """Arms' angles (n, 3) degrees at points (n, 3) mm: a circle cut by a line, as Klipper does."""
-    angle = _each(found, "angle") / DEGREE
+    angle = _each(found, "angle") / DEGREES_A_RADIAN
     c, s = np.cos(angle), np.sin(angle)
     across = points[:, 1:2] * c - points[:, :1] * s
     dx = points[:, :1] * c + points[:, 1:2] * s - found.getfloat("printer", "shoulder_radius")
@@ -165,4 +165,4 @@ def rotary_motors(found: ConfigParser, points: Array) -> Array:
     slope = dx / dy
     scale = slope**2 + 1
     x = first * slope + np.sqrt(scale * upper - first**2)
-    return np.arctan2(first * scale - slope * x, x) * DEGREE
+    return np.arctan2(first * scale - slope * x, x) * DEGREES_A_RADIAN

@@ -19,8 +19,8 @@ from pkmcal.mechanisms.carriers.contract import Chain
 from pkmcal.mechanisms.closure import scales
 from pkmcal.mechanisms.layout import CarrierGroup
 
-CONSTANT, TELESCOPE, SLIDE, TURN = "constant", "telescope", "slide", "turn"
-FIXED, FLOAT = "fixed", "float"
+CONSTANT_ROD, TELESCOPE_ROD, SLIDE_CARRIER, TURN_CARRIER = "constant", "telescope", "slide", "turn"
+FIXED_CARRIER, FLOAT_CARRIER = "fixed", "float"
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Limbs:
     @property
     def rate(self) -> Array:
         """How the end on the base moves with what its motor moves where that is zero, (L, 3)."""
-        slides = np.array([drive == SLIDE for drive in self.drive])
+        slides = np.array([drive == SLIDE_CARRIER for drive in self.drive])
         return np.where(slides[:, None], self.axis, cross(self.axis, self.arm))
 
     @property
     def ends(self) -> Array:
         """The ends on the platform (L, 3), platform frame; of a floating bar its hinge."""
-        turns = np.array([held == TURN for held in self.held])
+        turns = np.array([held == TURN_CARRIER for held in self.held])
         return np.where(turns[:, None], self.platform + self.bar, self.platform)
 
     def of(self, limbs: Integers) -> Limbs:
@@ -80,22 +80,24 @@ class Limbs:
         return replace(self, **{name: chosen(value) for name, value in vars(self).items()})
 
 
-def limbs_of(machine: Machine) -> Limbs:
+def all_limbs(machine: Machine) -> Limbs:
     """All limbs of a machine; InputError where a carrier is no elementary joint."""
     layout, values = machine.layout, machine.parameters.unit_axes(machine.values)
-    base, axis, arm, moved = _chains(machine, "base", layout.base, (FIXED, SLIDE, TURN))
+    base, axis, arm, moved = _chains(
+        machine, "base", layout.base, (FIXED_CARRIER, SLIDE_CARRIER, TURN_CARRIER)
+    )
     hinge, hinge_axis, bar, held = _chains(
-        machine, "platform", layout.platform, (FIXED, TURN, FLOAT)
+        machine, "platform", layout.platform, (FIXED_CARRIER, TURN_CARRIER, FLOAT_CARRIER)
     )
     # an arm that nothing turns belongs to its place; of one that turns, what lies along the axis
-    turns = np.array([kind == TURN for kind in moved])[:, None]
+    turns = np.array([kind == TURN_CARRIER for kind in moved])[:, None]
     along = np.where(turns, dot(axis, arm)[:, None] * axis, arm)
-    barred = np.array([kind != FIXED for kind in held])[:, None]
-    driven = np.where(layout.rod_reads, TELESCOPE, moved)
+    barred = np.array([kind != FIXED_CARRIER for kind in held])[:, None]
+    driven = np.where(layout.rod_reads, TELESCOPE_ROD, moved)
     rods = np.where(layout.rod >= 0, layout.rod, 0)
     return Limbs(
         leg=np.arange(machine.n_legs) + 1,
-        drive=tuple(np.where(layout.actuated >= 0, driven, CONSTANT).tolist()),
+        drive=tuple(np.where(layout.actuated >= 0, driven, CONSTANT_ROD).tolist()),
         joint=layout.actuated,
         scale=scales(layout, machine.values),
         length=np.where(layout.rod >= 0, values[rods], np.nan),
@@ -110,7 +112,7 @@ def limbs_of(machine: Machine) -> Limbs:
     )
 
 
-def rods_of(machine: Machine) -> Limbs:
+def rod_limbs(machine: Machine) -> Limbs:
     """The limbs whose length is known: passive ones move nothing.
 
     Raises InputError where they and the joints' axes do not just hold the platform.
@@ -123,7 +125,7 @@ def rods_of(machine: Machine) -> Limbs:
             found=f"{layout.n_equations} equations for {unknowns} unknowns",
             expected="as many of both, for Newton's method",
         )
-    return limbs_of(machine).of(np.flatnonzero(layout.closing))
+    return all_limbs(machine).of(np.flatnonzero(layout.closing))
 
 
 def _chains(

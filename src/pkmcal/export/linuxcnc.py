@@ -20,78 +20,89 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact, largest
 from pkmcal.export.delta import (
-    DEGREE,
-    MM,
-    TOLD,
+    DEGREES_A_RADIAN,
+    MM_A_METRE,
+    UNTOLD_SCALE_DIFFERENCE,
     Fit,
     Freedoms,
     about,
-    degrees,
+    firmware_angle,
+    firmware_length,
+    firmware_tool_difference,
     fit_of,
     follows,
-    mm,
-    tool_difference,
 )
-from pkmcal.export.limbs import Limbs, rods_of
+from pkmcal.export.limbs import Limbs, rod_limbs
 from pkmcal.export.samples import samples
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 
-HAL, INI = "pkmcal_kinematics.hal", "pkmcal_kinematics.ini"
+LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE = "pkmcal_kinematics.hal", "pkmcal_kinematics.ini"
 PROGRAM = "LinuxCNC"
-LINEAR = Freedoms((90.0, 210.0, 330.0), angles=False, rods=False)
-ROTARY = Freedoms((-90.0, 30.0, 150.0), angles=False, rods=False, arms=False, flat=True)
-STRUTS = 6
-HEXAPOD = ("center", "offset", "scale")
+LINUXCNC_LINEAR_FREEDOMS = Freedoms((90.0, 210.0, 330.0), angles=False, rods=False)
+LINUXCNC_ROTARY_FREEDOMS = Freedoms(
+    (-90.0, 30.0, 150.0), angles=False, rods=False, arms=False, flat=True
+)
+GENHEXKINS_STRUTS = 6
+HEXAPOD_PARAMETERS = ("center", "offset", "scale")
 MAX_ERROR = 500.0
 """genhexkins' own limit on the sum of the struts' errors, beyond which it gives up."""
-ROUNDING = 1e-12
+LINUXCNC_READING_ROUNDING = 1e-12
 """m: pins hold 17 digits; angles go through degrees and back."""
 _STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
 _PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
 _OFFSET = re.compile(r"^HOME_OFFSET = (\S+)$", re.M)
 _RATE = re.compile(r"^# joint \d = (\S+) \* reading", re.M)
-CORRECTING = "Divide its SCALE in the INI file, steps or counts per unit, by that."
+SCALE_CORRECTION_ADVICE = "Divide its SCALE in the INI file, steps or counts per unit, by that."
 
 
 @final
 class LinuxCnc(Exporter):
-    """HAL and INI lines for hexapods and ideal deltas."""
+    """LINUXCNC_HAL_FILE and LINUXCNC_INI_FILE lines for hexapods and ideal deltas."""
 
     name: ClassVar = "linuxcnc"
     title: ClassVar = "LinuxCNC: kinematics' HAL pins and INI words"
 
-    def files(self, source: Source) -> dict[str, str]:
-        """A HAL file and words for the INI file."""
+    def files(self, source: MachineSource) -> dict[str, str]:
+        """A LINUXCNC_HAL_FILE file and words for the INI file."""
         if source.machine.document.motion == "translation":
             fit = _fit(source)
-            return {HAL: _delta_hal(source, fit), INI: _delta_ini(source, fit)}
+            return {
+                LINUXCNC_HAL_FILE: _delta_hal(source, fit),
+                LINUXCNC_INI_FILE: _delta_ini(source, fit),
+            }
         struts = _hexapod(source.machine)
-        return {HAL: _hal(source, struts), INI: _ini(source, struts)}
+        return {LINUXCNC_HAL_FILE: _hal(source, struts), LINUXCNC_INI_FILE: _ini(source, struts)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Pins and words read again, moved by LinuxCNC's own formulas."""
-        hal, machine = files[HAL], source.machine
-        offsets = np.array([float(word) for word in _OFFSET.findall(files[INI])])
+        hal, machine = files[LINUXCNC_HAL_FILE], source.machine
+        offsets = np.array([float(word) for word in _OFFSET.findall(files[LINUXCNC_INI_FILE])])
         if machine.document.motion == "translation":
             fit = _fit(source)
             pins = {name: float(value) for name, value in _PIN.findall(hal)}
             if fit.kind == "linear":
-                return [tool_difference(hal, fit, lambda p: linear_joints(pins, p), offsets)]
+                return [
+                    firmware_tool_difference(hal, fit, lambda p: linear_joints(pins, p), offsets)
+                ]
             # motors count upwards, LinuxCNC's joints downwards
-            return [tool_difference(hal, fit, lambda p: -rotary_joints(pins, p), -offsets)]
+            return [firmware_tool_difference(hal, fit, lambda p: -rotary_joints(pins, p), -offsets)]
         poses, readings = samples(machine)
-        rates = np.array([float(word) for word in _RATE.findall(files[INI])])
+        rates = np.array([float(word) for word in _RATE.findall(files[LINUXCNC_INI_FILE])])
         off = largest((genhexkins(hal, world(poses)) - offsets) / rates, readings)
         return [
-            Difference(f"readings at {len(poses)} poses by genhexkins' formulas", off, ROUNDING)
+            Difference(
+                f"readings at {len(poses)} poses by genhexkins' formulas",
+                off,
+                LINUXCNC_READING_ROUNDING,
+            )
         ]
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """Where offsets went, or how well the pins follow the machine."""
         if source.machine.document.motion == "translation":
             return (follows(_fit(source)),)
@@ -113,7 +124,7 @@ def _hexapod(machine: Machine) -> Limbs:
     """
     layout = machine.layout
     rods, axes = int(layout.closing.sum()), len(layout.angles)
-    ok = machine.document.motion == "spatial" and rods == STRUTS and not axes
+    ok = machine.document.motion == "spatial" and rods == GENHEXKINS_STRUTS and not axes
     if not ok or not layout.rod_reads[layout.closing].all() or layout.n_internal:
         joints = sorted({leg.base.joint for leg in machine.document.legs})
         raise InputError(
@@ -125,11 +136,11 @@ def _hexapod(machine: Machine) -> Limbs:
             expected="a hexapod; or a linear or rotary delta, for lineardeltakins, rotarydeltakins",
             next_step="Export it with --to c, and build a kinematics module from that",
         )
-    struts = rods_of(machine)
+    struts = rod_limbs(machine)
     return struts.of(np.argsort(struts.joint))
 
 
-def _hexapod_header(source: Source) -> tuple[str, ...]:
+def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
     return source.header(
         "Units: mm and degrees. Strut N is joint N; base.N in the base frame, platform.N in the"
         " platform frame.",
@@ -143,21 +154,21 @@ def _hexapod_header(source: Source) -> tuple[str, ...]:
 def _limits(machine: Machine, struts: Limbs) -> Array:
     """Smallest and largest strut lengths (6, 2) mm."""
     ways = struts.scale[:, None] * machine.joint_ranges[struts.joint]
-    return MM * (ways + struts.length[:, None])
+    return MM_A_METRE * (ways + struts.length[:, None])
 
 
-def _hal(source: Source, struts: Limbs) -> str:
+def _hal(source: MachineSource, struts: Limbs) -> str:
     limits = _limits(source.machine, struts)
-    limit = max(MAX_ERROR, STRUTS * float(np.nanmax(limits, initial=0.0)))
+    limit = max(MAX_ERROR, GENHEXKINS_STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
-        commented((*_hexapod_header(source), "", *source.sigma_lines(HEXAPOD)), "#"),
+        commented((*_hexapod_header(source), "", *source.sigma_lines(HEXAPOD_PARAMETERS)), "#"),
         "# your own HAL file loads it before: loadrt genhexkins\n",
     ]
     for n, leg in enumerate(struts.leg):
         lines.append(f"# strut {n}: leg {leg} of the mechanism file")
         for name, values in (("base", struts.base), ("platform", struts.platform)):
             lines += [
-                f"setp genhexkins.{name}.{n}.{axis} {exact(MM * value)}"
+                f"setp genhexkins.{name}.{n}.{axis} {exact(MM_A_METRE * value)}"
                 for axis, value in zip("xyz", values[n].tolist(), strict=True)
             ]
     lines += [
@@ -174,7 +185,7 @@ def _hal(source: Source, struts: Limbs) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _ini(source: Source, struts: Limbs) -> str:
+def _ini(source: MachineSource, struts: Limbs) -> str:
     home = world(source.machine.home()[None])[0]
     lines = [
         commented(
@@ -194,10 +205,10 @@ def _ini(source: Source, struts: Limbs) -> str:
     for n, (low, high) in enumerate(_limits(source.machine, struts).tolist()):
         scale = float(struts.scale[n])
         lines.append(f"\n[JOINT_{n}]\nTYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2")
-        lines.append(f"# joint {n} = {exact(MM * scale)} * reading + HOME_OFFSET")
-        if abs(scale - 1) > TOLD:
-            lines.append(f"# {CORRECTING.replace('that', exact(scale))}")
-        lines.append(f"HOME_OFFSET = {exact(float(MM * struts.length[n]))}")
+        lines.append(f"# joint {n} = {exact(MM_A_METRE * scale)} * reading + HOME_OFFSET")
+        if abs(scale - 1) > UNTOLD_SCALE_DIFFERENCE:
+            lines.append(f"# {SCALE_CORRECTION_ADVICE.replace('that', exact(scale))}")
+        lines.append(f"HOME_OFFSET = {exact(float(MM_A_METRE * struts.length[n]))}")
         if np.isfinite(low) and np.isfinite(high):
             lines.append(f"MIN_LIMIT = {low:.4f}\nMAX_LIMIT = {high:.4f}")
     return "\n".join(lines) + "\n"
@@ -209,16 +220,19 @@ def world(poses: Array) -> Array:
     roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
     pitch = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 2, 1], r[:, 2, 2]))
     yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
-    turns = np.stack([roll, pitch, yaw], axis=1) * DEGREE
-    return np.concatenate([MM * poses[:, :3, 3], turns], axis=1)
+    turns = np.stack([roll, pitch, yaw], axis=1) * DEGREES_A_RADIAN
+    return np.concatenate([MM_A_METRE * poses[:, :3, 3], turns], axis=1)
 
 
 def genhexkins(hal: str, pose: Array) -> Array:
     """Joints (n, 6) mm at X, Y, Z, A, B, C (n, 6), by the pins that a HAL file sets."""
-    pins = {name: np.zeros((STRUTS, 3)) for name in ("base", "platform")}
+    pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in ("base", "platform")}
     for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
-    (sa, sb, sc), (ca, cb, cc) = np.sin(pose[:, 3:].T / DEGREE), np.cos(pose[:, 3:].T / DEGREE)
+    (sa, sb, sc), (ca, cb, cc) = (
+        np.sin(pose[:, 3:].T / DEGREES_A_RADIAN),
+        np.cos(pose[:, 3:].T / DEGREES_A_RADIAN),
+    )
     rows = [
         [cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa],
         [sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa],
@@ -232,36 +246,36 @@ def genhexkins(hal: str, pose: Array) -> Array:
 # Deltas
 
 
-def _fit(source: Source) -> Fit:
-    return fit_of(source, PROGRAM, LINEAR, ROTARY)
+def _fit(source: MachineSource) -> Fit:
+    return fit_of(source, PROGRAM, LINUXCNC_LINEAR_FREEDOMS, LINUXCNC_ROTARY_FREEDOMS)
 
 
-def _delta_hal(source: Source, fit: Fit) -> str:
-    lines = about(source, fit, "012", CORRECTING)
+def _delta_hal(source: MachineSource, fit: Fit) -> str:
+    lines = about(source, fit, "012", SCALE_CORRECTION_ADVICE)
     lines = [line for line in lines if not line.startswith("End switches")]
     if fit.kind == "linear":
         pins = [
-            f"setp lineardeltakins.R {mm(fit.radius)}",
-            f"setp lineardeltakins.L {mm(fit.rod[0])}",
+            f"setp lineardeltakins.R {firmware_length(fit.radius)}",
+            f"setp lineardeltakins.L {firmware_length(fit.rod[0])}",
         ]
     else:
         lines.append("LinuxCNC's joints are the motors' angles with the other sign: downwards.")
         pins = [
             "# of platformradius and footradius the difference alone moves the machine",
-            f"setp rotarydeltakins.platformradius {mm(fit.radius)}",
+            f"setp rotarydeltakins.platformradius {firmware_length(fit.radius)}",
             "setp rotarydeltakins.footradius 0.0000",
-            f"setp rotarydeltakins.thighlength {mm(fit.arm[0])}",
-            f"setp rotarydeltakins.shinlength {mm(fit.rod[0])}",
+            f"setp rotarydeltakins.thighlength {firmware_length(fit.arm[0])}",
+            f"setp rotarydeltakins.shinlength {firmware_length(fit.rod[0])}",
         ]
     loaded = f"# your own HAL file loads it before: loadrt {fit.kind}deltakins"
     return "\n".join([commented(lines, "#"), loaded, *pins]) + "\n"
 
 
-def _delta_ini(source: Source, fit: Fit) -> str:
+def _delta_ini(source: MachineSource, fit: Fit) -> str:
     linear = fit.kind == "linear"
     sign = 1.0 if linear else -1.0  # arms count downwards
     rate, zero = sign * fit.rate, sign * fit.zero
-    word, number = ("LINEAR", mm) if linear else ("ANGULAR", degrees)
+    word, number = ("LINEAR", firmware_length) if linear else ("ANGULAR", firmware_angle)
     ini = [
         commented(
             (
@@ -303,10 +317,10 @@ def rotary_joints(pins: dict[str, float], points: Array) -> Array:
     z = points[:, 2]
     out: list[Array] = []
     for turn in (0.0, -120.0, 120.0):
-        c, s = np.cos(turn / DEGREE), np.sin(turn / DEGREE)
+        c, s = np.cos(turn / DEGREES_A_RADIAN), np.sin(turn / DEGREES_A_RADIAN)
         x, y = points[:, 0] * c - points[:, 1] * s, points[:, 0] * s + points[:, 1] * c
         a = 0.5 * (x**2 + (y - foot) ** 2 + z**2 + thigh**2 - shin**2 - pfr**2) / z
         b = (foot - pfr - y) / z
         knee = (pfr + a * b + np.sqrt(thigh**2 * (b**2 + 1) - (a - b * pfr) ** 2)) / (b**2 + 1)
-        out.append(np.arctan2(b * knee - a, knee - pfr) * DEGREE)
+        out.append(np.arctan2(b * knee - a, knee - pfr) * DEGREES_A_RADIAN)
     return np.stack(out, axis=1)

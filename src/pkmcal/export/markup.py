@@ -9,16 +9,16 @@ from xml.etree.ElementTree import Comment, Element, indent, tostring
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 
 
-def numbers(*values: float | Array) -> str:
+def numbers_text(*values: float | Array) -> str:
     """Numbers to the last digit, or the 16th behind the point; no negative zeros."""
     flat = np.concatenate([np.atleast_1d(np.asarray(v, dtype=float)).ravel() for v in values])
     return " ".join(repr(round(float(v), 16) + 0.0) for v in flat)
 
 
-def plain(text: str) -> str:
+def comment_text(text: str) -> str:
     """Text that may stand in an XML comment: printable, and no two hyphens in a row."""
     text = "".join(c for c in text if c.isprintable())
     while "--" in text:
@@ -28,15 +28,15 @@ def plain(text: str) -> str:
 
 def comment(parent: Element, text: str) -> None:
     """A sentence for people."""
-    parent.append(Comment(f" {plain(text)} "))
+    parent.append(Comment(f" {comment_text(text)} "))
 
 
-def document(root: Element, source: Source, conventions: Iterable[str]) -> str:
+def document(root: Element, source: MachineSource, conventions: Iterable[str]) -> str:
     """The whole text, on top what it is made of and the parameters with their deviations."""
     indent(root)
-    lines = [plain(line) for line in (*source.header(*conventions), "Parameters:")]
+    lines = [comment_text(line) for line in (*source.header(*conventions), "Parameters:")]
     lines = [part for line in lines for part in wrap(line, 96, break_on_hyphens=False)]
-    lines += [plain(line) for line in source.sigma_lines()]
+    lines += [comment_text(line) for line in source.sigma_lines()]
     about = "\n".join(["<!--", *(f"  {line}" for line in lines), "-->"])
     return f"{about}\n{tostring(root, encoding='unicode')}\n"
 

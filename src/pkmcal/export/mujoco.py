@@ -8,23 +8,23 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.export.agreement import differences
-from pkmcal.export.bodies import COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
+from pkmcal.export.bodies import BODY_COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
 from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.home import HomeState
-from pkmcal.export.markup import comment, document, file_name, numbers, plain
-from pkmcal.export.mujoco_read import read
+from pkmcal.export.markup import comment, comment_text, document, file_name, numbers_text
+from pkmcal.export.mujoco_read import read_mujoco
 from pkmcal.geometry.rigid import quaternion
 from pkmcal.outcome import Finding, Level
 
-STEP = "0.001"
+MUJOCO_TIME_STEP = "0.001"
 """s; the loops' time constant is twice that, the shortest that MuJoCo allows."""
-STIFF = 2.0e4
+DRIVE_STIFFNESS = 2.0e4
 """N/m of a drive's position control: with the parts' masses it settles within some 20 ms."""
-DAMPED = 2.0e2
+DRIVE_DAMPING = 2.0e2
 """N s/m of a drive."""
-LIGHT, PLATFORM = 0.1, 1.0
+MUJOCO_PART_MASS, MUJOCO_PLATFORM_MASS = 0.1, 1.0
 """kg of a part and of the platform: placeholders, since photographs weigh nothing."""
 CONVENTIONS = (
     "Units: m, rad, kg, s. MuJoCo's world is the machine's base frame; the body 'platform' has the"
@@ -47,15 +47,15 @@ class MujocoExporter(Exporter):
     name: ClassVar = "mujoco"
     title: ClassVar = "MuJoCo model (MJCF) with closed loops"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """The model's text."""
         return {f"{file_name(source.machine.name)}.xml": _mjcf(source)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """By the text's own bodies, joints and loops."""
-        return differences(read(next(iter(files.values()))), source.machine)
+        return differences(read_mujoco(next(iter(files.values()))), source.machine)
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """What the model does not know."""
         del source
         text = (
@@ -65,14 +65,14 @@ class MujocoExporter(Exporter):
         return (Finding(Level.NOTE, text),)
 
 
-def _mjcf(source: Source) -> str:
+def _mjcf(source: MachineSource) -> str:
     """The model's XML. Raises InputError for a machine that MuJoCo's bodies cannot be."""
     tree = body_tree(source.machine)
     home = tree.home
-    root = Element("mujoco", model=plain(source.machine.name))
+    root = Element("mujoco", model=comment_text(source.machine.name))
     _settings(root, home)
     world = SubElement(root, "worldbody")
-    size = numbers(np.zeros(2), 5 * home.size)
+    size = numbers_text(np.zeros(2), 5 * home.size)
     SubElement(world, "light", pos=size, dir="0 0 -1", directional="true")
     _fill(world, tree.bodies[0], tree)
     equality = SubElement(root, "equality")
@@ -85,7 +85,7 @@ def _mjcf(source: Source) -> str:
         kind, second = ("weld", f"{loop.name}_end") if loop.hinges else ("connect", loop.tip.name)
         out = SubElement(equality, kind, name=loop.name, body1=loop.held.name, body2=second)
         if not loop.hinges:
-            out.set("anchor", numbers(loop.point))
+            out.set("anchor", numbers_text(loop.point))
     _drives(root, home)
     _keyframe(root, home)
     return document(root, source, CONVENTIONS)
@@ -102,17 +102,17 @@ def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
             limits = tree.home.values(joint.column)[1:]
             if np.isfinite(limits).all():
                 made.set("limited", "true")
-                made.set("range", numbers(limits))
+                made.set("range", numbers_text(limits))
             # N s/m or N m s
-            made.set("damping", numbers(DAMPED * tree.home.lever(joint.column) ** 2))
+            made.set("damping", numbers_text(DRIVE_DAMPING * tree.home.lever(joint.column) ** 2))
     for shape in body.shapes:
         _geom(node, shape)
     for name, point in body.points.items():
-        SubElement(node, "site", name=name, pos=numbers(point))
+        SubElement(node, "site", name=name, pos=numbers_text(point))
     for child in tree.children(body):
         if child.said:
             comment(node, child.said)
-        mass = PLATFORM if child is tree.platform else LIGHT
+        mass = MUJOCO_PLATFORM_MASS if child is tree.platform else MUJOCO_PART_MASS
         made = _body(node, child.name, child.T_parent_body, mass, child.middle, child.size)
         if child.free:
             SubElement(made, "freejoint", name=child.name)
@@ -126,7 +126,7 @@ def _end(node: Element, loop: Loop, size: float) -> None:
     """The part of a joint whose axes count that the platform is welded to."""
     place = np.eye(4)
     place[:3, 3] = loop.end
-    last = _body(node, f"{loop.name}_end", place, LIGHT, np.zeros(3), size)
+    last = _body(node, f"{loop.name}_end", place, MUJOCO_PART_MASS, np.zeros(3), size)
     for kind, axis in loop.hinges:
         _joint(last, f"{loop.name}_{kind}", "hinge", axis)
 
@@ -136,28 +136,32 @@ def _body(parent: Element, name: str, T: Array, mass: float, middle: Array, size
 
     middle : (3,) its centre of mass. size : m, of a rod of that length; placeholders.
     """
-    out = SubElement(parent, "body", name=name, pos=numbers(T[:3, 3]))
-    inertia = numbers(np.full(3, mass * size**2 / 12))
-    SubElement(out, "inertial", pos=numbers(middle), mass=numbers(mass), diaginertia=inertia)
+    out = SubElement(parent, "body", name=name, pos=numbers_text(T[:3, 3]))
+    inertia = numbers_text(np.full(3, mass * size**2 / 12))
+    SubElement(
+        out, "inertial", pos=numbers_text(middle), mass=numbers_text(mass), diaginertia=inertia
+    )
     if np.abs(T[:3, :3] - np.eye(3)).max() > 1e-15:  # rounding is no turn
-        out.set("quat", numbers(quaternion(T[:3, :3])))
+        out.set("quat", numbers_text(quaternion(T[:3, :3])))
     return out
 
 
 def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0) -> Element:
     """A ``hinge`` or ``slide`` at the body's origin; ``ref`` is its value as drawn (m, rad)."""
-    out = SubElement(parent, "joint", name=name, type=kind, axis=numbers(axis))
+    out = SubElement(parent, "joint", name=name, type=kind, axis=numbers_text(axis))
     if ref:
-        out.set("ref", numbers(ref))
+        out.set("ref", numbers_text(ref))
     return out
 
 
 def _geom(parent: Element, shape: RoundBar) -> None:
-    size, rgba = numbers(shape.radius), COLOURS[shape.look]
+    size, rgba = numbers_text(shape.radius), BODY_COLOURS[shape.look]
     if shape.stop is None:
-        SubElement(parent, "geom", type="sphere", pos=numbers(shape.start), size=size, rgba=rgba)
+        SubElement(
+            parent, "geom", type="sphere", pos=numbers_text(shape.start), size=size, rgba=rgba
+        )
     elif not shape.flat:  # MuJoCo takes no cylinder without a length
-        ends = numbers(shape.start, shape.stop)
+        ends = numbers_text(shape.start, shape.stop)
         geom = SubElement(parent, "geom", type="cylinder", fromto=ends, size=size, rgba=rgba)
         if shape.name:
             geom.set("name", shape.name)
@@ -168,13 +172,15 @@ def _geom(parent: Element, shape: RoundBar) -> None:
 
 def _settings(root: Element, home: HomeState) -> None:
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
-    option = SubElement(root, "option", timestep=STEP, gravity="0 0 0", integrator="implicitfast")
+    option = SubElement(
+        root, "option", timestep=MUJOCO_TIME_STEP, gravity="0 0 0", integrator="implicitfast"
+    )
     SubElement(option, "flag", contact="disable")
     middle = np.concatenate([home.a, home.b]).mean(axis=0)
-    SubElement(root, "statistic", center=numbers(middle), extent=numbers(2 * home.size))
+    SubElement(root, "statistic", center=numbers_text(middle), extent=numbers_text(2 * home.size))
     default = SubElement(root, "default")
     SubElement(default, "geom", contype="0", conaffinity="0")
-    SubElement(default, "site", size=numbers(home.size / 100))
+    SubElement(default, "site", size=numbers_text(home.size / 100))
     SubElement(default, "joint", damping="0.01")
     # as stiff as the step allows: the loops are the machine's joints, not springs
     SubElement(default, "equality", solref="0.002 1", solimp="0.99 0.9999 0.0001 0.5 2")
@@ -185,13 +191,13 @@ def _drives(root: Element, home: HomeState) -> None:
     actuator, sensor = SubElement(root, "actuator"), SubElement(root, "sensor")
     for column in range(home.machine.n_joints):
         name, limits = home.reading_name(column), home.machine.joint_ranges[column]
-        stiffness = numbers(STIFF * home.lever(column) ** 2)
+        stiffness = numbers_text(DRIVE_STIFFNESS * home.lever(column) ** 2)
         drive = SubElement(actuator, "position", name=name, joint=name, kp=stiffness)
         if home.scale(column) != 1:
-            drive.set("gear", numbers(1 / home.scale(column)))
+            drive.set("gear", numbers_text(1 / home.scale(column)))
         if np.isfinite(limits).all():
             drive.set("ctrllimited", "true")
-            drive.set("ctrlrange", numbers(limits))
+            drive.set("ctrlrange", numbers_text(limits))
         SubElement(sensor, "actuatorpos", name=name, actuator=name)
     for kind, name in (("framepos", "platform_position"), ("framequat", "platform_quaternion")):
         SubElement(sensor, kind, name=name, objtype="xbody", objname="platform")
@@ -205,4 +211,4 @@ def _keyframe(root: Element, home: HomeState) -> None:
     if free is not None:  # the platform comes first
         values[:0] = [free.get("pos", "0 0 0"), free.get("quat", "1 0 0 0")]
     key = SubElement(SubElement(root, "keyframe"), "key", name="home", qpos=" ".join(values))
-    key.set("ctrl", numbers(home.readings))
+    key.set("ctrl", numbers_text(home.readings))

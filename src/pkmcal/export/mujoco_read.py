@@ -16,12 +16,12 @@ from pkmcal.export.read_model import (
     ReadJoint,
     ReadLoop,
     ReadModel,
-    placed,
+    body_poses,
 )
 from pkmcal.geometry.rigid import from_quaternion, inverse, pose, pose_difference
 
 
-def read(text: str) -> ReadModel:
+def read_mujoco(text: str) -> ReadModel:
     """The model of a text, with loops closed as MuJoCo's compiler closes them: as drawn."""
     root = fromstring(text)
     bodies = [ReadBody("world", 0, np.eye(4), ())]
@@ -33,7 +33,9 @@ def read(text: str) -> ReadModel:
     drawn = np.zeros(dofs)
     for j in joints.values():
         drawn[j.dof] = j.ref
-    at = dict(zip((body.name for body in bodies), enumerate(placed(bodies, drawn)), strict=True))
+    at = dict(
+        zip((body.name for body in bodies), enumerate(body_poses(bodies, drawn)), strict=True)
+    )
     nodes = [node for part in root.findall("equality") for node in part]
     drives = root.findall("actuator/position")
     key = root.find("keyframe/key")

@@ -8,14 +8,14 @@ from typing import Any, ClassVar, final
 
 import yaml
 
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.mechanisms.machine import field_of
 
-MECHANISM, MACHINE = "mechanism.yaml", "machine.json"
-FORMAT = 1
+PLAIN_MECHANISM_FILE, PLAIN_MACHINE_FILE = "mechanism.yaml", "machine.json"
+MACHINE_JSON_FORMAT = 1
 CONVENTIONS = (
     "Units: m and rad; axes are unit vectors.",
     "T_a_b maps coordinates of frame b to frame a. length = scale * reading + offset, and so of"
@@ -32,14 +32,14 @@ class MechanismYaml(Exporter):
     name: ClassVar = "yaml"
     title: ClassVar = "pkmcal's own mechanism file"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """``mechanism.yaml`` with everything that is known of its values on top."""
         lines = [*source.header(*CONVENTIONS), "", *source.sigma_lines()]
-        return {MECHANISM: commented(lines, "#") + mechanism_text(source.machine)}
+        return {PLAIN_MECHANISM_FILE: commented(lines, "#") + mechanism_text(source.machine)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Read by another YAML parser than ours, each value by its path."""
-        document = yaml.safe_load(files[MECHANISM])
+        document = yaml.safe_load(files[PLAIN_MECHANISM_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
         found = _values_in(document, table.names)
@@ -53,13 +53,13 @@ class MachineJson(Exporter):
     name: ClassVar = "json"
     title: ClassVar = "names, values, units, deviations and covariance"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """``machine.json``."""
         machine = source.machine
         table = machine.parameters
         values = table.unit_axes(machine.values)
         document = {
-            "pkmcal_machine": FORMAT,
+            "pkmcal_machine": MACHINE_JSON_FORMAT,
             "pkmcal": version("pkmcal"),
             "about": source.header(),
             "conventions": CONVENTIONS,
@@ -87,11 +87,11 @@ class MachineJson(Exporter):
             "cameras": {name: camera.document() for name, camera in source.cameras.items()},
             "mechanism": machine.to_document(),
         }
-        return {MACHINE: json_text(document)}
+        return {PLAIN_MACHINE_FILE: json_text(document)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Read by the standard library, values and covariance."""
-        document = json.loads(files[MACHINE])
+        document = json.loads(files[PLAIN_MACHINE_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
         found = [p["value"] for p in document["parameters"]]

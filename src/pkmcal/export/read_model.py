@@ -22,13 +22,13 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
 )
 
-ZERO = np.zeros(3)
-STEPS = 30
-CLOSED = 1e-13
+NO_TRANSLATION = np.zeros(3)
+MOST_CLOSING_STEPS = 30
+LOOPS_CLOSED_STEP = 1e-13
 """m or rad of a step below which nothing changes any more."""
-SMALL = 1e-7
+DIFFERENCE_QUOTIENT_STEP = 1e-7
 """m or rad, of the differences that derivatives are taken from: right to as much."""
-DEPENDENT = 1e-6
+DEPENDENT_CONSTRAINT_SHARE = 1e-6
 """Share of the largest singular value below which constraints say the same; above that error."""
 
 
@@ -96,16 +96,16 @@ class ReadModel:
     def places(self, x: Array) -> dict[str, Array]:
         """Poses (..., 4, 4) of all bodies by name, world frame."""
         names = (body.name for body in self.bodies)
-        return dict(zip(names, placed(self.bodies, x), strict=True))
+        return dict(zip(names, body_poses(self.bodies, x), strict=True))
 
     def site_places(self, x: Array) -> dict[str, Array]:
         """Where the named points are, (..., 3) m, world frame."""
-        at = placed(self.bodies, x)
+        at = body_poses(self.bodies, x)
         return {name: apply(at[body], point) for name, (body, point) in self.sites.items()}
 
     def gaps(self, x: Array) -> Array:
         """What is left of the equality constraints (..., E), m and rad."""
-        at, out = placed(self.bodies, x), list[Array]()
+        at, out = body_poses(self.bodies, x), list[Array]()
         for loop in self.loops:
             first, second = (at[k] @ T for k, T in zip(loop.bodies, loop.frames, strict=True))
             out.append(first[..., :3, 3] - second[..., :3, 3])
@@ -147,19 +147,19 @@ class ReadModel:
             off = pose_difference(self.places(x)["platform"], wanted)
             return np.concatenate([gaps, off], axis=-1)
 
-        steps = SMALL * np.eye(x.shape[-1])[~held]
-        for _ in range(STEPS):
+        steps = DIFFERENCE_QUOTIENT_STEP * np.eye(x.shape[-1])[~held]
+        for _ in range(MOST_CLOSING_STEPS):
             value = left(x)
-            by_freedom = (left(x[:, None] + steps) - value[:, None]).mT / SMALL
-            step = np.linalg.pinv(by_freedom, rcond=DEPENDENT) @ value[..., None]
+            by_freedom = (left(x[:, None] + steps) - value[:, None]).mT / DIFFERENCE_QUOTIENT_STEP
+            step = np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ value[..., None]
             x = x.copy()
             x[:, ~held] -= step[..., 0]
-            if np.abs(step).max() < CLOSED:
+            if np.abs(step).max() < LOOPS_CLOSED_STEP:
                 break
         return x
 
 
-def placed(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
+def body_poses(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
     """Poses (..., 4, 4) of bodies: their joints act one after the other, each in the frame so far;
     a free joint's body stands in the world.
     """
@@ -172,6 +172,6 @@ def placed(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
                 continue
             way = (x[..., j.dof, None] - j.ref) * j.axis
             turns = j.kind == "hinge"
-            here = here @ (pose(rotation(way), ZERO) if turns else pose(np.eye(3), way))
+            here = here @ (pose(rotation(way), NO_TRANSLATION) if turns else pose(np.eye(3), way))
         at.append(here)
     return at

@@ -15,34 +15,34 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
-    DEGREE,
-    MM,
+    DEGREES_A_RADIAN,
+    MM_A_METRE,
     Fit,
     Freedoms,
     about,
-    degrees,
+    firmware_angle,
+    firmware_length,
+    firmware_tool_difference,
     fit_of,
     follows,
-    mm,
     reach,
     redo,
-    tool_difference,
 )
 from pkmcal.outcome import Finding
 
 FILE = "pkmcal_delta.g"
 PROGRAM = "RepRapFirmware"
-NOMINAL = (-150.0, -30.0, 90.0)
-STEEPEST = 90.0
+REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
+STEEPEST_ARM_ANGLE = 90.0
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
 
 
-def _fit(source: Source) -> Fit:
-    return fit_of(source, PROGRAM, Freedoms(NOMINAL), Freedoms(NOMINAL))
+def _fit(source: MachineSource) -> Fit:
+    return fit_of(source, PROGRAM, Freedoms(REPRAP_TOWER_ANGLES), Freedoms(REPRAP_TOWER_ANGLES))
 
 
 @final
@@ -52,7 +52,7 @@ class RepRap(Exporter):
     name: ClassVar = "reprap"
     title: ClassVar = "RepRapFirmware: lines for config.g"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """One file of G-code."""
         fit = _fit(source)
         way = "mm" if fit.kind == "linear" else "degree"
@@ -61,7 +61,7 @@ class RepRap(Exporter):
         commands = _linear(fit) if fit.kind == "linear" else _rotary(fit)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Read as the firmware does, and moved by its formulas."""
         fit = _fit(source)
         text = files[FILE]
@@ -69,10 +69,12 @@ class RepRap(Exporter):
         ends = fit.rate * fit.delta.ends[fit.order]
         linear = fit.kind == "linear"
         homed = homed_carriages(words) if linear else words["669A"][1] + _xyz(words, "666")
-        move = linear_motors if linear else rotary_motors
-        return [tool_difference(text, fit, lambda points: move(words, points), homed - ends)]
+        move = reprap_carriage_heights if linear else reprap_arm_angles
+        return [
+            firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends)
+        ]
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
         return (follows(_fit(source)), *redo(source))
 
@@ -80,12 +82,15 @@ class RepRap(Exporter):
 def _linear(fit: Fit) -> list[str]:
     heights = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
     homed = float(heights.mean())
-    corrections = fit.angle - np.array(NOMINAL)
+    corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
     return [
         "M669 K3 ; linear delta",
-        f"M665 L{_three(fit.rod)} R{mm(fit.radius)} H{mm(homed)} B{mm(MM * reach(fit.delta))}"
-        f" {_letters(corrections, degrees)} ; L rods, R radius, H homed height, B print radius",
-        f"M666 {_letters(heights - homed, mm)} A0 B0 ; endstop adjustments, mm; no tilt",
+        f"M665 L{_three(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
+        f" B{firmware_length(MM_A_METRE * reach(fit.delta))}"
+        f" {_letters(corrections, firmware_angle)} ; L rods, R radius, H homed height, B print"
+        f" radius",
+        f"M666 {_letters(heights - homed, firmware_length)} A0 B0 ; endstop adjustments, mm; no"
+        f" tilt",
     ]
 
 
@@ -94,27 +99,31 @@ def _rotary(fit: Fit) -> list[str]:
     largest = float(homed.mean())
     ranges = delta.machine.joint_ranges[delta.joint][fit.order]
     lowest = float((fit.rate[:, None] * ranges + fit.zero[:, None]).min())
-    if lowest < -STEEPEST or largest > STEEPEST:
+    if lowest < -STEEPEST_ARM_ANGLE or largest > STEEPEST_ARM_ANGLE:
         raise InputError(
             "RepRapFirmware's rotary delta takes arms up to 90 degrees from the horizontal",
             found=f"arms from {lowest:.1f} to {largest:.1f} degrees",
             next_step="Give the cranks a smaller range in the mechanism file",
         )
-    corrections = fit.angle - np.array(NOMINAL)
-    low = float(MM * delta.positions[:, 2].min() + MM * fit.T_firmware_base[2, 3])
-    high = float(MM * delta.positions[:, 2].max() + MM * fit.T_firmware_base[2, 3])
+    corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
+    low = float(MM_A_METRE * delta.positions[:, 2].min() + MM_A_METRE * fit.T_firmware_base[2, 3])
+    high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
     return [
-        f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)} R{mm(fit.radius)}"
-        f" A{degrees(lowest)}:{degrees(largest)} B{mm(MM * reach(delta))}"
-        f" {_letters(corrections, degrees)} ; U arms, L rods, H bearings' heights, R radius",
-        f"M666 {_letters(homed - largest, degrees)} ; homed angles beyond A's larger one, degrees",
-        f"; M208 Z{mm(max(low, 0.0))}:{mm(high)} ; Z of the workspace at most; set your own",
+        f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)}"
+        f" R{firmware_length(fit.radius)}"
+        f" A{firmware_angle(lowest)}:{firmware_angle(largest)}"
+        f" B{firmware_length(MM_A_METRE * reach(delta))}"
+        f" {_letters(corrections, firmware_angle)} ; U arms, L rods, H bearings' heights, R radius",
+        f"M666 {_letters(homed - largest, firmware_angle)} ; homed angles beyond A's larger one,"
+        f" degrees",
+        f"; M208 Z{firmware_length(max(low, 0.0))}:{firmware_length(high)} ; Z of the workspace"
+        f" at most; set your own",
         "; M92: microsteps per degree of the arm, on X, Y and Z",
     ]
 
 
 def _three(values: Array) -> str:
-    return ":".join(mm(v) for v in values)
+    return ":".join(firmware_length(v) for v in values)
 
 
 def _letters(values: Array, write: Callable[[float], str]) -> str:
@@ -141,14 +150,14 @@ def homed_carriages(words: dict[str, Array]) -> Array:
     return words["665H"] + rise + _xyz(words, "666")
 
 
-def linear_motors(words: dict[str, Array], points: Array) -> Array:
+def reprap_carriage_heights(words: dict[str, Array], points: Array) -> Array:
     """Carriages' heights (n, 3) mm at points (n, 3): the firmware's linear Transform."""
     x, y, z, tower = *_xyz(words, "665"), words["665R"][0]
     towers = tower * np.array(
         [
-            [-np.cos((30 + x) / DEGREE), -np.sin((30 + x) / DEGREE)],
-            [np.cos((30 - y) / DEGREE), -np.sin((30 - y) / DEGREE)],
-            [-np.sin(z / DEGREE), np.cos(z / DEGREE)],
+            [-np.cos((30 + x) / DEGREES_A_RADIAN), -np.sin((30 + x) / DEGREES_A_RADIAN)],
+            [np.cos((30 - y) / DEGREES_A_RADIAN), -np.sin((30 - y) / DEGREES_A_RADIAN)],
+            [-np.sin(z / DEGREES_A_RADIAN), np.cos(z / DEGREES_A_RADIAN)],
         ]
     )
     d = points[:, None, :2] - towers
@@ -157,16 +166,16 @@ def linear_motors(words: dict[str, Array], points: Array) -> Array:
     return rise + points[:, 2:] + tilt[:, None]
 
 
-def rotary_motors(words: dict[str, Array], points: Array) -> Array:
+def reprap_arm_angles(words: dict[str, Array], points: Array) -> Array:
     """Arms' angles (n, 3) degrees at points (n, 3) mm: the firmware's rotary Transform.
 
     Its arc sine knows angles up to 90 degrees from the horizontal.
     """
-    angle = (np.array(NOMINAL) + _xyz(words, "669")) / DEGREE
+    angle = (np.array(REPRAP_TOWER_ANGLES) + _xyz(words, "669")) / DEGREES_A_RADIAN
     along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle)
     across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
     r, h = words["669R"] - along, words["669H"] - points[:, 2:]
     a, b = 2 * words["669U"] * r, 2 * words["669U"] * h
     c = words["669L"] ** 2 - words["669U"] ** 2 - (h**2 + r**2 + across**2)
     square = a**2 + b**2
-    return np.arcsin((b * c - a * np.sqrt(square - c**2)) / square) * DEGREE
+    return np.arcsin((b * c - a * np.sqrt(square - c**2)) / square) * DEGREES_A_RADIAN

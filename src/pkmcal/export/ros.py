@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.cameras.files import foreign_text, load_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact
@@ -24,10 +24,10 @@ from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
 from pkmcal.outcome import Finding, Level
 from pkmcal.wording import listed
 
-LAUNCH = "static_transforms.launch.yaml"
-BASE = "base"
-MIRROR = "unified"
-ROUNDING = 1e-12
+ROS_LAUNCH_FILE = "static_transforms.launch.yaml"
+ROS_BASE_FRAME = "base"
+MIRROR_CAMERA_MODEL = "unified"
+TRANSFORM_ROUNDING = 1e-12
 """m, and elements of a rotation matrix, which a unit quaternion of 17 digits gives back."""
 
 
@@ -38,7 +38,7 @@ class Ros(Exporter):
     name: ClassVar = "ros"
     title: ClassVar = "ROS 2: camera_info and static transforms"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """A launch file, and a camera_info file for each camera that ROS has a model for."""
         if not source.T_base_camera:
             raise InputError(
@@ -47,20 +47,20 @@ class Ros(Exporter):
                 expected="a folder that pkmcal calibrate wrote",
                 next_step="Calibrate first; a mechanism file alone has no cameras",
             )
-        out = {LAUNCH: _launch(source)}
+        out = {ROS_LAUNCH_FILE: _launch(source)}
         frames = frame_names(source)
         for station, camera in source.cameras.items():
-            if camera.model != MIRROR:
+            if camera.model != MIRROR_CAMERA_MODEL:
                 name = f"camera_info_{frames[station]}.yaml"
                 out[name] = _camera_info(source, station, frames[station])
         return out
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Transforms by the quaternions' own formula, cameras by the reader of foreign files."""
         frames = frame_names(source)
-        found = transforms(files[LAUNCH])
+        found = transforms(files[ROS_LAUNCH_FILE])
         off = [float(np.abs(found[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
-        out = [Difference(f"{len(off)} transforms read again", max(off), ROUNDING)]
+        out = [Difference(f"{len(off)} transforms read again", max(off), TRANSFORM_ROUNDING)]
         for station, camera in source.cameras.items():
             text = files.get(f"camera_info_{frames[station]}.yaml")
             if text is not None:
@@ -73,7 +73,7 @@ class Ros(Exporter):
                 out.append(Difference(f"camera of {station} read again", worst, limit, "px"))
         return out
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """Cameras that are not in the files, and why."""
         lost = [s for s in source.T_base_camera if s not in source.cameras]
         out: list[Finding] = []
@@ -83,15 +83,15 @@ class Ros(Exporter):
                 " session with --session; trackers have none."
             )
             out.append(Finding(Level.DOUBTFUL, text))
-        mirrors = [s for s, camera in source.cameras.items() if camera.model == MIRROR]
+        mirrors = [s for s, camera in source.cameras.items() if camera.model == MIRROR_CAMERA_MODEL]
         if mirrors:
             text = f"No camera_info for {listed(mirrors)}: ROS has no model for mirrors."
             out.append(Finding(Level.DOUBTFUL, text))
-        out.append(Finding(Level.NOTE, f"Start it with: ros2 launch ./{LAUNCH}"))
+        out.append(Finding(Level.NOTE, f"Start it with: ros2 launch ./{ROS_LAUNCH_FILE}"))
         return tuple(out)
 
 
-def frame_names(source: Source) -> dict[str, str]:
+def frame_names(source: MachineSource) -> dict[str, str]:
     """A name that ROS takes, for each station: letters, digits and underscores, all different."""
     out: dict[str, str] = {}
     for station in source.T_base_camera:
@@ -104,7 +104,7 @@ def frame_names(source: Source) -> dict[str, str]:
     return out
 
 
-def _launch(source: Source) -> str:
+def _launch(source: MachineSource) -> str:
     names = frame_names(source)
     nodes: list[str] = []
     for station, transform in source.T_base_camera.items():
@@ -115,14 +115,15 @@ def _launch(source: Source) -> str:
         turn = " ".join(
             f"--q{axis} {exact(v)}" for axis, v in zip("xyzw", turned.tolist(), strict=True)
         )
-        frame = f"--frame-id {BASE} --child-frame-id {names[station]}_optical_frame"
+        frame = f"--frame-id {ROS_BASE_FRAME} --child-frame-id {names[station]}_optical_frame"
         nodes.append(
             "- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n"
             f"    name: {names[station]}_transform\n"
             f'    args: "{shift} {turn} {frame}"\n'
         )
     about = source.header(
-        f"Transforms from {BASE} (the machine's base frame) to each camera's optical frame:"
+        f"Transforms from {ROS_BASE_FRAME} (the machine's base frame) to each camera's optical"
+        f" frame:"
         " z forward, x right, y down. Metres; quaternions x y z w, which turn camera coordinates"
         " into base coordinates.",
         *(_sigma(source)),
@@ -130,7 +131,7 @@ def _launch(source: Source) -> str:
     return commented(about, "#") + "launch:\n" + "".join(nodes)
 
 
-def _sigma(source: Source) -> tuple[str, ...]:
+def _sigma(source: MachineSource) -> tuple[str, ...]:
     return tuple(
         f"Station {station}: sigma of rotation"
         f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
@@ -139,7 +140,7 @@ def _sigma(source: Source) -> tuple[str, ...]:
     )
 
 
-def _camera_info(source: Source, station: str, frame: str) -> str:
+def _camera_info(source: MachineSource, station: str, frame: str) -> str:
     """The text of a ROS camera file, whose camera_name is the frame's."""
     text = foreign_text(source.cameras[station], f"{frame}.yaml", "ros")
     about = source.header(

@@ -10,16 +10,18 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
 
-COUNT = 64
-SEED = 0
-LEAST = 0.05
+COMPARED_SAMPLES = 64
+SAMPLES_SEED = 0
+LEAST_SAMPLE_SINGULARITY = 0.05
 """Least singular value of the scaled inverse Jacobian: nearer to singular, 1e-15 of rounding in a
 length moves a platform by more than comparisons allow."""
-SAME = 1e-9
+SAME_ELBOW_DIFFERENCE = 1e-9
 """Readings (m, rad) beyond which inverse kinematics chose another elbow than was put in."""
 
 
-def samples(machine: Machine, count: int = COUNT, seed: int = SEED) -> tuple[Array, Array]:
+def samples(
+    machine: Machine, count: int = COMPARED_SAMPLES, seed: int = SAMPLES_SEED
+) -> tuple[Array, Array]:
     """Poses (n, 4, 4) and their readings (n, m), n <= count, in the home's assembly.
 
     Raises ResultError where there are none.
@@ -39,9 +41,13 @@ def samples(machine: Machine, count: int = COUNT, seed: int = SEED) -> tuple[Arr
         wanted = None
     poses = found.T_base_platform
     joints = machine.inverse(poses)
-    good = found.converged & (found.singularity > LEAST) & np.isfinite(joints).all(axis=-1)
+    good = (
+        found.converged
+        & (found.singularity > LEAST_SAMPLE_SINGULARITY)
+        & np.isfinite(joints).all(axis=-1)
+    )
     if wanted is not None:
-        good &= np.abs(joints - wanted).max(axis=-1) < SAME
+        good &= np.abs(joints - wanted).max(axis=-1) < SAME_ELBOW_DIFFERENCE
     if not good.any():
         raise ResultError(
             f"mechanism {machine.name!r} has no poses within its ranges to compare an export at",

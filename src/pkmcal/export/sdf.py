@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
-    COLOURS,
+    BODY_COLOURS,
     NOT_WEIGHED,
     BodyJoint,
     BodyTree,
@@ -23,15 +23,15 @@ from pkmcal.export.bodies import (
     without_masses,
 )
 from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.home import SAME
-from pkmcal.export.markup import comment, document, file_name, numbers
-from pkmcal.export.sdf_read import NAMESPACE, read
+from pkmcal.export.home import SAME_HINGE_DIFFERENCE
+from pkmcal.export.markup import comment, document, file_name, numbers_text
+from pkmcal.export.sdf_read import SDF_NAMESPACE, read_sdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw
 from pkmcal.outcome import Finding, Level
 
-VERSION = "1.11"
+SDF_VERSION = "1.11"
 """The first with joints that follow others (``mimic``)."""
-MODEL = "__model__"
+SDF_MODEL_FRAME = "__model__"
 CONVENTIONS = (
     "Units: m, rad. The model's frame is the machine's base frame, the link 'platform' has the"
     " platform frame; its pose is T_base_platform at home, where all is drawn.",
@@ -53,16 +53,16 @@ class SdfExporter(Exporter):
     name: ClassVar = "sdf"
     title: ClassVar = "SDF model with closed loops"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """The model's text."""
         name = file_name(source.machine.name)
         return {f"{name}.sdf": _sdf(body_tree(source.machine), source, name)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """By the text's own links and joints."""
-        return differences(read(next(iter(files.values()))), source.machine)
+        return differences(read_sdf(next(iter(files.values()))), source.machine)
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """What the model does not know, and what its readers may not do."""
         del source
         return (
@@ -77,12 +77,12 @@ class SdfExporter(Exporter):
         )
 
 
-def _sdf(tree: BodyTree, source: Source, name: str) -> str:
-    root = Element("sdf", {"version": VERSION, "xmlns:pkmcal": NAMESPACE})
+def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
+    root = Element("sdf", {"version": SDF_VERSION, "xmlns:pkmcal": SDF_NAMESPACE})
     model = SubElement(root, "model", name=name)
     for k, reading in enumerate(tree.home.readings):
-        known = {"joint": tree.home.reading_name(k), "home": numbers(reading)}
-        SubElement(model, "pkmcal:reading", known, scale=numbers(tree.home.scale(k)))
+        known = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
+        SubElement(model, "pkmcal:reading", known, scale=numbers_text(tree.home.scale(k)))
     for body in tree.bodies:
         if body.said:
             comment(model, body.said)
@@ -133,7 +133,10 @@ def _steps(joints: list[BodyJoint]) -> Iterator[tuple[BodyJoint, ...]]:
     while k < len(joints):
         pair = tuple(joints[k : k + 2])
         turns = [joint.kind == "hinge" for joint in pair]
-        square = turns == [True, True] and abs(float(pair[0].axis @ pair[1].axis)) < SAME
+        square = (
+            turns == [True, True]
+            and abs(float(pair[0].axis @ pair[1].axis)) < SAME_HINGE_DIFFERENCE
+        )
         yield pair if square else pair[:1]
         k += 2 if square else 1
 
@@ -147,7 +150,7 @@ def _joint(model: Element, name: str, links: tuple[str, str], kind: str) -> Elem
 def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
     """A joint's axis in the joint's own frame, its limits, and what it follows."""
     out = SubElement(parent, tag)
-    SubElement(out, "xyz").text = numbers(joint.axis)
+    SubElement(out, "xyz").text = numbers_text(joint.axis)
     limit = SubElement(out, "limit")
     if joint.column < 0:
         SubElement(limit, "effort").text = "0"  # or readers take a motor for what has no limit
@@ -155,7 +158,7 @@ def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
         known = np.sort(tree.home.values(joint.column)[1:] - joint.value)
         for end, value in zip(("lower", "upper"), known, strict=True):
             if np.isfinite(value):
-                SubElement(limit, end).text = numbers(value)
+                SubElement(limit, end).text = numbers_text(value)
     for coupling in tree.couplings:
         if coupling.follower == joint.name:
             mimic = SubElement(out, "mimic", joint=coupling.leader, axis="axis")
@@ -170,7 +173,7 @@ def _loop(model: Element, loop: Loop) -> None:
     _pose(out, np.eye(4), f"{loop.name}_platform")
     for tag, (_, axis) in zip(("axis", "axis2"), loop.hinges, strict=False):
         node = SubElement(out, tag)
-        SubElement(node, "xyz", expressed_in=MODEL).text = numbers(axis)
+        SubElement(node, "xyz", expressed_in=SDF_MODEL_FRAME).text = numbers_text(axis)
         SubElement(SubElement(node, "limit"), "effort").text = "0"
 
 
@@ -178,7 +181,7 @@ def _pose(parent: Element, T: Array, relative_to: str = "") -> None:
     out = SubElement(parent, "pose")
     if relative_to:
         out.set("relative_to", relative_to)
-    out.text = numbers(T[:3, 3], roll_pitch_yaw(T[:3, :3]))
+    out.text = numbers_text(T[:3, 3], roll_pitch_yaw(T[:3, :3]))
 
 
 def _visual(link: Element, shape: RoundBar, name: str) -> None:
@@ -187,12 +190,12 @@ def _visual(link: Element, shape: RoundBar, name: str) -> None:
         return
     out = SubElement(link, "visual", name=name)
     middle, length, turned = shape.drawn
-    SubElement(out, "pose").text = numbers(middle, turned)
+    SubElement(out, "pose").text = numbers_text(middle, turned)
     geometry = SubElement(out, "geometry")
     form = SubElement(geometry, "sphere" if shape.stop is None else "cylinder")
-    SubElement(form, "radius").text = numbers(shape.radius)
+    SubElement(form, "radius").text = numbers_text(shape.radius)
     if shape.stop is not None:
-        SubElement(form, "length").text = numbers(length)
+        SubElement(form, "length").text = numbers_text(length)
     material = SubElement(out, "material")
     for light in ("ambient", "diffuse"):
-        SubElement(material, light).text = COLOURS[shape.look]
+        SubElement(material, light).text = BODY_COLOURS[shape.look]

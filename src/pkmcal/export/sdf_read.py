@@ -12,19 +12,19 @@ from pkmcal.arrays import Array
 from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, inverse, pose
 
-NAMESPACE = "urn:pkmcal"
-MODEL, WORLD = "__model__", "world"
-AXES = {"revolute": ("axis",), "prismatic": ("axis",), "universal": ("axis", "axis2")}
-LOOP = "_loop"
+SDF_NAMESPACE = "urn:pkmcal"
+SDF_READ_MODEL_FRAME, SDF_WORLD_FRAME = "__model__", "world"
+SDF_JOINT_AXES = {"revolute": ("axis",), "prismatic": ("axis",), "universal": ("axis", "axis2")}
+LOOP_JOINT_ENDING = "_loop"
 
 
-def read(text: str) -> ReadModel:
+def read_sdf(text: str) -> ReadModel:
     """The model of a text whose joints named ``…_loop`` close what the others leave open."""
     model = fromstring(text)[0]
     made = _Links(model)
     for link in made.links:
         made.put(link)
-    loops = [made.loop(name) for name in made.joints if name.endswith(LOOP)]
+    loops = [made.loop(name) for name in made.joints if name.endswith(LOOP_JOINT_ENDING)]
     sites = {
         name: (made.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
         for name, node in made.frames.items()
@@ -63,21 +63,22 @@ class _Links:
         self.frames = _named(model, "frame")
         self.joints = _named(model, "joint")
         self.readings = {
-            node.attrib["joint"]: node.attrib for node in model.findall(f"{{{NAMESPACE}}}reading")
+            node.attrib["joint"]: node.attrib
+            for node in model.findall(f"{{{SDF_NAMESPACE}}}reading")
         }
         self.above = {
             _end(node, "child"): name
             for name, node in self.joints.items()
-            if not name.endswith(LOOP)
+            if not name.endswith(LOOP_JOINT_ENDING)
         }
-        self.bodies = [ReadBody(WORLD, 0, np.eye(4), ())]
-        self.numbers = {WORLD: 0}
+        self.bodies = [ReadBody(SDF_WORLD_FRAME, 0, np.eye(4), ())]
+        self.numbers = {SDF_WORLD_FRAME: 0}
         self.known: dict[str, ReadJoint] = {}
         self.key: list[float] = []
 
     def drawn(self, name: str) -> Array:
         """Where a link or a frame is drawn, (4, 4), in the model's frame."""
-        if name in ("", MODEL, WORLD):
+        if name in ("", SDF_READ_MODEL_FRAME, SDF_WORLD_FRAME):
             return np.eye(4)
         if name in self.frames:
             return self.drawn(self.frames[name].attrib["attached_to"]) @ _pose(self.frames[name])
@@ -127,10 +128,10 @@ class _Links:
         ref = 0.0 if told is None else float(told["scale"]) * float(told["home"])
         kind = "slide" if node.attrib["type"] == "prismatic" else "hinge"
         out: list[ReadJoint] = []
-        for tag in AXES.get(node.attrib["type"], ()):
+        for tag in SDF_JOINT_AXES.get(node.attrib["type"], ()):
             xyz = node.find(f"{tag}/xyz")
             axis = np.array([] if xyz is None else (xyz.text or "").split(), dtype=float)
-            if xyz is not None and xyz.get("expressed_in") == MODEL:
+            if xyz is not None and xyz.get("expressed_in") == SDF_READ_MODEL_FRAME:
                 axis = at[:3, :3].T @ axis
             out.append(ReadJoint(name, kind, axis, len(self.key), ref))
             self.key.append(ref)

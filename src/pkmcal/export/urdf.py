@@ -10,10 +10,10 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import Source
+from pkmcal.calibration.source import MachineSource
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
-    COLOURS,
+    BODY_COLOURS,
     NOT_WEIGHED,
     BodyJoint,
     BodyTree,
@@ -24,12 +24,12 @@ from pkmcal.export.bodies import (
     without_masses,
 )
 from pkmcal.export.contract import Difference, Exporter, commented
-from pkmcal.export.markup import comment, document, file_name, numbers
-from pkmcal.export.urdf_read import read
+from pkmcal.export.markup import comment, document, file_name, numbers_text
+from pkmcal.export.urdf_read import read_urdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw, rotation
 from pkmcal.outcome import Finding, Level
 
-REACH = 2.0
+JOINT_LIMIT_ROD_LENGTHS = 2.0
 """Rods' mean lengths about home, of limits that URDF demands and nobody knows."""
 POSE_JOINTS = ("x", "y", "z", "yaw", "pitch", "roll")
 CONVENTIONS = (
@@ -48,12 +48,14 @@ CONVENTIONS = (
     " not known, and slides without a range have {reach:g} of the rods' mean lengths to either side"
     " of home.",
 )
-POSE = (
+FREE_PLATFORM_WORDS = (
     "Their values are its pose: T_base_platform = Trans(platform_x, platform_y, platform_z)"
     " Rz(platform_yaw) Ry(platform_pitch) Rx(platform_roll)."
 )
-RESTRICTED = "They leave it the machine's motion; what holds it so in the machine is not drawn."
-LOOPS = (
+RESTRICTED_PLATFORM_WORDS = (
+    "They leave it the machine's motion; what holds it so in the machine is not drawn."
+)
+LOOPS_FILE_WORDS = (
     "Loops that the URDF beside this cannot hold. frames: the origins of these two links coincide,"
     " or, where coincide is pose, their axes as well.",
     "readings: the joint's value is scale * reading. home: all joints' values where the machine is"
@@ -68,17 +70,17 @@ class UrdfExporter(Exporter):
     name: ClassVar = "urdf"
     title: ClassVar = "URDF (a tree), and the loops that it cannot hold"
 
-    def files(self, source: Source) -> dict[str, str]:
+    def files(self, source: MachineSource) -> dict[str, str]:
         """The tree's text, and the loops'."""
         tree, (name, loops) = body_tree(source.machine), _file_names(source)
         return {name: _urdf(tree, source, loops), loops: _loops(tree, source)}
 
-    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """By the text's own links and joints, its loops closed as the other text says."""
         tree, loops = files.values()
-        return differences(read(tree, loops), source.machine)
+        return differences(read_urdf(tree, loops), source.machine)
 
-    def notes(self, source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """What the tree does not hold."""
         tree, loops = _file_names(source)
         return (
@@ -91,14 +93,14 @@ class UrdfExporter(Exporter):
         )
 
 
-def _file_names(source: Source) -> tuple[str, str]:
+def _file_names(source: MachineSource) -> tuple[str, str]:
     name = file_name(source.machine.name)
     return f"{name}.urdf", f"{name}.loops.yaml"
 
 
-def _urdf(tree: BodyTree, source: Source, loops: str) -> str:
+def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
     root = Element("robot", name=file_name(source.machine.name))
-    for look, rgba in COLOURS.items():
+    for look, rgba in BODY_COLOURS.items():
         SubElement(SubElement(root, "material", name=look), "color", rgba=rgba)
     for body in tree.bodies:
         if body.said:
@@ -114,7 +116,11 @@ def _urdf(tree: BodyTree, source: Source, loops: str) -> str:
             _visual(node, shape)
     for loop in tree.loops:
         _ends(root, loop, tree)
-    told = {"loops": loops, "pose": POSE if tree.platform.free else RESTRICTED, "reach": REACH}
+    told = {
+        "loops": loops,
+        "pose": FREE_PLATFORM_WORDS if tree.platform.free else RESTRICTED_PLATFORM_WORDS,
+        "reach": JOINT_LIMIT_ROD_LENGTHS,
+    }
     return document(root, source, [line.format(**told) for line in CONVENTIONS])
 
 
@@ -159,18 +165,20 @@ def _joint(
         kind = "prismatic" if joint.kind == "slide" else turns
     name = f"{links[1]}_fixed" if joint is None else joint.name
     out = SubElement(root, "joint", name=name, type=kind)
-    SubElement(out, "origin", xyz=numbers(T[:3, 3]), rpy=numbers(roll_pitch_yaw(T[:3, :3])))
+    SubElement(
+        out, "origin", xyz=numbers_text(T[:3, 3]), rpy=numbers_text(roll_pitch_yaw(T[:3, :3]))
+    )
     SubElement(out, "parent", link=links[0])
     SubElement(out, "child", link=links[1])
     if joint is not None:
-        SubElement(out, "axis", xyz=numbers(joint.axis))
+        SubElement(out, "axis", xyz=numbers_text(joint.axis))
     if limits is not None:
-        low, high = (numbers(limit) for limit in limits)
+        low, high = (numbers_text(limit) for limit in limits)
         SubElement(out, "limit", lower=low, upper=high, effort="0", velocity="0")
     for coupling in tree.couplings:
         if joint is not None and coupling.follower == joint.name:
             values = {j.name: j.value for body in tree.bodies for j in body.joints}
-            offset = numbers(values[coupling.follower] + values[coupling.leader])
+            offset = numbers_text(values[coupling.follower] + values[coupling.leader])
             SubElement(out, "mimic", joint=coupling.leader, multiplier="-1", offset=offset)
 
 
@@ -183,7 +191,7 @@ def _limits(joint: BodyJoint | None, tree: BodyTree) -> Array | None:
         if np.isfinite(known).all():
             return np.sort(known)
     if joint.kind == "slide":
-        return joint.value + REACH * tree.home.size * np.array([-1.0, 1.0])
+        return joint.value + JOINT_LIMIT_ROD_LENGTHS * tree.home.size * np.array([-1.0, 1.0])
     return None
 
 
@@ -216,16 +224,16 @@ def _visual(link: Element, shape: RoundBar) -> None:
     if shape.name:
         out.set("name", shape.name)
     middle, length, turned = shape.drawn
-    SubElement(out, "origin", xyz=numbers(middle), rpy=numbers(turned))
-    geometry, radius = SubElement(out, "geometry"), numbers(shape.radius)
+    SubElement(out, "origin", xyz=numbers_text(middle), rpy=numbers_text(turned))
+    geometry, radius = SubElement(out, "geometry"), numbers_text(shape.radius)
     if shape.stop is None:
         SubElement(geometry, "sphere", radius=radius)
     else:
-        SubElement(geometry, "cylinder", radius=radius, length=numbers(length))
+        SubElement(geometry, "cylinder", radius=radius, length=numbers_text(length))
     SubElement(out, "material", name=shape.look)
 
 
-def _loops(tree: BodyTree, source: Source) -> str:
+def _loops(tree: BodyTree, source: MachineSource) -> str:
     home = tree.home
     following = {coupling.follower for coupling in tree.couplings}
     joints = [joint for body in tree.bodies for _, joint, _ in _steps(body) if joint is not None]
@@ -247,4 +255,4 @@ def _loops(tree: BodyTree, source: Source) -> str:
         "home": values,
     }
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=96)
-    return commented(source.header(*LOOPS), "#") + text
+    return commented(source.header(*LOOPS_FILE_WORDS), "#") + text

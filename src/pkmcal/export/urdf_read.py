@@ -13,10 +13,10 @@ from pkmcal.arrays import Array
 from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, pose
 
-KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
+URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
 
-def read(text: str, loops: str) -> ReadModel:
+def read_urdf(text: str, loops: str) -> ReadModel:
     """The model of a URDF and of the text that tells its loops."""
     root, beside = fromstring(text), yaml.safe_load(loops)
     found = {node.attrib["name"]: node for node in root.findall("link")}
@@ -36,7 +36,7 @@ def read(text: str, loops: str) -> ReadModel:
             parent, own = put(_link(node, "parent")), tuple[ReadJoint, ...]()
             if node.attrib["type"] != "fixed":
                 axis = _vector(node.find("axis"), "xyz", "1 0 0")
-                name, kind = node.attrib["name"], KINDS[node.attrib["type"]]
+                name, kind = node.attrib["name"], URDF_JOINT_KINDS[node.attrib["type"]]
                 joints[name] = ReadJoint(name, kind, axis, len(joints), 0.0)
                 own = (joints[name],)
             bodies.append(ReadBody(link, parent, _place(node), own))

@@ -7,8 +7,8 @@ from pkmcal.files.documents import (
     closest,
     field_path,
     json_text,
+    json_value,
     parse_yaml,
-    plain,
     read_json,
     read_text,
     read_yaml,
@@ -18,9 +18,9 @@ from pkmcal.files.documents import (
 )
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
-from pkmcal.files.headers import ENDINGS, stated_size
+from pkmcal.files.headers import IMAGE_FILE_ENDINGS, stated_size
 from pkmcal.files.quantities import (
-    TOO_LARGE,
+    LARGEST_UNITLESS_LENGTH,
     Metres,
     Point,
     Radians,
@@ -28,18 +28,18 @@ from pkmcal.files.quantities import (
     Share,
     any_unit,
     no_such,
-    with_unit,
+    written_unit,
 )
 from pkmcal.files.regular import check_regular
-from pkmcal.files.schema import Schema, validate
+from pkmcal.files.schema import Schema, validated_document
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
     alone_in,
     check_own_folder,
     check_writable,
     entries,
+    finish_replacement,
     remove_folder,
-    settle,
     staged_file,
     staged_folder,
     write_bytes,
@@ -48,8 +48,8 @@ from pkmcal.files.writing import (
 )
 
 __all__ = [
-    "ENDINGS",
-    "TOO_LARGE",
+    "IMAGE_FILE_ENDINGS",
+    "LARGEST_UNITLESS_LENGTH",
     "CsvTable",
     "Document",
     "Exif",
@@ -69,10 +69,11 @@ __all__ = [
     "csv_text",
     "entries",
     "field_path",
+    "finish_replacement",
     "json_text",
+    "json_value",
     "no_such",
     "parse_yaml",
-    "plain",
     "read_csv",
     "read_exif",
     "read_json",
@@ -81,18 +82,17 @@ __all__ = [
     "remember",
     "remembered",
     "remove_folder",
-    "settle",
     "shown",
     "staged_file",
     "staged_folder",
     "stated_size",
-    "validate",
+    "validated_document",
     "wanted_file",
     "with_exif",
     "with_numbers",
-    "with_unit",
     "write_bytes",
     "write_folder",
     "write_text",
+    "written_unit",
     "yaml_text",
 ]

@@ -16,14 +16,14 @@ import yaml
 
 from pkmcal.errors import InputError
 from pkmcal.files.regular import check_regular
-from pkmcal.files.writing import settle
+from pkmcal.files.writing import finish_replacement
 
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
 one line."""
 SHORTEST_PART = 4
 """Letters from which on a part of a name stands for the whole."""
-BLOCK = 2**20
+TEXT_BLOCK_BYTES = 2**20
 """Bytes of a text that are in memory at a time where it is read line by line."""
 
 
@@ -36,8 +36,8 @@ def read_text(path: Path, label: str | None = None) -> str:
 
 
 def text_blocks(path: Path, label: str) -> Iterator[str]:
-    """The same in blocks of whole lines, some BLOCK bytes each: of a table of many megabytes no
-    more has to be in memory.
+    """The same in blocks of whole lines, some TEXT_BLOCK_BYTES bytes each: of a table of many
+    megabytes no more has to be in memory.
     """
     lines, mark = 0, "\ufeff"
     for raw in _raw_blocks(path, label):
@@ -48,11 +48,11 @@ def text_blocks(path: Path, label: str) -> Iterator[str]:
 def _raw_blocks(path: Path, label: str) -> Iterator[bytes]:
     """A file's bytes, cut behind line ends of any kind."""
     try:
-        settle(path.parent)
+        finish_replacement(path.parent)
         check_regular(path, label)
         with path.open("rb") as stream:
             rest: list[bytes] = []
-            while block := stream.read(BLOCK):
+            while block := stream.read(TEXT_BLOCK_BYTES):
                 # a carriage return at the end may be half of a line end
                 end = max(block.rfind(b"\n"), block.rfind(b"\r", 0, -1)) + 1
                 if end:
@@ -135,10 +135,10 @@ MOST_VALUES = 200_000
 from one short line, and would fill the memory."""
 MOST_CHARACTERS = 10_000_000
 """The same of their texts."""
-DEEPEST = 50
+MOST_NESTED_LEVELS = 50
 """Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
 at two hundred or so."""
-LARGEST = 1e15
+LARGEST_WRITTEN_NUMBER = 1e15
 """Of a number that a person writes, whatever its unit; what is computed with larger ones, to the
 fourth power and further, would overflow."""
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
@@ -252,9 +252,10 @@ def _checked(document: Document) -> Document:
     todo: list[tuple[Keys, Any]] = [((), document.data)]
     while todo:
         keys, value = todo.pop()
-        if len(keys) > DEEPEST:
+        if len(keys) > MOST_NESTED_LEVELS:
             raise InputError(
-                f"nested too deeply, in more than {DEEPEST} levels", where=document.where(*keys)
+                f"nested too deeply, in more than {MOST_NESTED_LEVELS} levels",
+                where=document.where(*keys),
             )
         if isinstance(value, str):
             _check_characters(document, keys, value)
@@ -300,9 +301,9 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.depth == 1:
             self.top = getattr(index, "value", "")
-        if self.depth > DEEPEST:
+        if self.depth > MOST_NESTED_LEVELS:
             mark = self.peek_event().start_mark
-            what = f"{self.top} is nested too deeply, in more than {DEEPEST} levels"
+            what = f"{self.top} is nested too deeply, in more than {MOST_NESTED_LEVELS} levels"
             raise yaml.MarkedYAMLError(problem=what, problem_mark=mark)
         self.depth += 1
         try:
@@ -354,8 +355,10 @@ class _Builder:
         """Plain data of a node that stands at `keys`."""
         self.lines.setdefault(keys, node.start_mark.line + 1)
         self._count_up(node)
-        if len(keys) > DEEPEST:
-            raise self._error(node, f"nested too deeply, in more than {DEEPEST} levels", keys)
+        if len(keys) > MOST_NESTED_LEVELS:
+            raise self._error(
+                node, f"nested too deeply, in more than {MOST_NESTED_LEVELS} levels", keys
+            )
         self._open.add(id(node))
         try:
             if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
@@ -436,27 +439,29 @@ _WIDEST = 160
 """Characters up to which a list or an object stays on one line."""
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
     if value is None or isinstance(value, str | int):  # most values; of Python's own types
         return value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
-        return value.tolist() if known and value.dtype.kind in "fiub" else plain(value.tolist())
+        return (
+            value.tolist() if known and value.dtype.kind in "fiub" else json_value(value.tolist())
+        )
     if isinstance(value, (list, tuple)):
         if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
             return list(value)  # a row of a matrix: most numbers stand in one
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
 def json_text(value: Any) -> str:
     """Plain data as JSON text; short parts and rows of numbers stay on one line each."""
-    return _text(plain(value), "") + "\n"
+    return _text(json_value(value), "") + "\n"
 
 
 def _text(value: Any, indent: str) -> str:

@@ -16,7 +16,7 @@ import yaml
 from pkmcal.errors import InputError
 from pkmcal.files.documents import Document, compose_yaml, parse_yaml
 
-INDENT = 2
+MAPPING_INDENT = 2
 """Columns by which a new mapping stands in its parent."""
 
 
@@ -128,7 +128,7 @@ class _Edit:
         indent = " " * parent.value[0][0].start_mark.column
         lines = [f"{indent}{name}: {inner}"]
         if isinstance(value, Mapping):
-            deeper = indent + " " * INDENT
+            deeper = indent + " " * MAPPING_INDENT
             rows = [f"{deeper}{each}: {_row(numbers)}" for each, numbers in value.items()]
             lines = [f"{indent}{name}:", *rows]
         eol = "\r\n" if "\r\n" in self.text else "\n"

@@ -8,7 +8,7 @@ import re
 import zlib
 from typing import BinaryIO, Literal
 
-ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"})
+IMAGE_FILE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"})
 """Of these files' names, in lower case."""
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
@@ -23,7 +23,7 @@ _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SHORT = 256, 257, 3
 _PNM = re.compile(rb"P[2356]\s+(?:#.*\s+)*(\d{1,9})\s+(?:#.*\s+)*(\d{1,9})\s")
 _LONGEST_PNM = 1000
 """Bytes in which a PGM file's size stands, remarks before it included."""
-DEFLATED = 1032
+MOST_DEFLATE_EXPANSION = 1032
 """Bytes that one byte of PNG's compression can stand for at most (RFC 1951: 258 in two bits); those
 of TIFF reach less."""
 JPEG_BLOCK = 64
@@ -63,7 +63,7 @@ def _png(start: bytes) -> _Stated:
     if not header.startswith(b"IHDR") or zlib.crc32(header) != int.from_bytes(check):
         return 0, 0, 0.0
     bits = header[12] * _PNG_CHANNELS.get(header[13], 1)
-    return *_pair(header[4:8], header[8:12]), 8 * DEFLATED / max(bits, 1)
+    return *_pair(header[4:8], header[8:12]), 8 * MOST_DEFLATE_EXPANSION / max(bits, 1)
 
 
 def _jpeg(stream: BinaryIO) -> _Stated:
@@ -107,7 +107,7 @@ def _tiff(stream: BinaryIO, order: Literal["little", "big"]) -> _Stated:
             break
         size = 2 if number(entry[2:4]) == _TIFF_SHORT else 4
         found[number(entry[:2])] = number(entry[8 : 8 + size])
-    return found.get(_TIFF_WIDTH, 0), found.get(_TIFF_HEIGHT, 0), 8.0 * DEFLATED
+    return found.get(_TIFF_WIDTH, 0), found.get(_TIFF_HEIGHT, 0), 8.0 * MOST_DEFLATE_EXPANSION
 
 
 def _pair(width: bytes, height: bytes) -> tuple[int, int]:

@@ -16,11 +16,11 @@ from pydantic import BeforeValidator
 
 from pkmcal.files.documents import shown
 
-TOO_LARGE = 50.0
+LARGEST_UNITLESS_LENGTH = 50.0
 """m; a machine or a camera's place without a unit that is larger was written in millimetres."""
 _QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})")
 _HEAD = re.compile(r"(.*\S)\s*(?:\[([A-Za-zµμ°%]{1,20})\]|\(([A-Za-zµμ°%]{1,20})\))")
-SHARES = ("%", "percent", "ppm")
+SHARE_UNIT_NAMES = ("%", "percent", "ppm")
 _ROOTS = {"meter": "m", "radian": "rad", "dimensionless": ""}
 _KINDS = {
     "m": ("a length", "metres", "269.3 mm"),
@@ -48,7 +48,7 @@ def unit(name: str) -> Unit | None:
         return None
     kind = _ROOTS.get(str(root))
     # without a dimension there are decibels and pi, too
-    if kind is None or (kind == "" and name not in SHARES):
+    if kind is None or (kind == "" and name not in SHARE_UNIT_NAMES):
         return None
     return Unit(float(factor), kind)
 
@@ -60,7 +60,7 @@ def _registry() -> Any:
     return pint.UnitRegistry()
 
 
-def with_unit(value: object) -> Unit | None:
+def written_unit(value: object) -> Unit | None:
     """The unit with which a file's value is written, or None."""
     found = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
     return unit(found[2]) if found else None
@@ -70,7 +70,7 @@ def any_unit(data: object) -> bool:
     """Whether any value of a file's content is written with its unit."""
     if isinstance(data, (dict, list)):
         return any(map(any_unit, data.values() if isinstance(data, dict) else data))
-    return with_unit(data) is not None
+    return written_unit(data) is not None
 
 
 def split_head(head: str) -> tuple[str, Unit | None]:

@@ -11,12 +11,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
-from pkmcal.files.documents import LARGEST, Document, Keys, closest, shown
+from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, Document, Keys, closest, shown
 from pkmcal.wording import listed
 
 JsonSchema = Mapping[str, Any]
 LONGEST_REPR = 200
-Model = TypeVar("Model", bound=BaseModel)
+SchemaModel = TypeVar("SchemaModel", bound=BaseModel)
 
 
 class Schema(BaseModel):
@@ -33,7 +33,7 @@ class Schema(BaseModel):
         return text if len(text) <= LONGEST_REPR else f"{text[: LONGEST_REPR - 1]}…"
 
 
-def validate(document: Document, model: type[Model]) -> Model:
+def validated_document(document: Document, model: type[SchemaModel]) -> SchemaModel:
     """Return the document as a `model`, or raise one `InputError` about everything wrong in it.
 
     The first fault in the file's order makes the sentence; the others are named after it, so that
@@ -74,12 +74,12 @@ def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
             todo += [((*keys, str(key)), item) for key, item in value.items()]
         elif isinstance(value, (list, tuple)):
             todo += [((*keys, k), item) for k, item in enumerate(value)]
-        elif isinstance(value, int | float) and abs(value) > LARGEST:
+        elif isinstance(value, int | float) and abs(value) > LARGEST_WRITTEN_NUMBER:
             raise InputError(
                 "this number is too large for any quantity",
                 where=document.where(*keys),
                 found=shown(value),
-                expected=f"at most {LARGEST:g}",
+                expected=f"at most {LARGEST_WRITTEN_NUMBER:g}",
             )
 
 

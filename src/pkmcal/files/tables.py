@@ -16,11 +16,11 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
-from pkmcal.files.documents import LARGEST, closest, shown, text_blocks
+from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, closest, shown, text_blocks
 from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
 
-KEY = "configuration"
+CONFIGURATION_COLUMN = "configuration"
 """The first column's name."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
@@ -73,7 +73,7 @@ def read_csv(
     columns: Sequence[str] | None = None,
     label: str | None = None,
 ) -> CsvTable:
-    """Read a table whose header is KEY and then one name a number column.
+    """Read a table whose header is CONFIGURATION_COLUMN and then one name a number column.
 
     columns : the only names allowed, all of them needed, in any order; None takes what is there.
     Values come back in the file's own order of columns. A byte-order mark, any line ends, empty
@@ -85,7 +85,9 @@ def read_csv(
     rows = _rows(text, label)
     header_line, header = next(rows, (0, None))
     if header is None:
-        raise InputError("the file is empty", where=label, expected=f"a header: {KEY},…")
+        raise InputError(
+            "the file is empty", where=label, expected=f"a header: {CONFIGURATION_COLUMN},…"
+        )
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
     _check_header(header, columns, f"{label}, line {header_line}")
@@ -101,7 +103,7 @@ def read_csv(
             _check_length([name], f"{label}, line {line}")
         if (first := lines.setdefault(name, line)) != line:
             raise InputError(
-                f"the {KEY} {name} stands twice, on lines {first} and {line}",
+                f"the {CONFIGURATION_COLUMN} {name} stands twice, on lines {first} and {line}",
                 where=f"{label}, line {line}",
                 next_step="Give each row its own name, or remove one of the two",
             )
@@ -117,7 +119,7 @@ def csv_text(columns: Sequence[str], names: Sequence[str], values: Array) -> str
     """Write a table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([KEY, *columns])
+    writer.writerow([CONFIGURATION_COLUMN, *columns])
     rows = np.asarray(values, dtype=float).reshape(len(names), len(columns)).tolist()
     writer.writerows([name, *map(repr, row)] for name, row in zip(names, rows, strict=True))
     return stream.getvalue()
@@ -152,13 +154,13 @@ def _check_header(header: list[str], columns: Sequence[str] | None, where: str) 
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
             )
-    if header[0] != KEY:
+    if header[0] != CONFIGURATION_COLUMN:
         raise InputError(
             "the header's first column has another name" if len(header) > 1 else "no header",
             where=where,
             found=shown(header[0]),
-            expected=KEY,
-            next_step=f"Begin the file with the line {KEY},<one column a number>",
+            expected=CONFIGURATION_COLUMN,
+            next_step=f"Begin the file with the line {CONFIGURATION_COLUMN},<one column a number>",
         )
     _check_length(header, where)
     if "" in header:
@@ -168,7 +170,7 @@ def _check_header(header: list[str], columns: Sequence[str] | None, where: str) 
     if twice:
         raise InputError(f"the header names {listed(twice)} twice", where=where)
     if len(header) == 1:
-        raise InputError("there is no column of numbers", where=where, found=KEY)
+        raise InputError("there is no column of numbers", where=where, found=CONFIGURATION_COLUMN)
     if columns is not None:
         _check_columns(header[1:], columns, where)
 
@@ -198,7 +200,7 @@ def _quickly(cells: list[str]) -> list[float] | None:
         numbers = list(map(float, cells[1:]))
     except ValueError:
         return None
-    return numbers if max(map(abs, numbers), default=0.0) <= LARGEST else None
+    return numbers if max(map(abs, numbers), default=0.0) <= LARGEST_WRITTEN_NUMBER else None
 
 
 def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
@@ -227,10 +229,13 @@ def _number(cell: str, where: str) -> float:
             next_step="Leave the whole row out if the reading was not taken",
         )
     value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
-    if abs(value) <= LARGEST:
+    if abs(value) <= LARGEST_WRITTEN_NUMBER:
         return value
     if math.isfinite(value):
-        what, expected = "this number is too large for any quantity", f"at most {LARGEST:g}"
+        what, expected = (
+            "this number is too large for any quantity",
+            f"at most {LARGEST_WRITTEN_NUMBER:g}",
+        )
     elif _NOT_FINITE.fullmatch(cell) or math.isinf(value):
         what, expected = "this is not a finite number", "a number"
     elif _NUMBER.fullmatch(cell.replace(",", ".")):

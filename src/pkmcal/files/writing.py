@@ -19,14 +19,14 @@ from typing import BinaryIO
 from pkmcal.errors import InputError
 from pkmcal.wording import listed
 
-COMMITTED = ".pkmcal-replacing"
+COMMITTED_FOLDER = ".pkmcal-replacing"
 """Inside a folder: all that was written for it, complete, on the way to its place."""
-STAGE, PROBE = "stage", "probe"
+WRITING_STAGE_NAME, WRITING_PROBE_NAME = "stage", "probe"
 _NEW, _GONE = "new", "gone"
 """In a stage: the files as they will stand, and empty ones that name those which go."""
 _HELD = "held"
 """In a stage, beside them: a file that its process has locked for as long as it lives."""
-LOCK = "lock"
+FOLDER_LOCK_FILE = "lock"
 """An empty file in a folder in which one process at a time works; it stays there."""
 _LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
 """Names of `_beside`."""
@@ -47,7 +47,7 @@ def check_writable(folder: Path | str) -> None:
             "outputs cannot go here", where=str(folder), found=f"{standing} is a file",
             expected="a folder",
         )  # fmt: skip
-    probe = _beside(standing / PROBE)
+    probe = _beside(standing / WRITING_PROBE_NAME)
     try:
         probe.mkdir()
         probe.rmdir()
@@ -84,7 +84,7 @@ def entries(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         return []
-    settle(folder)
+    finish_replacement(folder)
     return sorted(e.name for e in folder.iterdir() if not _LEFT_OVER.fullmatch(e.name))
 
 
@@ -136,15 +136,16 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
 
     over : names of files in `folder` that go, unless they were written again. Others stay.
     A new folder appears in one step. What is to go into one that is there already is put into it
-    under the name COMMITTED, in one step, and moved to its place from there. A run that is killed
-    leaves the old files before that step, and after it COMMITTED, from which `settle` goes on: the
-    next time that anything here is read or written. On an error nothing changes.
+    under the name COMMITTED_FOLDER, in one step, and moved to its place from there. A run that is
+    killed leaves the old files before that step, and after it COMMITTED_FOLDER, from which
+    `finish_replacement` goes on: the next time that anything here is read or written. On an error
+    nothing changes.
     """
     folder = Path(folder)
     check_writable(folder)
-    settle(folder)
+    finish_replacement(folder)
     # Inside a folder that exists, because that may be a mount of its own, where moves would copy.
-    stage = _beside(folder / STAGE) if folder.is_dir() else _beside(folder)
+    stage = _beside(folder / WRITING_STAGE_NAME) if folder.is_dir() else _beside(folder)
     new, gone = stage / _NEW, stage / _GONE
     for place in {stage.parent, folder.parent}:
         _clear_abandoned(place)
@@ -164,8 +165,8 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
                     (gone / name).touch()
             held.close()
             (stage / _HELD).unlink()
-            stage.replace(folder / COMMITTED)
-            settle(folder)
+            stage.replace(folder / COMMITTED_FOLDER)
+            finish_replacement(folder)
         else:
             new.replace(folder)
         _sweep(folder)
@@ -185,7 +186,7 @@ def alone_in(folder: Path, what: str) -> Generator[None]:
     """
     check_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK).open("ab") as stream:
+    with (folder / FOLDER_LOCK_FILE).open("ab") as stream:
         if _lock(stream.fileno()) is False:
             raise InputError(
                 f"another {what} works in this folder",
@@ -202,13 +203,13 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(left)
 
 
-def settle(folder: Path) -> None:
+def finish_replacement(folder: Path) -> None:
     """Finish a replacement of files in `folder` in which a run was killed, if there is one.
 
     Several processes may do so at once, and it may be killed as well: what is moved is moved.
     Raises `InputError` where that is not allowed here.
     """
-    committed = folder / COMMITTED
+    committed = folder / COMMITTED_FOLDER
     if not committed.is_dir():
         return
     new, gone = committed / _NEW, committed / _GONE
@@ -225,7 +226,7 @@ def settle(folder: Path) -> None:
         raise InputError(
             f"new files cannot be moved to their place ({error.strerror or error})",
             where=str(folder),
-            found=f"what a run that was cut short left in {COMMITTED}",
+            found=f"what a run that was cut short left in {COMMITTED_FOLDER}",
             next_step="Close programs that hold these files, make the folder writable, and run"
             " this again",
         ) from None
@@ -261,7 +262,10 @@ def _sweep(folder: Path) -> None:
     """Remove what runs that were killed left of their attempts; of two that work at once, the
     first to finish wins.
     """
-    for place, names in ((folder, (STAGE, PROBE)), (folder.parent, (folder.name, PROBE))):
+    for place, names in (
+        (folder, (WRITING_STAGE_NAME, WRITING_PROBE_NAME)),
+        (folder.parent, (folder.name, WRITING_PROBE_NAME)),
+    ):
         for path in list(place.iterdir()):
             left = _LEFT_OVER.fullmatch(path.name)
             if left and left["name"] in names and path.is_dir():

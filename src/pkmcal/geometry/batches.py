@@ -13,13 +13,14 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, skew
 
-WORTH = 16
+POSES_WORTH_BATCH_LAST = 16
 """Poses from which on the other order of memory pays."""
-FEW = 100
+NUMBERS_WORTH_CALLS = 100
 """Numbers below which calls cost more than arithmetic."""
-NEXT = ((1, 2), (2, 0), (0, 1))
-TURNING = -skew(np.eye(3))
-"""The cross product's signs: ``(a x b)_i`` is the sum of ``TURNING[i, j, k] a_j b_k``."""
+CYCLIC_PAIRS = ((1, 2), (2, 0), (0, 1))
+CROSS_PRODUCT_SIGNS = -skew(np.eye(3))
+"""The cross product's signs: ``(a x b)_i`` is the sum of ``CROSS_PRODUCT_SIGNS[i, j, k] a_j
+b_k``."""
 
 
 def batch_last(array: Array) -> Array:
@@ -72,10 +73,10 @@ def turned(rot: Array, p: Array) -> Array:
 
 def moments(arm: Array, w: Array, out: Array) -> None:
     """Writes arm x w, (..., 3) each, into ``out``, an array like w."""
-    if out.size < FEW:  # one call then takes less time than nine
-        np.einsum("ijk,...j,...k->...i", TURNING, arm, w, out=out)
+    if out.size < NUMBERS_WORTH_CALLS:  # one call then takes less time than nine
+        np.einsum("ijk,...j,...k->...i", CROSS_PRODUCT_SIGNS, arm, w, out=out)
         return
-    for k, (i, j) in enumerate(NEXT):
+    for k, (i, j) in enumerate(CYCLIC_PAIRS):
         np.multiply(arm[..., i], w[..., j], out=out[..., k])
         out[..., k] -= arm[..., j] * w[..., i]
 
@@ -108,7 +109,7 @@ def stepped(poses: Array, delta: Array) -> Array:
 def _crossed(w: Array, matrix: Array) -> Array:
     """Each column of matrices (n, 3, 3) under w (n, 3) x."""
     out = np.empty_like(matrix)
-    for k, (i, j) in enumerate(NEXT):
+    for k, (i, j) in enumerate(CYCLIC_PAIRS):
         np.multiply(w[:, i, None], matrix[:, j], out=out[:, k])
         out[:, k] -= w[:, j, None] * matrix[:, i]
     return out

@@ -15,7 +15,7 @@ from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import ALIKE, BREATHING_SIGMA, SHADING_SIGMA, Measurements
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_ALIKE_ANGLE, SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -23,7 +23,7 @@ SHIFT_SIGMA = 0.3
 LEVEL_SIGMA = 1e-6
 """rad, of a bed that is level by definition: a tenth of a micrometre over a printer's bed."""
 
-Numbers = TypeVar("Numbers", Array, Integers)
+FilledNumbers = TypeVar("FilledNumbers", Array, Integers)
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Places:
     place: Integers
     shape: tuple[int, int]
 
-    def filled(self, values: Numbers) -> Numbers:
+    def filled(self, values: FilledNumbers) -> FilledNumbers:
         """Values (N, ...) at their places, (K', G, ...); zero where there is none."""
         count, each = self.shape
         out = np.zeros((count * each, *values.shape[1:]), dtype=values.dtype)
         out[self.row * each + self.place] = values
-        return cast(Numbers, out.reshape(*self.shape, *values.shape[1:]))
+        return cast(FilledNumbers, out.reshape(*self.shape, *values.shape[1:]))
 
     def taken(self, values: Array) -> Array:
         """Of values (K', G, ...) those at the measurements' places, (N, ...)."""
@@ -206,14 +206,15 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
 
 def crowd(measurements: Measurements, number: Integers) -> Array:
     """How many edges of its line share an edge's own shading, itself among them, (N,): the sum of
-    exp(-angle / ALIKE) over the angles between the normals. number : (N,) of each edge's line.
+    exp(-angle / SHADING_ALIKE_ANGLE) over the angles between the normals. number : (N,) of each
+    edge's line.
 
     Of n edges with the same normal each counts as one n-th, whatever their number. Normals are
-    gathered in cells an eighth of ALIKE wide first, so that thousands cost little.
+    gathered in cells an eighth of SHADING_ALIKE_ANGLE wide first, so that thousands cost little.
     """
     edges = measurements.edges
     out = np.ones(len(edges))
-    cell = np.round(8 * edges.normal / ALIKE).astype(int)
+    cell = np.round(8 * edges.normal / SHADING_ALIKE_ANGLE).astype(int)
     keys, at = np.unique(np.column_stack([number, cell]), axis=0, return_inverse=True)
     at = at.reshape(-1)
     count = np.bincount(at)
@@ -223,7 +224,7 @@ def crowd(measurements: Measurements, number: Integers) -> Array:
     many = np.ones(len(count))
     for start, end in pairwise(first.tolist()):
         angle = np.arccos(np.clip(middle[start:end] @ middle[start:end].T, -1, 1))
-        many[start:end] = np.exp(-angle / ALIKE) @ count[start:end]
+        many[start:end] = np.exp(-angle / SHADING_ALIKE_ANGLE) @ count[start:end]
     return np.where(number >= 0, many[at], out)
 
 

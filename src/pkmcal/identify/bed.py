@@ -19,17 +19,17 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.solver.elimination import stacked
+from pkmcal.solver.elimination import rows_on_shared
 
-POINTS = 60
+PLACES_OVER_BED = 60
 """Places all over the bed: where nobody probed counts as well."""
-NOTICED = 4.13
+NOTICED_TOUCH_DEVIATIONS = 4.13
 """Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
 right touch in a thousand seems to be, and four wrong ones in five are found (W. Baarda, A testing
 procedure for use in geodetic networks, 1968)."""
-EXACT = 1e-9
+BED_ROUNDING_SHARE = 1e-9
 """Share of what a parameter does below which it is rounding."""
-GOLDEN = np.pi * (3 - np.sqrt(5))
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 """Turn from one place to the next on a spiral that covers a disc evenly."""
 
 
@@ -98,10 +98,12 @@ def _over_the_disc(probed: Array) -> Array:
     middle = xy.mean(axis=0)
     plane = np.column_stack([np.ones(len(xy)), xy])
     height = np.linalg.lstsq(plane, probed[:, 2, 3], rcond=None)[0]
-    k = np.arange(POINTS)
-    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / POINTS)
-    places = middle + r[:, None] * np.stack([np.cos(GOLDEN * k), np.sin(GOLDEN * k)], axis=1)
-    out = np.repeat(probed[:1], POINTS, axis=0)
+    k = np.arange(PLACES_OVER_BED)
+    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / PLACES_OVER_BED)
+    places = middle + r[:, None] * np.stack(
+        [np.cos(GOLDEN_ANGLE * k), np.sin(GOLDEN_ANGLE * k)], axis=1
+    )
+    out = np.repeat(probed[:1], PLACES_OVER_BED, axis=0)
     out[:, :2, 3] = places
     out[:, 2, 3] = height[0] + places @ height[1:]
     return out
@@ -124,10 +126,12 @@ def _drawing_root(machine: Machine, by: Array) -> Array:
     free, wide = (t.free_matrix() * t.tolerances_free() for t in (table, everything))
     by = by.reshape(-1, by.shape[-1])
     u, s, _ = np.linalg.svd(by @ free, full_matrices=False)
-    u = u[:, s > EXACT * s[0]]
+    u = u[:, s > BED_ROUNDING_SHARE * s[0]]
     moved = by @ wide
     own = np.linalg.norm(moved - u @ (u.T @ moved), axis=0)
-    return np.column_stack([free, wide[:, own > EXACT * np.linalg.norm(moved, axis=0)]])
+    return np.column_stack(
+        [free, wide[:, own > BED_ROUNDING_SHARE * np.linalg.norm(moved, axis=0)]]
+    )
 
 
 def _wider(measurements: Measurements, estimate: Estimate, drawing: Array) -> tuple[Array, Array]:
@@ -151,10 +155,12 @@ def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) ->
     """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
     _, info = as_ended(measurements, estimate)
     problem, state = info.problem, info.state
-    rows = stacked(info.linear, info.reduced)[0][0]
+    rows = rows_on_shared(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=EXACT, hermitian=True)
+    inverse = np.linalg.pinv(
+        (rows / scale).T @ (rows / scale), rcond=BED_ROUNDING_SHARE, hermitian=True
+    )
     inverse /= scale[:, None] * scale
     own = rows[: len(rows) - len(problem.prior)]
     # all that a configuration says, its pose aside, is one number: what was felt there
@@ -162,10 +168,10 @@ def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) ->
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
     left = 1 - np.sum(gain * felt, axis=1)
-    if left.min() < EXACT:
+    if left.min() < BED_ROUNDING_SHARE:
         return None
     moved = height @ problem.free @ gain[:, problem.unknowns.machine].T
-    return float(np.max(NOTICED * np.sqrt(np.mean(moved**2, axis=0) / left)))
+    return float(np.max(NOTICED_TOUCH_DEVIATIONS * np.sqrt(np.mean(moved**2, axis=0) / left)))
 
 
 def _deviation(rows: Array, off: Array, root: Array, places: int) -> float:

@@ -23,8 +23,14 @@ from pkmcal.identify.covariance import (
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
-from pkmcal.identify.kinds import EDGES, POSES, READINGS
-from pkmcal.identify.noise import FEWEST, STEP, Components, components, counts
+from pkmcal.identify.kinds import EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.noise import (
+    LARGEST_NOISE_STEP,
+    LEAST_NOISE_FREEDOM,
+    Components,
+    components,
+    counts,
+)
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, norms, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -38,15 +44,15 @@ LEAST_SCALE = 1.0
 """The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
 What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
 smaller than errors are: scaling down by them would promise too much."""
-NEARLY = 1e-3
+NEARLY_SOLVED_DISTANCE = 1e-3
 """Standard deviations, of all fitted values together, that a round's solution may have left to go,
 mostly after two steps: far less than the next round's weights and deviations change. Only where
 these have settled is it brought to its end."""
-ROUNDS = 30
-PACE, PACED = 1.6, 2
+MOST_BUNDLE_ROUNDS = 30
+SCATTER_PACE, FIRST_PACED_ROUND = 1.6, 2
 """A round of weights, deviations and solution brings the deviations of shading and of the edges a
 part of the way only; from this one on, as they go on as they began, they go by so much further."""
-FURTHEST, MOST = 3.0, 0.99 * float(np.log(STEP))
+FURTHEST_NOISE_PACE, UNCUT_NOISE_LOG_STEP = 3.0, 0.99 * float(np.log(LARGEST_NOISE_STEP))
 """The same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
 how far it goes: at most by how much further, and the logarithm of a step that was not cut short."""
 FREE_ROUNDS = 6
@@ -57,10 +63,10 @@ SCALE_CHANGE = 1e-3
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found; and of the edges'
 noise."""
-FREEDOM = 4.0
+SHADING_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
 some five deviations off, and costs clean ones little."""
-WEIGHINGS = 5
+SHADING_WEIGHINGS = 5
 """Rounds of weights and their common deviation, before the next solution."""
 
 
@@ -164,7 +170,7 @@ def _settle(
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
     asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     nearly = False
-    for number in range(ROUNDS):
+    for number in range(MOST_BUNDLE_ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, trust = fit.scale, fit.edges, fit.trust
         if scale_noise:
@@ -177,9 +183,9 @@ def _settle(
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
-        if number >= PACED:
+        if number >= FIRST_PACED_ROUND:
             shading = np.maximum(
-                problem.data.shading * (shading / problem.data.shading) ** PACE, least
+                problem.data.shading * (shading / problem.data.shading) ** SCATTER_PACE, least
             )
         if robust:
             rows = problem.unweighted(state)
@@ -201,7 +207,9 @@ def _settle(
             problem = problem.shaded(shading)
         problem = replace(problem, joint_noise=readings)
         steps = fit.solution.steps
-        fit = _solved(problem, state, weight, scale, steps, edges, trust, fit.stated, NEARLY)
+        fit = _solved(
+            problem, state, weight, scale, steps, edges, trust, fit.stated, NEARLY_SOLVED_DISTANCE
+        )
         nearly = True
     return _to_the_end(fit) if nearly else fit
 
@@ -215,11 +223,15 @@ def _readings_step(
     """
     if not by_data.any():
         return before, made
-    asked = np.log(fit.components.factor(READINGS))
+    asked = np.log(fit.components.factor(READING_ROWS_KIND))
     # what is asked for at most is not all that is missing
-    shrinks = (asked * before > 0) & (np.abs(asked) < np.abs(before)) & (np.abs(before) < MOST)
+    shrinks = (
+        (asked * before > 0)
+        & (np.abs(asked) < np.abs(before))
+        & (np.abs(before) < UNCUT_NOISE_LOG_STEP)
+    )
     pace = np.where(shrinks, made / np.where(shrinks, before - asked, 1.0), 1.0)
-    return asked, asked * np.clip(pace, 1.0, FURTHEST)
+    return asked, asked * np.clip(pace, 1.0, FURTHEST_NOISE_PACE)
 
 
 def _readings_speak(fit: BatchResult) -> Booleans:
@@ -228,7 +240,9 @@ def _readings_speak(fit: BatchResult) -> Booleans:
     """
     found = fit.components
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
-    return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
+    return (found.contradicts(READING_ROWS_KIND) | alone) & (
+        found.told[:, READING_ROWS_KIND] > LEAST_NOISE_FREEDOM
+    )
 
 
 def _settled(
@@ -287,11 +301,11 @@ def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
     if by_tube:
         late = number >= FREE_ROUNDS
         edges = edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
-        return edges.beyond(fit.edges, PACE) if number >= PACED else edges
+        return edges.beyond(fit.edges, SCATTER_PACE) if number >= FIRST_PACED_ROUND else edges
     scale, found = fit.scale.edges[:, None] * fit.edges.scale, fit.components
-    chi2, freedom = found.chi2[:, EDGES, None], found.freedom[:, EDGES, None]
+    chi2, freedom = found.chi2[:, EDGE_ROWS_KIND, None], found.freedom[:, EDGE_ROWS_KIND, None]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
-    scale = np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
+    scale = np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
     return replace(fit.edges, scale=scale)
 
 
@@ -303,9 +317,9 @@ def _pose_scale(fit: BatchResult) -> Array:
     if not fit.info.problem.kinds.poses.present.any():
         return scale
     found = fit.components
-    chi2, freedom = found.chi2[:, POSES], found.freedom[:, POSES]
+    chi2, freedom = found.chi2[:, POSE_ROWS_KIND], found.freedom[:, POSE_ROWS_KIND]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
-    return np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
+    return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
 
 def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
@@ -313,12 +327,12 @@ def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float
 
     shift : (B, n) px, as estimated with the deviations sigma (B, n) px. told : (B, n) what the data
     left of its variance, 1 where they say nothing of it. least : (B or 1, 1) what all have at
-    least. Shifts have Student's distribution with FREEDOM degrees: most lines are shaded alike, and
-    some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w with
-    its weight w = (FREEDOM + 1) / (FREEDOM + x^2 / s^2) (Lange, Little, Taylor 1989), x^2 the
-    square expected of its shift. The common s^2 is the fixed point of the weighted sum of squares
-    over the number of shifts that the data tell: a line counts by what its variance has become less
-    than the prior's (MacKay 1992).
+    least. Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded
+    alike, and some show a highlight's border for their own, pixels off. Each line's variance is s^2
+    / w with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little,
+    Taylor 1989), x^2 the square expected of its shift. The common s^2 is the fixed point of the
+    weighted sum of squares over the number of shifts that the data tell: a line counts by what its
+    variance has become less than the prior's (MacKay 1992).
     """
     left = np.minimum(told, 1.0)
     count = np.sum(1 - left, axis=1, keepdims=True)
@@ -326,8 +340,8 @@ def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float
     expected = square + sigma**2 * left
     common = np.median(sigma, axis=1, keepdims=True) ** 2
     weight = np.ones_like(square)
-    for _ in range(WEIGHINGS):
-        weight = (FREEDOM + 1) / (FREEDOM + expected / common)
+    for _ in range(SHADING_WEIGHINGS):
+        weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
         total = np.sum(weight * square, axis=1, keepdims=True)
         common = np.maximum(total / np.maximum(count, 1e-9), np.square(least))
     return np.maximum(np.sqrt(common / weight), least)
@@ -543,12 +557,12 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
         chi2_poses=chi2[2],
         n_poses=n_poses,
         pose_scale=float(result.scale.poses[0]),
-        dof_edges=freedom[EDGES],
-        dof_joints=freedom[READINGS],
-        dof_poses=freedom[POSES],
+        dof_edges=freedom[EDGE_ROWS_KIND],
+        dof_joints=freedom[READING_ROWS_KIND],
+        dof_poses=freedom[POSE_ROWS_KIND],
         reading_scale=float(result.reading_scale[0]),
-        reading_range=_range(found, READINGS, result.reading_scale),
-        pose_range=_range(found, POSES, result.scale.poses),
+        reading_range=_range(found, READING_ROWS_KIND, result.reading_scale),
+        pose_range=_range(found, POSE_ROWS_KIND, result.scale.poses),
         shading=float(np.median(problem.data.shading[0])),
     )
 

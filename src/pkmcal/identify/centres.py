@@ -17,7 +17,7 @@ from pkmcal.identify.gauge import BestFit, generators, projector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 
-FLAT = 1e-6
+COLLINEAR_SPREAD_SHARE = 1e-6
 """Points nearer to one line than this part of their spread fix no rotation about it."""
 
 
@@ -81,7 +81,7 @@ def free_of_gauge(machine: Machine, covariance: Array) -> Array:
 def laid_over(source: Array, target: Array) -> Array:
     """T_target_source (4, 4) of the best fit; a shift alone where the points are on one line."""
     spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False)
-    if len(source) < 3 or spread[1] < FLAT * spread[0]:
+    if len(source) < 3 or spread[1] < COLLINEAR_SPREAD_SHARE * spread[0]:
         shift = np.eye(4)
         shift[:3, 3] = (target - source).mean(axis=0)
         return shift

@@ -33,12 +33,12 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.mechanisms import Machine
 
-UNTOLD = 0.99
+UNTOLD_VARIANCE_SHARE = 0.99
 """Part of the drawing's variance that is left, from which on data say nothing of a direction."""
-SETTLED = 0.01
+SETTLED_ESTIMATE_SHARE = 0.01
 """Of a standard deviation: to which the search for an estimate settles, so that two from the same
 data are never held against a spread of nothing."""
-FIRM = 1e-9
+CHANGE_VARIANCE_FLOOR = 1e-9
 """Of a tolerance squared: a variance below it is rounding."""
 
 
@@ -125,7 +125,7 @@ def _spread(
     if not known:
         return np.zeros((size, size)), np.zeros((size, 0))
     values, vectors = np.linalg.eigh(np.mean(known, axis=0))
-    told = vectors[:, values < UNTOLD]
+    told = vectors[:, values < UNTOLD_VARIANCE_SHARE]
     if len(known) == 1:
         return known[0], told
     one, other = (_firm(c) for c in known)
@@ -134,14 +134,14 @@ def _spread(
     unit = np.eye(len(one))
     joint = shared * (lesser - unit) + (unit if one_drawing else 0.0)
     cross = one @ joint @ other
-    spread = one + other - cross - cross.T + SETTLED**2 * (one + other)
+    spread = one + other - cross - cross.T + SETTLED_ESTIMATE_SHARE**2 * (one + other)
     return spread, told
 
 
 def _firm(covariance: Array) -> Array:
     """A covariance in tolerances, no larger than the drawing's and no smaller than rounding."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    return (vectors * np.clip(values, FIRM, 1.0)) @ vectors.T
+    return (vectors * np.clip(values, CHANGE_VARIANCE_FLOOR, 1.0)) @ vectors.T
 
 
 def _lesser(one: Array, other: Array) -> Array:

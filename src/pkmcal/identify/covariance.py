@@ -31,7 +31,14 @@ from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.solver.elimination import Linear, Reduced, condensed, divisions, eliminate, stacked
+from pkmcal.solver.elimination import (
+    Linear,
+    Reduced,
+    condensed,
+    divisions,
+    eliminate,
+    rows_on_shared,
+)
 from pkmcal.solver.ranks import (
     RANK_TOLERANCE,
     column_space,
@@ -41,9 +48,9 @@ from pkmcal.solver.ranks import (
 )
 from pkmcal.solver.search import take
 
-NULL = 1e-12
+ROWS_RANK_TOLERANCE = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
-UNKNOWN = 1e-13
+NORMAL_RANK_TOLERANCE = 1e-13
 """Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
@@ -88,7 +95,7 @@ class Information:
         """
         parts: list[tuple[Array, Array]] = []
         for piece in self.pieces():
-            rows, value = stacked(piece.linear, piece.reduced)
+            rows, value = rows_on_shared(piece.linear, piece.reduced)
             own = rows.shape[1] - len(self.problem.prior)
             if not parts:
                 parts = [(rows[:, own:], value[:, own:])]
@@ -113,7 +120,7 @@ class Information:
             inverse, sure = self._inverse
             if sure.all():
                 return np.linalg.cholesky(inverse)
-        return normal_root(normal, UNKNOWN, loose=False)
+        return normal_root(normal, NORMAL_RANK_TOLERANCE, loose=False)
 
     @cached_property
     def _inverse(self) -> tuple[Array, Booleans]:
@@ -137,7 +144,7 @@ class Information:
                 inverse = inverse.copy()
                 inverse[rest] = part.covariance
                 return inverse
-        half = inverse_root(self.rows[0], NULL, loose=True)
+        half = inverse_root(self.rows[0], ROWS_RANK_TOLERANCE, loose=True)
         return half @ half.mT
 
 
@@ -221,7 +228,7 @@ def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) 
 
 
 @dataclass(frozen=True)
-class Direction:
+class ParameterDirection:
     """A combination of parameters: names with weights, largest first, and how well known.
 
     information : singular value of the data in units of the drawing's tolerance; 1 means that
@@ -247,8 +254,8 @@ class Identifiability:
     n_parameters: int
     n_frames: int
     rank: int
-    unidentified: tuple[Direction, ...]
-    weak: tuple[Direction, ...]
+    unidentified: tuple[ParameterDirection, ...]
+    weak: tuple[ParameterDirection, ...]
     singular_values: Array
 
     __repr__ = short_repr
@@ -296,12 +303,14 @@ def identifiability(info: Information, machine: Machine) -> Identifiability:
     )
 
 
-def _direction(table: ParameterTable, weights: Array, vector: Array, value: float) -> Direction:
+def _direction(
+    table: ParameterTable, weights: Array, vector: Array, value: float
+) -> ParameterDirection:
     order = np.argsort(-np.abs(weights), kind="stable")
     order = order[np.abs(weights[order]) > 0.15 * np.abs(weights).max()][:8]
     names = table.free_names()
     size = np.abs(vector / table.tolerance).max()
-    return Direction(
+    return ParameterDirection(
         tuple(names[k] for k in order),
         tuple(float(weights[k]) for k in order),
         value,

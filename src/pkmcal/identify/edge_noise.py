@@ -23,8 +23,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.scatter import (
-    PAIR,
-    TINY,
+    EDGE_SCATTER_FLOOR,
+    NUMBERS_AN_EDGE,
     EdgeScatter,
     shift_squares,
     worth,
@@ -33,14 +33,14 @@ from pkmcal.measurements import OWN_SHADING
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.strips import Eliminated, Strips, eliminated
 
-TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
+TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
-STATED = 5.0
+STATED_NOISE_WORTH = 5.0
 """Edges that the stated noise is worth when their own is found."""
-ROUNDS = 60
-ENOUGH = 1e-4
+MOST_EDGE_NOISE_ROUNDS = 60
+VARIANCE_FOUND_CHANGE = 1e-4
 """Relative change of a variance below which it counts as found."""
-LARGEST = 4.0
+LARGEST_VARIANCE_FACTOR = 4.0
 """Largest factor on a variance in one round."""
 
 
@@ -63,7 +63,7 @@ def edge_noise(
             )
             continue
         begin = before.scale[:, number], before.shading[:, number]
-        tails = before.tails[None, :, number] if same_tails else TAILS[:, None]
+        tails = before.tails[None, :, number] if same_tails else TAILS_TRIED[:, None]
         squares = along[:, own], rest[:, own], size[:, own]
         found.append(_student(*squares, weight[:, own], *begin, tails))
     scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
@@ -81,15 +81,15 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         data, rows = part.data, part.compact(state)
         layout, numbers = rows.strips
-        at = layout.configuration[:, None], layout.rows[:, ::PAIR] // PAIR
+        at = layout.configuration[:, None], layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
         v = data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
         turned = Strips(layout, _turned(numbers, unit[:, *at]))
         taken = _taken_up(turned, eliminated(rows, np.zeros(n_runs)), half)
         # a place more than there are takes in the strips' padding, -1
-        square = np.zeros((n_runs, len(part.blocks.present), n_places + 1, PAIR))
-        square[:, *at] = taken.reshape(*taken.shape[:2], -1, PAIR)
+        square = np.zeros((n_runs, len(part.blocks.present), n_places + 1, NUMBERS_AN_EDGE))
+        square[:, *at] = taken.reshape(*taken.shape[:2], -1, NUMBERS_AN_EDGE)
         square = square[:, :, :-1]
         size = shift_squares(part.blocks, data)
         weight = np.where(data.weight > 0, data.weight, 1.0)
@@ -104,11 +104,11 @@ def _turned(numbers: Array, unit: Array) -> Array:
     """Numbers (B, ..., N, n) of strips of edges with the two rows of each turned into those along
     ``unit`` (B, N, n / 2, 2) and across.
     """
-    first, second = numbers[..., ::PAIR], numbers[..., 1::PAIR]
+    first, second = numbers[..., ::NUMBERS_AN_EDGE], numbers[..., 1::NUMBERS_AN_EDGE]
     x, y = np.moveaxis(unit, -1, 0)[:, :, None]
     out = np.empty_like(numbers)
-    out[..., ::PAIR] = x * first + y * second
-    out[..., 1::PAIR] = x * second - y * first
+    out[..., ::NUMBERS_AN_EDGE] = x * first + y * second
+    out[..., 1::NUMBERS_AN_EDGE] = x * second - y * first
     return out
 
 
@@ -157,36 +157,43 @@ def _student(
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
         """One step of the two variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
-        trust = (tails + PAIR) / (tails + along / s + rest / t)
+        trust = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)
         of_s = weight / s**2
         left = (trust * along - s) * of_s
         # the stated noise counts as some edges more
         by_a = np.sum(left, axis=-1) + (total(trust, of_rest) - count * a) / a**2
-        by_a += STATED * (1 - a) / a**2
+        by_a += STATED_NOISE_WORTH * (1 - a) / a**2
         by_b = total(left, size)
-        aa, ab = np.sum(of_s, axis=-1) + (count + STATED) / a**2, total(of_s, size)
-        bb = total(of_s, square) + TINY
+        aa, ab = np.sum(of_s, axis=-1) + (count + STATED_NOISE_WORTH) / a**2, total(of_s, size)
+        bb = total(of_s, square) + EDGE_SCATTER_FLOOR
         det = aa * bb - ab**2
-        det = np.where(det > TINY * aa * bb, det, np.inf)
+        det = np.where(det > EDGE_SCATTER_FLOOR * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
         # a shading at its least is known: the scale goes on alone
         new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
-        new_a = np.clip(new_a, a / LARGEST, a * LARGEST)
-        return new_a, np.maximum(np.clip(new_b, b / LARGEST, b * LARGEST), least)
+        new_a = np.clip(new_a, a / LARGEST_VARIANCE_FACTOR, a * LARGEST_VARIANCE_FACTOR)
+        return new_a, np.maximum(
+            np.clip(new_b, b / LARGEST_VARIANCE_FACTOR, b * LARGEST_VARIANCE_FACTOR), least
+        )
 
     a = scale**2 / norm
     b = np.broadcast_to(shading**2 / norm, a.shape)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_EDGE_NOISE_ROUNDS):
         before, (a, b) = (a, b), scored(a, b)
         change = max(np.abs(new / old - 1).max() for new, old in zip((a, b), before, strict=True))
-        if change < ENOUGH:
+        if change < VARIANCE_FOUND_CHANGE:
             break
     s, t = a[..., None] + b[..., None] * size, a[..., None]
     distance = along / s + rest / t
     cost = np.sum(
-        weight * (np.log(s * t) + (tails + PAIR) * np.log1p(distance / tails)) / 2, axis=-1
+        weight * (np.log(s * t) + (tails + NUMBERS_AN_EDGE) * np.log1p(distance / tails)) / 2,
+        axis=-1,
     )
-    constant = gammaln((tried + PAIR) / 2) - gammaln(tried / 2) - PAIR / 2 * np.log(tried)
+    constant = (
+        gammaln((tried + NUMBERS_AN_EDGE) / 2)
+        - gammaln(tried / 2)
+        - NUMBERS_AN_EDGE / 2 * np.log(tried)
+    )
     cost = cost - constant * count
     best, run = np.argmin(cost, axis=0), np.arange(len(scale))
     factor = (norm * np.ones_like(a))[best, run]

@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-COLUMNS = (
+FOUND_PARAMETER_COLUMNS = (
     "name", "unit", "drawing", "value", "change", "sigma", "data_share", "decided_by",
 )  # fmt: skip
-SHOWN = 12
+REPR_ROWS_SHOWN = 12
 """Rows of the table that its repr shows."""
 Decider = Literal["data", "drawing", "frame", "fixed"]
 
-DECIDES = 0.5
+DATA_DECIDES_SHARE = 0.5
 """Share of what is known that has to come from the data for the value to be theirs."""
-EXACT = 1e-9
+ROUNDING_SIGMA = 1e-9
 """Standard deviations (m or rad) below this are zero but for rounding: a nanometre."""
 
 
@@ -39,8 +39,8 @@ def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> t
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return tuple(
         "fixed" if name in table.fixed
-        else "frame" if sigma[k] <= EXACT
-        else "data" if data_share[k] >= DECIDES
+        else "frame" if sigma[k] <= ROUNDING_SIGMA
+        else "data" if data_share[k] >= DATA_DECIDES_SHARE
         else "drawing"
         for k, name in enumerate(table.names)
     )  # fmt: skip
@@ -105,17 +105,17 @@ class FoundParameters(Sequence[FoundParameter]):
                 "this table as a DataFrame needs pandas",
                 next_step="Install it with: pip install pandas",
             ) from None
-        return pd.DataFrame(self.records(), columns=list(COLUMNS)).set_index("name")
+        return pd.DataFrame(self.records(), columns=list(FOUND_PARAMETER_COLUMNS)).set_index("name")
 
     def records(self) -> list[dict[str, str | float]]:
-        """One mapping a row, by COLUMNS."""
-        return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
+        """One mapping a row, by FOUND_PARAMETER_COLUMNS."""
+        return [{name: getattr(row, name) for name in FOUND_PARAMETER_COLUMNS} for row in self.rows]
 
     def __str__(self) -> str:
         return self._text(len(self.rows))
 
     def __repr__(self) -> str:
-        return self._text(SHOWN)
+        return self._text(REPR_ROWS_SHOWN)
 
     def _text(self, most: int) -> str:
         """The first rows as text, in columns."""

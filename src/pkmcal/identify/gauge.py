@@ -46,10 +46,10 @@ class Gauge(Protocol):
         ...
 
 
-ROUNDED = 1e-12
+FRAME_CHANGE_ROUNDING = 1e-12
 """Share of the machine's size, and of a direction's one, below which a value is the rounding of a
 change of frames: some thousand times a double's."""
-FLAT = 1e-3
+COLLINEAR_POINTS_SINE = 1e-3
 """Three points nearer to one line than this part of their distances fix no turn about it."""
 
 
@@ -306,7 +306,7 @@ def default_gauge(machine: Machine) -> Gauge:
     for index in (base,) if meet else (base, platform):
         p1, p2, p3 = machine.parameters.drawing[index[list(legs)]]
         sides = np.linalg.norm([p2 - p1, p3 - p1], axis=1)
-        if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= FLAT * sides.prod():
+        if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= COLLINEAR_POINTS_SINE * sides.prod():
             return BestFit()
     return ThreeCentres(legs)
 
@@ -360,7 +360,7 @@ def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
     moved = changed_frames(machine.layout, state, *alignment(machine, state, gauge))
     lengths = np.array([unit == "m" for unit in machine.parameters.units])
     size = np.where(lengths, np.abs(moved.theta[..., lengths]).max(initial=0.0), 1.0)
-    rounding = np.abs(moved.theta) < ROUNDED * size
+    rounding = np.abs(moved.theta) < FRAME_CHANGE_ROUNDING * size
     return replace(moved, theta=np.where(rounding, 0.0, moved.theta))
 
 

@@ -17,12 +17,12 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver.elimination import divisions, flat
 from pkmcal.solver.strips import Eliminated, eliminated
 
-EDGES, POSES, READINGS = range(3)
+EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND = range(3)
 """Kinds of rows in the axes of :class:`KindSums`."""
 
 
 class KindSums(NamedTuple):
-    """Sums over the configurations c of B runs; kinds k, l of rows as :data:`EDGES`.
+    """Sums over the configurations c of B runs; kinds k, l of rows as :data:`EDGE_ROWS_KIND`.
 
     With Q of the own Jacobian in a configuration and its reduced rows A, Q_k and A_k those of a
     kind: own sum_c tr(Q_k^T Q_k Q_l^T Q_l) (B, 3, 3), trace sum_c tr Q_k^T Q_k (B, 3), cross
@@ -63,7 +63,11 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
                 own[:, k, m] += np.sum(squares * others, axis=(1, 2, 3))
                 cross[:, k, m] += flat(along).mT @ flat(beside)
         chi2 += _chi2(part, rows.value, by_reading)
-    for k, m in ((POSES, EDGES), (READINGS, EDGES), (READINGS, POSES)):
+    for k, m in (
+        (POSE_ROWS_KIND, EDGE_ROWS_KIND),
+        (READING_ROWS_KIND, EDGE_ROWS_KIND),
+        (READING_ROWS_KIND, POSE_ROWS_KIND),
+    ):
         own[:, k, m], cross[:, k, m] = own[:, m, k], cross[:, m, k].mT
     return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
 
@@ -78,11 +82,11 @@ def _of_kinds(
     out = dict[int, tuple[Array, Array, Array]]()
     if problem.kinds.edges.present.any():
         along = found.along_strips - found.own @ found.along
-        out[EDGES] = found.own, along, found.strips_normal
+        out[EDGE_ROWS_KIND] = found.own, along, found.strips_normal
     for kind, part, rows in (
-        (POSES, found.q[:, :, equations:], found.rows[:, :, equations:]),
+        (POSE_ROWS_KIND, found.q[:, :, equations:], found.rows[:, :, equations:]),
         (
-            READINGS,
+            READING_ROWS_KIND,
             _readings(problem, found.q[:, :, :equations], by_reading),
             _readings(problem, found.rows[:, :, :equations], by_reading),
         ),

@@ -25,20 +25,20 @@ from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
-from pkmcal.wording import SCALES, decimals, joined, named, number, split_name, with_unit
+from pkmcal.wording import SHOWN_UNITS, decimals, joined, named, number, split_name, with_unit
 
-AXES = "xyz"
+AXIS_LETTERS = "xyz"
 MOST_GROUPS = 120
 """Groups of legs that are tried; ten stations that each see other legs make about as many."""
 MOST_SIZES = 3
 """Sizes of which fewer than all are tried together; their combinations grow as powers of two."""
-ALIGNED = 0.985
+ALIGNED_AXIS_COSINE = 0.985
 """Cosine (10 degrees) of a direction with an axis that still is called by that axis's name."""
-THROUGH = 0.05
+THROUGH_AXIS_DISTANCE = 0.05
 """Distance of a joint from an axis, in parts of the joints' spread, that still lies on it."""
-SAME = 1e-3
+NEGLIGIBLE_CHANGE_SHARE = 1e-3
 """Part of its greatest number below which a number of a change is nothing."""
-LITTLE = 0.01
+UNTOLD_SIZE_CHANGE = 0.01
 """mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
 MOST_TOLD = 5
 """Numbers of a change that are told, the last of them for all smaller ones."""
@@ -118,7 +118,7 @@ How = Callable[[Situation, Array], str]
 
 
 @dataclass(frozen=True)
-class Motion:
+class NamedChanges:
     """Changes with one name.
 
     legs : that it is about, from 0. columns : (P, m). one, several : its sentence for one leg, and
@@ -151,7 +151,7 @@ class Motion:
         return self.several if n_legs > 1 and self.several else self.one
 
 
-def candidates(s: Situation) -> Iterator[Motion]:
+def candidates(s: Situation) -> Iterator[NamedChanges]:
     """Every motion, the most particular first; the last is anything at all."""
     yield from (_unseen(s, j) for j in s.legs if not s.seen[:, j].any())
     yield from _conventions(s)
@@ -160,28 +160,28 @@ def candidates(s: Situation) -> Iterator[Motion]:
     shared = [*(motion for motion, _ in carried), *_sizes(s)]
     # photographs tell legs one by one; poses leave open what is the same of all
     yield from (*own, *shared) if s.photographed else (*shared, *own)
-    for group in groups(s.seen):
+    for group in movable_leg_groups(s.seen):
         yield from _group(s, group)
     for j in s.legs:
         yield from _whole_leg(s, j)
     if s.photographed and any("tubes" in fields for fields in s.fields):
-        yield from (_spread(s, group) for group in (*groups(s.seen), s.legs))
+        yield from (_spread(s, group) for group in (*movable_leg_groups(s.seen), s.legs))
     yield _everything(s)
     yield from _all_together(s, carried)
     rest = "of the machine's numbers, {combinations}{mostly}"
-    yield Motion(s.legs, np.eye(len(s.machine.parameters)), rest)
+    yield NamedChanges(s.legs, np.eye(len(s.machine.parameters)), rest)
 
 
 # ------------------------------------------------------------------ legs nobody sees, frames
 
 
-def _unseen(s: Situation, leg: int) -> Motion:
+def _unseen(s: Situation, leg: int) -> NamedChanges:
     read = "; its readings alone leave {n} of its values {open}"
     all_read = "; their readings alone leave {n} of each one's values {open}"
     if not s.rows(leg, "length").size:
         read = ", so that nothing tells where its joints are"
         all_read = ", so that nothing tells where their joints are"
-    return Motion(
+    return NamedChanges(
         (leg,),
         s.one_hot(s.rows(leg, "")),
         "{legs} is in no photograph" + read,
@@ -190,7 +190,7 @@ def _unseen(s: Situation, leg: int) -> Motion:
     )
 
 
-def _conventions(s: Situation) -> Iterator[Motion]:
+def _conventions(s: Situation) -> Iterator[NamedChanges]:
     """Both ends of a leg shifted alike, as a frame of its own; the base frame turned.
 
     Where the file holds some of what a frame would have to take along, the rest still may move.
@@ -207,23 +207,24 @@ def _conventions(s: Situation) -> Iterator[Motion]:
         shifts = shifts[:, :0]  # photographs, or the platform's turns, tell the ends of legs
     else:
         one = "of {how}: both can shift alike {ways}"
-        yield Motion(s.legs, shifts, one, how=_difference, convention=True)
+        yield NamedChanges(s.legs, shifts, one, how=_difference, convention=True)
     frames = generators(s.machine.layout, s.machine.values)
     for axis in (2, 0, 1):
         # with shifts of both ends: what is held of the one end, the other makes good
         turn = np.concatenate([frames[:, [axis, 6 + axis]], shifts], axis=1)
         text = (
-            f"the turn of the base frame about {AXES[axis]} {{is}}: the axes and places of all base"
+            f"the turn of the base frame about {AXIS_LETTERS[axis]} {{is}}: the axes and places"
+            f" of all base"
             " joints can turn together, and the camera or tracker with them; nothing that the"
             " mechanism file holds stops it"
         )
-        yield Motion(s.legs, turn, text, convention=True)
+        yield NamedChanges(s.legs, turn, text, convention=True)
 
 
 def _difference(s: Situation, coefficients: Array) -> str:
     """Along which axes both ends shift, and what is seen instead."""
     numbers = np.abs(coefficients).max(axis=0).reshape(3, -1).max(axis=1)
-    axes = [c for c, x in zip(AXES, numbers, strict=True) if x > 0.05 * numbers.max()]
+    axes = [c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > 0.05 * numbers.max()]
     layout = s.machine.layout
     base, platform = (
         joined(list(dict.fromkeys(f"the {g.carrier.called}" for g in groups_)))
@@ -238,7 +239,7 @@ def _difference(s: Situation, coefficients: Array) -> str:
 # ------------------------------------------------------------------ of one leg
 
 
-def _of_one_leg(s: Situation, leg: int) -> Iterator[Motion]:
+def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     """Its axes, its radii, the leg along itself, then every number and every point by itself."""
     base, platform = s.fields[leg].get("base.axis"), s.fields[leg].get("platform.axis")
     if base is not None and platform is not None:
@@ -250,27 +251,27 @@ def _of_one_leg(s: Situation, leg: int) -> Iterator[Motion]:
             "the common direction of both axes of {each}{legs} {is}: only the angle between the two"
             " can be seen"
         )
-        yield Motion((leg,), turn, one, advice="drawing")
+        yield NamedChanges((leg,), turn, one, advice="drawing")
     alone = {field: s.one_hot(rows) for field, rows in s.fields[leg].items()}
     what = {field: s.label(rows) for field, rows in s.fields[leg].items()}
     axes = [field for field in alone if field.endswith("axis")]
     points = [f for f, own in alone.items() if own.shape[1] == 3 and f not in (*axes, "tubes")]
     for field in axes:
         one = f"the direction of the {what[field]} of {{each}}{{legs}} {{is}}"
-        yield Motion((leg,), alone[field], one, advice="turn")
+        yield NamedChanges((leg,), alone[field], one, advice="turn")
     if "tubes" in alone:
         one = "the tubes' radii of {legs} {are}"
-        yield Motion((leg,), alone["tubes"], one, advice="caliper")
+        yield NamedChanges((leg,), alone["tubes"], one, advice="caliper")
     yield _along(s, leg)
     for field in (f for f in alone if f not in (*axes, *points, "tubes")):
-        yield Motion((leg,), alone[field], f"the {what[field]} of {{each}}{{legs}} {{is}}")
+        yield NamedChanges((leg,), alone[field], f"the {what[field]} of {{each}}{{legs}} {{is}}")
     for field in points:
         name = what[field].replace("centre", "joint")
         one = f"the {name} of {{each}}{{legs}} {{is}} {{how}}"
-        yield Motion((leg,), alone[field], one, how=lambda _s, c: directions(c))
+        yield NamedChanges((leg,), alone[field], one, how=lambda _s, c: directions_in_words(c))
 
 
-def _along(s: Situation, leg: int) -> Motion:
+def _along(s: Situation, leg: int) -> NamedChanges:
     """A leg that grows, or shifts, along itself."""
     start = "{legs} keeps nearly one direction in the data: it "
     starts = "{legs} keep nearly one direction each in the data: each of them "
@@ -278,7 +279,7 @@ def _along(s: Situation, leg: int) -> Motion:
         end, how = "{how}{limited}", _sliding
     else:
         end, how = "can shift along itself, its two joints by themselves{limited}", None
-    return Motion((leg,), _slide(s, leg), start + end, starts + end, how)
+    return NamedChanges((leg,), _slide(s, leg), start + end, starts + end, how)
 
 
 def _slide(s: Situation, leg: int) -> Array:
@@ -297,7 +298,7 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
     if len(coefficients) > 1:
         return "can grow and shift along itself, its two joints and its length together"
     base, platform = np.abs(coefficients[0])
-    if min(base, platform) < SAME * max(base, platform):
+    if min(base, platform) < NEGLIGIBLE_CHANGE_SHARE * max(base, platform):
         if base > platform:
             return "can grow while its base joint moves back along it"
         return "can grow while its platform joint moves on along it"
@@ -306,14 +307,14 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
     return "can grow while both of its joints move along it"
 
 
-def directions(vectors: Array) -> str:
+def directions_in_words(vectors: Array) -> str:
     """Directions (k, 3) in words: ``along x``, ``in the x-y plane``, ``in all directions``."""
     if len(vectors) >= 3:
         return "in all directions"
     if len(vectors) == 2:
         axis = _axis_name(np.cross(vectors[0], vectors[1]))
         if axis:
-            return f"in the {'-'.join(c for c in AXES if c != axis)} plane"
+            return f"in the {'-'.join(c for c in AXIS_LETTERS if c != axis)} plane"
         return "in two directions"
     axis = _axis_name(vectors[0])
     return f"along {axis}" if axis else "in one direction"
@@ -322,10 +323,10 @@ def directions(vectors: Array) -> str:
 def _axis_name(vector: Array) -> str:
     """The axis that a vector (3,) is along, empty where it is along none."""
     size = np.abs(vector) / max(float(np.linalg.norm(vector)), 1e-300)
-    return AXES[int(np.argmax(size))] if size.max() > ALIGNED else ""
+    return AXIS_LETTERS[int(np.argmax(size))] if size.max() > ALIGNED_AXIS_COSINE else ""
 
 
-def _carriers(s: Situation, leg: int) -> Iterator[tuple[Motion, str]]:
+def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
     """What a leg's carriers name in their own files, each with its sentence for all legs."""
     layout, poses = s.machine.layout, s.T_base_platform
     readings = np.full(len(poses), np.nan)
@@ -338,18 +339,18 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[Motion, str]]:
                 # what the file is silent about lands in the last row
                 columns = np.zeros((len(s.machine.parameters) + 1, motion.columns.shape[1]))
                 columns[group.index[i]] = motion.columns
-                found = Motion((leg,), columns[:-1], motion.one, motion.several)
+                found = NamedChanges((leg,), columns[:-1], motion.one, motion.several)
                 yield found, motion.together
 
 
-def _whole_leg(s: Situation, leg: int) -> Iterator[Motion]:
+def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     own = s.rows(leg, "base", "platform", "length", "scale")
     one = "of the values of {legs}, {combinations}{mostly}"
-    yield Motion((leg,), s.one_hot(own), one)
+    yield NamedChanges((leg,), s.one_hot(own), one)
     if "tubes" in s.fields[leg] and s.photographed:
         one = "the tubes' radii of {legs} and the distance to the camera cannot be told apart"
         every = s.one_hot(s.rows(leg, ""))
-        yield Motion((leg,), every, one + "{better}", advice="caliper")
+        yield NamedChanges((leg,), every, one + "{better}", advice="caliper")
 
 
 # ------------------------------------------------------------------ sizes that legs share
@@ -389,13 +390,13 @@ def sizes(s: Situation) -> tuple[Size, ...]:
     return tuple(found)
 
 
-def _sizes(s: Situation) -> Iterator[Motion]:
+def _sizes(s: Situation) -> Iterator[NamedChanges]:
     """Few of them first: of all legs alike, then of single legs."""
     known = sizes(s)
     numbers = [*range(1, min(MOST_SIZES, len(known)) + 1)]
     numbers += [len(known)] if len(known) > MOST_SIZES else []
     apart = "cannot be told apart" + (" by heights" if s.heights else "") + "{better}"
-    single: list[Motion] = []
+    single: list[NamedChanges] = []
     for group in (group for n in numbers for group in combinations(known, n)):
         columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
         labels = tuple((f"the {g.label}", g.unit) for g in group)
@@ -405,16 +406,16 @@ def _sizes(s: Situation) -> Iterator[Motion]:
         what, alike = joined([label for label, _ in labels]), columns.sum(axis=1)
         text = f"{what}, of {whose} alike, "
         if len(group) == 1:
-            yield Motion(legs, alike, text + "{is}")
+            yield NamedChanges(legs, alike, text + "{is}")
             continue
         if s.heights:
             how = _as_flat(labels, alike)
-            yield Motion(legs, alike, text + apart + "{how}", how=how, labels=labels)
+            yield NamedChanges(legs, alike, text + apart + "{how}", how=how, labels=labels)
         else:
-            yield Motion(legs, alike, text + apart + "{mostly}", labels=labels)
+            yield NamedChanges(legs, alike, text + apart + "{mostly}", labels=labels)
         text = f"{what} of {{each}}{{legs}} {apart}{{mostly}}"
         single += [
-            Motion((j,), columns[:, j], text, labels=labels) for j in legs if having[j].all()
+            NamedChanges((j,), columns[:, j], text, labels=labels) for j in legs if having[j].all()
         ]
     yield from single
 
@@ -446,7 +447,7 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
     none, the largest angle a tenth of a degree, or scale a tenth of a per cent; also returns the
     factor by which.
     """
-    told = [{**SCALES, "": (100.0, "%")}.get(unit, SCALES["rad"]) for _, unit in labels]
+    told = [{**SHOWN_UNITS, "": (100.0, "%")}.get(unit, SHOWN_UNITS["rad"]) for _, unit in labels]
     scale = np.array([factor for factor, _ in told])
     length = np.array([unit == "m" for _, unit in labels]) & (np.abs(values) > 0)
     first = int(np.argmax(np.where(length, np.abs(values), 0 if length.any() else np.abs(values))))
@@ -454,7 +455,7 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
     factor = one / (scale[first] * values[first])
     shown = values * factor * scale
     order = [first, *(k for k in np.argsort(-np.abs(shown), kind="stable") if k != first)]
-    order = [k for k in order if abs(shown[k]) > LITTLE]
+    order = [k for k in order if abs(shown[k]) > UNTOLD_SIZE_CHANGE]
     said: list[str] = []
     for k in order:
         places = decimals(abs(shown[k])) if k != first else int(one < 1)
@@ -469,7 +470,7 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
 # ------------------------------------------------------------------ groups of legs
 
 
-def groups(seen: Booleans) -> tuple[tuple[int, ...], ...]:
+def movable_leg_groups(seen: Booleans) -> tuple[tuple[int, ...], ...]:
     """Groups of legs that might move against the others, by which stations (S, L) see them.
 
     What one station sees, what it sees and another does not, and what hangs together through
@@ -495,7 +496,7 @@ def hanging_together(seen: Booleans) -> tuple[Booleans, ...]:
     return tuple(np.unique(reach > 0, axis=0))
 
 
-def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[Motion]:
+def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
     """Some legs' ends moved as their body's frame would move them, the others left."""
     frames = generators(s.machine.layout, s.machine.values)
     ends: list[Array] = []
@@ -514,7 +515,7 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[Motion]:
         (f"the platform {joints}", ends[1], 1),
         (f"{who} as a whole", np.concatenate(ends, axis=1), 0),
     ):
-        yield Motion(legs, columns, text.format(what), how=_rigid(legs, body), advice="tie")
+        yield NamedChanges(legs, columns, text.format(what), how=_rigid(legs, body), advice="tie")
 
 
 def _relation(s: Situation, legs: tuple[int, ...]) -> str:
@@ -559,7 +560,7 @@ def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
     if turns == 1 and not len(shifts):
         k = int(np.argmax(np.linalg.norm(omega, axis=1)))
         return f"turn about {_line(twists[k, :3], tau[k], middle, points, legs, spread)}"
-    said = [f"shift {directions(shifts)}"] if len(shifts) else []
+    said = [f"shift {directions_in_words(shifts)}"] if len(shifts) else []
     axis = _axis_name(vt[0])
     about = (f"about {axis or 'one axis'}", "about two axes", "freely")
     return joined(said + ([f"turn {about[turns - 1]}"] if turns else []))
@@ -572,10 +573,10 @@ def _line(
     square = float(omega @ omega)
     point, direction = middle + cross(omega, tau) / square, omega / np.sqrt(square)
     axis = _axis_name(direction)
-    if abs(float(omega @ tau) / square) > THROUGH * spread:
+    if abs(float(omega @ tau) / square) > THROUGH_AXIS_DISTANCE * spread:
         return f"{axis or 'an axis'} and shift along it at once"
     distance = np.linalg.norm(np.cross(points - point, direction), axis=-1)
-    on = [j for j in np.flatnonzero(distance < THROUGH * spread) if j not in legs]
+    on = [j for j in np.flatnonzero(distance < THROUGH_AXIS_DISTANCE * spread) if j not in legs]
     if len(on) >= 2:
         return f"the axis through joints {joined([str(j + 1) for j in on])}"
     if len(on) == 1:
@@ -586,7 +587,7 @@ def _line(
 # ------------------------------------------------------------------ all legs
 
 
-def _spread(s: Situation, legs: tuple[int, ...]) -> Motion:
+def _spread(s: Situation, legs: tuple[int, ...]) -> NamedChanges:
     """Legs move apart as they are while their tubes grow thicker by the same share, (P, 1).
 
     A camera sees the same where the platform does not turn: it is the depth of all of them.
@@ -602,10 +603,10 @@ def _spread(s: Situation, legs: tuple[int, ...]) -> Motion:
         out[rows, 0] = values[rows]
     who = "the legs" if len(legs) == len(s.legs) else named(legs)
     text = f"how far apart {who} stand and how thick their tubes are cannot be told apart{{better}}"
-    return Motion(legs, out, text, advice="more or caliper")
+    return NamedChanges(legs, out, text, advice="more or caliper")
 
 
-def _everything(s: Situation) -> Motion:
+def _everything(s: Situation) -> NamedChanges:
     """All lengths grow by the same share, (P, 1): what readings in m stand for as well, where all
     their scales are free; else readings cannot, so offsets stay.
     """
@@ -620,42 +621,42 @@ def _everything(s: Situation) -> Motion:
     columns = np.where(grows, s.machine.values, 0.0)[:, None]
     if not (rows.size and follow):
         text = "the size of everything {is}: all lengths can grow alike"
-        return Motion(s.legs, columns, text)
+        return NamedChanges(s.legs, columns, text)
     text = (
         "the size of everything is known from the drawing only, by the tolerance of the readings'"
         " scales: all lengths can grow alike, and the scales with them"
     )
-    return Motion(s.legs, columns, text, advice="size")
+    return NamedChanges(s.legs, columns, text, advice="size")
 
 
-def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[Motion]:
+def _all_together(s: Situation, carried: list[tuple[NamedChanges, str]]) -> Iterator[NamedChanges]:
     """Motions of single legs, of which only combinations are open."""
     slides = np.concatenate([_slide(s, j) for j in s.legs], axis=1)
     text = "legs that grow while their joints move along them {are} {ways}{mostly}"
-    yield Motion(s.legs, slides, text)
+    yield NamedChanges(s.legs, slides, text)
     for side, centres in zip(("base", "platform"), centre_index(s.machine.layout), strict=True):
         text = f"how the {side} joints lie to each other {{is}} {{ways}}{{mostly}}"
-        yield Motion(s.legs, s.one_hot(centres.ravel()), text)
+        yield NamedChanges(s.legs, s.one_hot(centres.ravel()), text)
     scaled = [rows for leg in s.fields for field, rows in leg.items() if field == "scale"]
     if scaled:
         text = "the scales of the readings {are} {ways}{mostly}"
-        yield Motion(s.legs, s.one_hot(np.concatenate(scaled)), text)
+        yield NamedChanges(s.legs, s.one_hot(np.concatenate(scaled)), text)
     axes = [rows for leg in s.fields for field, rows in leg.items() if field.endswith("axis")]
     if axes:
         text = "the directions of the joints' axes {are} {ways}{mostly}"
-        yield Motion(s.legs, s.one_hot(np.concatenate(axes)), text, advice="turn")
+        yield NamedChanges(s.legs, s.one_hot(np.concatenate(axes)), text, advice="turn")
     for sentence in dict.fromkeys(text for _, text in carried if text):
         own = [motion for motion, text in carried if text == sentence]
         legs = tuple(leg for motion in own for leg in motion.legs)
         columns = np.concatenate([motion.columns for motion in own], axis=1)
-        yield Motion(legs, columns, sentence, advice="turn")
+        yield NamedChanges(legs, columns, sentence, advice="turn")
     radii = all_radii(s)
     if radii.columns.size:
         yield radii
 
 
-def all_radii(s: Situation) -> Motion:
+def all_radii(s: Situation) -> NamedChanges:
     """The radii of all tubes, (P, tubes)."""
     legs = tuple(j for j in s.legs if "tubes" in s.fields[j])
     rows = np.concatenate([s.rows(j, "tubes") for j in s.legs])
-    return Motion(legs, s.one_hot(rows), "the tubes' radii of {legs} {are}", advice="caliper")
+    return NamedChanges(legs, s.one_hot(rows), "the tubes' radii of {legs} {are}", advice="caliper")

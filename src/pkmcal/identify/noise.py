@@ -26,14 +26,14 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kinds
 
-DOUBT = 0.01 / 3
+NOISE_CONTRADICTION_CHANCE = 0.01 / 3
 """Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
 kinds of rows."""
-FEWEST = 5.0
+LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom below which a sum of squares tells no noise."""
-STEP = 10.0
+LARGEST_NOISE_STEP = 10.0
 """Largest factor on a noise in one step: what follows from it is linear no further."""
-TINY = 1e-300
+LEAST_NOISE_DIVISOR = 1e-300
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Components:
     def told(self) -> Array:
         """Degrees of freedom (B, 3) of the chi-square variables that the sums of squares are."""
         own = np.einsum("bkk->bk", self.square)
-        others = (self.freedom > FEWEST)[:, None, :] & ~np.eye(3, dtype=bool)
+        others = (self.freedom > LEAST_NOISE_FREEDOM)[:, None, :] & ~np.eye(3, dtype=bool)
         across = self.square**2 / np.where(others, own[:, None, :], 1.0)
         spread = own + np.where(others, across, 0.0).sum(axis=-1)
         return np.where(own > 0, self.freedom**2 / np.where(own > 0, spread, 1.0), 0.0)
@@ -62,9 +62,13 @@ class Components:
         any smaller one it stays: they know no better, and a noise of nothing promises too much.
         """
         square = self._variance(kind, self.chi2[:, kind])
-        freedom = np.maximum(self.freedom, TINY)
+        freedom = np.maximum(self.freedom, LEAST_NOISE_DIVISOR)
         less = (np.minimum(self.chi2, freedom) / freedom)[:, kind]
-        step = np.sqrt(np.clip(np.where(square > less, square, less), STEP**-2, STEP**2))
+        step = np.sqrt(
+            np.clip(
+                np.where(square > less, square, less), LARGEST_NOISE_STEP**-2, LARGEST_NOISE_STEP**2
+            )
+        )
         low, high = self.interval(kind)
         return np.where((low == 0) & (high >= 1), 1.0, step)
 
@@ -76,10 +80,12 @@ class Components:
         from scipy.special import chdtri
 
         dof = self.told[:, kind]
-        known = dof > FEWEST
+        known = dof > LEAST_NOISE_FREEDOM
         ends: list[Array] = []
-        for share in (DOUBT / 2, 1 - DOUBT / 2):
-            mean = self.chi2[:, kind] * dof / chdtri(np.where(known, dof, FEWEST), share)
+        for share in (NOISE_CONTRADICTION_CHANCE / 2, 1 - NOISE_CONTRADICTION_CHANCE / 2):
+            mean = (
+                self.chi2[:, kind] * dof / chdtri(np.where(known, dof, LEAST_NOISE_FREEDOM), share)
+            )
             ends.append(np.sqrt(np.maximum(self._variance(kind, mean), 0.0)))
         said = known & (ends[1] > 0)
         return np.where(said, ends[0], 0.0), np.where(said, ends[1], np.inf)
@@ -94,11 +100,11 @@ class Components:
         kinds' noise as their own sums of squares have it; what is known beforehand counts as it is.
         """
         own = self.square[:, kind, kind]
-        known = self.freedom > FEWEST
+        known = self.freedom > LEAST_NOISE_FREEDOM
         others = np.where(known, self.chi2 / np.where(known, self.freedom, 1.0), 1.0)
         others[:, kind] = 1.0
         by_others = np.sum((others - 1) * self.square[:, kind], axis=-1)
-        return 1 + (chi2 - self.freedom[:, kind] - by_others) / np.maximum(own, TINY)
+        return 1 + (chi2 - self.freedom[:, kind] - by_others) / np.maximum(own, LEAST_NOISE_DIVISOR)
 
 
 def components(info: Information, weight: Kinds[Array]) -> Components:

@@ -30,8 +30,8 @@ from pkmcal.identify.rows import (
     EdgeBlocks,
     EdgeData,
     EdgeRows,
-    Kind,
     Kinds,
+    MeasurementKind,
     PoseBlocks,
     PoseData,
     PoseRows,
@@ -40,10 +40,10 @@ from pkmcal.identify.rows import (
     edge_rows,
     joint_rows,
     least_joint_noise,
-    placed,
     pose_rows,
+    rows_at_blocks,
 )
-from pkmcal.identify.structure import Structure, numbered
+from pkmcal.identify.structure import Structure, numbered_columns
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import (
     Closure,
@@ -59,7 +59,7 @@ from pkmcal.solver.elimination import Linear, divisions
 from pkmcal.solver.search import Values, of_runs
 from pkmcal.solver.strips import Compact, Strips
 
-CLOSINGS = 2
+CLOSING_NEWTON_STEPS = 2
 """Newton steps back onto the closures; each squares what is left."""
 
 
@@ -114,13 +114,17 @@ class Problem:
         return cast(Structure, self.kept)
 
     @cached_property
-    def kinds(self) -> Kinds[Kind]:
+    def kinds(self) -> Kinds[MeasurementKind]:
         """The kinds of measurement: edges' rows come first in a configuration, poses' last."""
         edges, poses = self.data, self.pose_data
         closures = self.closure_rows
         return Kinds(
-            Kind(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
-            Kind(slice(closures.stop, None), self.pose_blocks.present, poses.weight, poses.whiten),
+            MeasurementKind(
+                slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten
+            ),
+            MeasurementKind(
+                slice(closures.stop, None), self.pose_blocks.present, poses.weight, poses.whiten
+            ),
         )
 
     @property
@@ -228,7 +232,7 @@ class Problem:
         edges, poses = self._edges(state, c), self._poses(state)
         of_edges = edges.value(state)
         parts = (
-            _in_rows(placed(self.blocks, of_edges)[..., None]),
+            _in_rows(rows_at_blocks(self.blocks, of_edges)[..., None]),
             self._by_noise(c, c.rows.value[..., None]),
             _in_rows(poses.value[..., None]),
         )
@@ -332,15 +336,15 @@ class Problem:
             none = (*poses.value.shape[:2], 0)
             return np.zeros((*none, u.count)), np.zeros((*none, self.layout.own_motion.shape[1]))
         parts = [
-            (numbered(u.stations, boards.station, 6), poses.by_station),
-            (numbered(u.optics, boards.camera, u.n_optics), poses.by_optics),
-            (numbered(u.mounts, boards.mount, 6), poses.by_mount),
+            (numbered_columns(u.stations, boards.station, 6), poses.by_station),
+            (numbered_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (numbered_columns(u.mounts, boards.mount, 6), poses.by_mount),
         ]
         if u.n_breathing:
-            parts.append((numbered(u.breathing, boards.station, 1), poses.by_breathing))
+            parts.append((numbered_columns(u.breathing, boards.station, 1), poses.by_breathing))
         if u.n_sizes:  # an exact size's rows are zero, whatever column they are written to
             number = np.maximum(boards.size[boards.mount], 0)
-            parts.append((numbered(u.sizes, number, 1), poses.by_size))
+            parts.append((numbered_columns(u.sizes, number, 1), poses.by_size))
         out = np.zeros((*poses.value.shape, u.count))
         for columns, values in parts:
             np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
@@ -363,7 +367,7 @@ class Problem:
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        rows = placed(self.blocks, edges.value(state))
+        rows = rows_at_blocks(self.blocks, edges.value(state))
         return Kinds(rows, plain._poses(state).value)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
@@ -500,7 +504,7 @@ class Problem:
         change = np.pad(change, ((0, 0), (0, 1)))[:, c.index][:, None]
         wanted = c.rows.value + np.sum(c.by_theta * change, axis=-1)
         wanted = wanted + (by_own(layout, c.rows) @ own[..., None])[..., 0]
-        for _ in range(CLOSINGS):
+        for _ in range(CLOSING_NEWTON_STEPS):
             c = self.closure(trial)
             off, by_pose = (wanted - c.rows.value)[..., None], by_own(layout, c.rows)
             try:

@@ -15,17 +15,17 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kind, Kinds
+from pkmcal.identify.rows import Kinds, MeasurementKind
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver.search import FULL, final_weights, minimise, soft_weights
+from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, final_weights, minimise, soft_weights
 
-TAIL = float(np.exp(-(FULL**2) / 2))
-"""Share of two clean residuals' norms beyond FULL, where weights begin to fall."""
+CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
+"""Share of two clean residuals' norms beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
 POSE_STEPS = 10
 """Steps of a stage where there are poses: against readings a hundred times sharper they allow
 short steps only at first, and one that is refused would look as if all had settled."""
-STAGES = 30
-WIDE = 4.0
+MOST_ANNEALING_STAGES = 30
+GEMAN_MCCLURE_SCALE = 4.0
 """Geman-McClure scale in units of the residuals' robust scale."""
 
 
@@ -51,9 +51,11 @@ def clean_norm(share: float, count: Integers) -> Array:
     return out
 
 
-def as_pairs(kind: Kind) -> Array:
-    """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL as of pairs."""
-    return FULL / clean_norm(TAIL, kind.count)
+def as_pairs(kind: MeasurementKind) -> Array:
+    """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE
+    as of pairs.
+    """
+    return FULL_WEIGHT_DISTANCE / clean_norm(CLEAN_TAIL_SHARE, kind.count)
 
 
 def norms(problem: Problem, rows: Kinds[Array]) -> Kinds[Array]:
@@ -102,9 +104,9 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     state, steps = start, 0
     most = POSE_STEPS if problem.kinds.poses.present.size else 1
     d = norms(problem, problem.unweighted(state))
-    cut = [4 * WIDE * scale for scale in noise_scales(problem, d, least_scale)]
-    for _ in range(STAGES):
-        aim = [WIDE * scale for scale in noise_scales(problem, d, least_scale)]
+    cut = [4 * GEMAN_MCCLURE_SCALE * scale for scale in noise_scales(problem, d, least_scale)]
+    for _ in range(MOST_ANNEALING_STAGES):
+        aim = [GEMAN_MCCLURE_SCALE * scale for scale in noise_scales(problem, d, least_scale)]
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new

@@ -8,7 +8,7 @@ Three kinds of rows, each in one place here:
   hence the plus sign.
 - **closures** (:func:`by_noise`), one a limb: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5
   whitened; what no reading enters (rods of constant length, joints' axes) is taken as perfect and
-  held to :data:`PERFECT`.
+  held to :data:`PERFECT_CLOSURE_SIGMA`.
 - **poses** of boards (:func:`pose_rows`), six each: predicted as
   ``T_camera_base T_base_platform T_platform_board``, or ``T_camera_base T_base_board`` for a board
   fixed to the base ([A] 3.3). The error is the left perturbation (omega, tau) that leads from the
@@ -35,13 +35,13 @@ from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import Closure
 from pkmcal.mechanisms.layout import LimbLayout
 
-PERFECT = 1e-6
+PERFECT_CLOSURE_SIGMA = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
 Item = TypeVar("Item", covariant=True)
 Scalar = TypeVar("Scalar", bound=np.generic)
-Numbers = TypeVar("Numbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
+BlockNumbers = TypeVar("BlockNumbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
 class Kinds(NamedTuple, Generic[Item]):
@@ -56,7 +56,7 @@ class Kinds(NamedTuple, Generic[Item]):
 
 
 @dataclass(frozen=True)
-class Kind:
+class MeasurementKind:
     """One kind of measurement in a problem.
 
     rows : those of a configuration that are its. present : (K, G) False for padding. weight :
@@ -76,7 +76,7 @@ class Kind:
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
 
 
-def _among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
+def _among(numbers: BlockNumbers, configurations: slice, axis: int) -> BlockNumbers:
     """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
     them, a single one or none, stays.
     """
@@ -410,7 +410,7 @@ def _side_by_side(parts: tuple[Array, ...], limbs: tuple[int, ...]) -> Array:
     return out.reshape(limbs[0], limbs[1] * limbs[2], 3, first)
 
 
-def placed(blocks: EdgeBlocks, rows: Array) -> Array:
+def rows_at_blocks(blocks: EdgeBlocks, rows: Array) -> Array:
     """Rows (B, N, n) of views at the places of their blocks, (B, K, G, 2g); zero elsewhere."""
     views, (n_runs, n, _), each = blocks.views, rows.shape, 2 * blocks.side.shape[-1]
     if not n:
@@ -450,8 +450,8 @@ def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Ar
     multiplied by c = 0.
 
     joint_noise : what by_reading (..., E) broadcasts with. Rods on one motor share its reading's
-    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T + PERFECT^2``,
-    whitened in closed form.
+    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T +
+    PERFECT_CLOSURE_SIGMA^2``, whitened in closed form.
     """
     if not layout.shares_motors:
         return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
@@ -459,9 +459,9 @@ def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Ar
         slope = np.where(layout.row_motor == motor, by_reading, 0.0)
         size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
         unit = slope / np.where(size > 0, size, 1.0)
-        less = 1 - PERFECT / np.hypot(PERFECT, joint_noise * size)
+        less = 1 - PERFECT_CLOSURE_SIGMA / np.hypot(PERFECT_CLOSURE_SIGMA, joint_noise * size)
         rows = rows - (less * unit)[..., None] * (unit[..., None, :] @ rows)
-    return rows / PERFECT
+    return rows / PERFECT_CLOSURE_SIGMA
 
 
 def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> Array:
@@ -472,10 +472,10 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     scale, it would be the same but for a thousandth, and change with an unknown.
     """
     if layout.reads_lengths:
-        return np.where(layout.row_motor >= 0, joint_noise, PERFECT)
-    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT)
+        return np.where(layout.row_motor >= 0, joint_noise, PERFECT_CLOSURE_SIGMA)
+    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT_CLOSURE_SIGMA)
     sigma = np.where(layout.row_is_rod, joint_noise, sigma)
-    return np.where(layout.row_motor >= 0, sigma, PERFECT)
+    return np.where(layout.row_motor >= 0, sigma, PERFECT_CLOSURE_SIGMA)
 
 
 def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
@@ -485,7 +485,7 @@ def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
     if layout.rod_reads[layout.closing].any() and not layout.shares_motors:
         return np.zeros(len(by_reading))
     steepest = np.abs(by_reading * (layout.row_motor >= 0)).max(axis=(1, 2))
-    return PERFECT / np.maximum(steepest, PERFECT)
+    return PERFECT_CLOSURE_SIGMA / np.maximum(steepest, PERFECT_CLOSURE_SIGMA)
 
 
 def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:

@@ -13,9 +13,9 @@ from pkmcal.arrays import Array, short_repr
 from pkmcal.identify.rows import EdgeBlocks, EdgeData
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 
-PAIR = 2
+NUMBERS_AN_EDGE = 2
 """Numbers that an edge measures."""
-TINY = 1e-12
+EDGE_SCATTER_FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class EdgeScatter:
         of its whitened residuals are (B, K, G).
         """
         tails = self.tails[:, blocks.tube]
-        return (tails + PAIR) / (tails + square * worth(tails))
+        return (tails + NUMBERS_AN_EDGE) / (tails + square * worth(tails))
 
     def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
         """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
         of normal errors.
         """
-        pairs = rows.reshape(*rows.shape[:2], -1, PAIR)
+        pairs = rows.reshape(*rows.shape[:2], -1, NUMBERS_AN_EDGE)
         return np.sum(pairs**2, axis=-1) * worth(self.tails)[:, blocks.tube]
 
     def factor(self, blocks: EdgeBlocks, data: EdgeData, weight: Array) -> Array:
@@ -67,7 +67,7 @@ class EdgeScatter:
         along = (scale**2 + shading**2 * size) / (1 + OWN_SHADING**2 * size)
         square = np.sum(weight * (along + scale**2) / 2, axis=(1, 2))
         count = np.sum(weight, axis=(1, 2))
-        return np.sqrt(np.where(count > 0, square / np.maximum(count, TINY), 1.0))
+        return np.sqrt(np.where(count > 0, square / np.maximum(count, EDGE_SCATTER_FLOOR), 1.0))
 
     def close_to(self, other: EdgeScatter, share: float) -> bool:
         """Whether its deviations are another's up to a share, and its tails the same."""
@@ -99,4 +99,4 @@ def worth(tails: Array) -> Array:
     """The variance of normal errors that tell as much as those of Student's distribution of pairs,
     over the square of its scale.
     """
-    return 1 + 2 / (tails + PAIR)
+    return 1 + 2 / (tails + NUMBERS_AN_EDGE)

@@ -14,7 +14,8 @@ chi2 has as many degrees of freedom as the data see of the departure.
 The rows are gone through twice, some configurations at a time: for an orthonormal basis of what the
 shared unknowns can do, then for the products of all columns with each other, with the basis and
 with r. These few numbers are all that is kept, however many configurations there are, and
-``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which SEEN asks for ten.
+``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which SEEN_SQUARE_SHARE asks for
+ten.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
-from pkmcal.identify.covariance import NULL, Information
+from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 
-SEEN = 1e-10
+SEEN_SQUARE_SHARE = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
 it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
 a ten-thousandth is left."""
-HIDDEN = 0.01
+UNTOLD_HIDDEN_SHARE = 0.01
 """Part of a number that lies in directions which the data do not see, from which it is not told."""
-MOST = 4
+MOST_DEPARTURES_SOUGHT = 4
 """Departures that are looked for one after the other; more are a session with other troubles."""
 
 
@@ -128,7 +129,7 @@ class Departures:
         and beside those that are free already.
         """
         out: list[tuple[int, Score]] = []
-        while len(out) < min(MOST, len(self._family)):
+        while len(out) < min(MOST_DEPARTURES_SOUGHT, len(self._family)):
             scores = self.scores([*freed, *(k for k, _ in out)])
             # chances below the smallest number are all zero
             best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
@@ -141,7 +142,7 @@ class Departures:
         """What some departures come to, all free together."""
         made, free = self._made, _Left.of(self._made, freed)
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
-        sigma[free.hidden > HIDDEN] = np.inf
+        sigma[free.hidden > UNTOLD_HIDDEN_SHARE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
             Freed(v, s, self._moves @ (made.with_basis(k).T @ v))
@@ -235,7 +236,7 @@ class _Products:
         across = np.concatenate(parts, axis=-1)
         left = left - np.einsum("kmf,fg,kmg->km", across, free.inverse, across)
         value = value - across @ (free.inverse @ free.value)
-        seen = left > SEEN * squared
+        seen = left > SEEN_SQUARE_SHARE * squared
         return np.where(seen, value**2 / np.where(seen, left, 1.0), 0.0).ravel(), seen.ravel()
 
 
@@ -265,26 +266,26 @@ class _Left:
     def inverse(self) -> Array:
         """Of the products (c, c), in the directions that are seen."""
         part, ways = self._directions()
-        seen = part > SEEN
+        seen = part > SEEN_SQUARE_SHARE
         back = ways[:, seen] / np.sqrt(part[seen]) / self.scale[:, None]
         return back @ back.T
 
     @property
     def gain(self) -> tuple[float, int]:
         """chi2 that they gain together, and by how many numbers."""
-        seen = self._directions()[0] > SEEN
+        seen = self._directions()[0] > SEEN_SQUARE_SHARE
         return float(self.value @ self.inverse @ self.value), int(seen.sum())
 
     @property
     def hidden(self) -> Array:
         """(c,) part of each that lies in directions which are not seen."""
         part, ways = self._directions()
-        return np.sum(ways[:, part <= SEEN] ** 2, axis=1)
+        return np.sum(ways[:, part <= SEEN_SQUARE_SHARE] ** 2, axis=1)
 
 
 def _basis(info: Information) -> Array:
     """B (na, nb): the rows by the shared unknowns times it are orthonormal."""
-    half = inverse_root(info.rows[0][:1], NULL, loose=False)[0]
+    half = inverse_root(info.rows[0][:1], ROWS_RANK_TOLERANCE, loose=False)[0]
     return half[:, np.any(half != 0, axis=0)]
 
 

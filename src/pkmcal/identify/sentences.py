@@ -9,21 +9,21 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.motions import AXES, Motion, Situation, changes
-from pkmcal.mechanisms.parameters import EVERY
+from pkmcal.identify.motions import AXIS_LETTERS, NamedChanges, Situation, changes
+from pkmcal.mechanisms.parameters import EVERY_LEG
 from pkmcal.wording import capital, in_full, joined, listed, named, split_name, ways
 
-MOVES = 0.01
+LEAST_PLATFORM_MOVE = 0.01
 """Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
 of what the drawing leaves open disappears beside any calibration's own deviations."""
-MOST = 8
+MOST_SENTENCES = 8
 """Sentences that people read."""
-MOST_NAMES = 5
-SHARE = 0.15
+MOST_NAMES_IN_SENTENCE = 5
+NAMED_CHANGE_SHARE = 0.15
 """Part of the greatest change, in tolerances, from which on a parameter is named."""
-TURNED = 0.02
+SHIFT_ONLY_TURN = 0.02
 """Turn (rad) of the platform between configurations below which they only shift it."""
-PARALLEL = 1e-9
+ZERO_AXIS_COMPONENT = 1e-9
 """Component of an axis below which the file can hold it alone."""
 
 
@@ -48,7 +48,7 @@ class Sentence:
 
 
 @dataclass(frozen=True)
-class Found:
+class OpenMotion:
     """A motion that the data leave open, of one or more legs.
 
     space : (k, P) changes that it explains, in units of the drawing's deviations. numbers : (n, m)
@@ -56,7 +56,7 @@ class Found:
     as ``space``, from which it differs by frames. new : how many of the k nobody said before.
     """
 
-    motion: Motion
+    motion: NamedChanges
     legs: tuple[int, ...]
     space: Array
     numbers: Array
@@ -67,7 +67,7 @@ class Found:
         """What the motion says of its own numbers."""
         return self.motion.how(around, self.numbers) if self.motion.how else ""
 
-    def and_of(self, other: Found) -> Found:
+    def and_of(self, other: OpenMotion) -> OpenMotion:
         """The same said of other legs, or of these again."""
         again = self.legs == other.legs
         return replace(
@@ -80,15 +80,17 @@ class Found:
         )
 
 
-def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: bool) -> Sentence:
+def sentence(
+    around: Situation, found: OpenMotion, unit: Array, moved: float, weak: bool
+) -> Sentence:
     """The sentence of a motion; unit (P,) of the drawing's deviations, moved (m) the platform's
     joints, weak : whether the data know it, yet less than the drawing does.
     """
     table = around.machine.parameters
-    matters = moved > MOVES * float(table.tolerance[table.of_kind("center")].mean())
+    matters = moved > LEAST_PLATFORM_MOVE * float(table.tolerance[table.of_kind("center")].mean())
     size = np.linalg.norm(found.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")
-    rows = order[: int(np.sum(size > SHARE * size.max()))]
+    rows = order[: int(np.sum(size > NAMED_CHANGE_SHARE * size.max()))]
     names = tuple(table.names[k] for k in rows)
     several = len(found.legs) > 1
     known, n = "known from the drawing only" if weak else "free", len(found.numbers)
@@ -127,7 +129,7 @@ def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: b
     )
 
 
-def _mostly(around: Situation, found: Found, rows: Integers, unit: Array) -> str:
+def _mostly(around: Situation, found: OpenMotion, rows: Integers, unit: Array) -> str:
     """``: +1 mm of a goes with −0.7 mm of b`` of a single change; else what changes most."""
     table, single = around.machine.parameters, len(found.space) == 1
     if found.motion.labels:
@@ -140,19 +142,19 @@ def _mostly(around: Situation, found: Found, rows: Integers, unit: Array) -> str
         else:
             what = [table.in_words(table.names[k]) for k in rows]
         if not single:
-            return f", mostly of {listed(what, MOST_NAMES)}"
+            return f", mostly of {listed(what, MOST_NAMES_IN_SENTENCE)}"
         labels = tuple((w, table.units[k]) for w, k in zip(what, rows, strict=True))
         said, _ = changes((found.own[0] * unit)[rows], labels)
     return f": {said[0]} goes with {joined(said[1:])}" if len(said) > 1 else ""
 
 
 def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
-    """At most ``MOST`` sentences, the rest counted in the last."""
-    if len(sentences) <= MOST:
+    """At most ``MOST_SENTENCES`` sentences, the rest counted in the last."""
+    if len(sentences) <= MOST_SENTENCES:
         return tuple(sentences)
     ranked = sorted(sentences, key=lambda s: -s.moves_platform)
-    kept = [s for s in sentences if s in ranked[: MOST - 1]]
-    rest = ranked[MOST - 1 :]
+    kept = [s for s in sentences if s in ranked[: MOST_SENTENCES - 1]]
+    rest = ranked[MOST_SENTENCES - 1 :]
     last = replace(
         rest[0],
         text=f"And {len(rest)} more of this kind. {rest[0].text}",
@@ -167,7 +169,7 @@ def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
 
 
 def advice_on(
-    around: Situation, found: Found, names: tuple[str, ...], matters: bool, weak: bool
+    around: Situation, found: OpenMotion, names: tuple[str, ...], matters: bool, weak: bool
 ) -> str:
     """What to do about a motion that changes these parameters."""
     held = _fixing(around, _enough(around, found.motion, names))
@@ -215,13 +217,13 @@ def _more(around: Situation, legs: tuple[int, ...]) -> str:
     if len(poses) == 1:
         return f"{take} more configurations, so that {elsewhere} too"
     turn = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
-    if around.machine.layout.motion[:3].any() and np.abs(turn).max() < TURNED:
+    if around.machine.layout.motion[:3].any() and np.abs(turn).max() < SHIFT_ONLY_TURN:
         return f"Turn the platform in some configurations, so that {elsewhere}"
     what = "lengths" if around.machine.layout.rod_reads.any() else "readings"
     return f"{take} configurations in which {elsewhere}, with {what} near both ends of their range"
 
 
-def _enough(around: Situation, motion: Motion, names: tuple[str, ...]) -> tuple[str, ...]:
+def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> tuple[str, ...]:
     """What is enough to hold: of a convention one axis, or one end of legs of which only the
     difference counts.
     """
@@ -229,7 +231,7 @@ def _enough(around: Situation, motion: Motion, names: tuple[str, ...]) -> tuple[
         return names
     table = around.machine.parameters
     axes = [n for n in sorted(names) if ".axis." in n]
-    axes = [n for n in axes if abs(table.drawing[table.index(n)]) < PARALLEL]
+    axes = [n for n in axes if abs(table.drawing[table.index(n)]) < ZERO_AXIS_COMPONENT]
     return tuple(axes[:1]) or tuple(n for n in names if ".platform." in n) or names
 
 
@@ -243,7 +245,7 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
     entries: dict[str, None] = {}
     for name in sorted(names, key=table.index):
         whole, _, component = name.rpartition(".")
-        every = component in AXES and all(f"{whole}.{c}" in names for c in AXES)
+        every = component in AXIS_LETTERS and all(f"{whole}.{c}" in names for c in AXIS_LETTERS)
         axis = ".axis." in name and len(names) > 1
         entries[whole if every or axis else name] = None
     said: dict[str, None] = {}
@@ -256,7 +258,7 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
             if any(n == f"{leg}]{rest}" or n.startswith(f"{leg}]{rest}.") for n in table.names)
         ]
         alike = len(having) > 1 and all(other in entries for other in having)
-        said[f"{EVERY}{rest}" if alike else entry] = None
+        said[f"{EVERY_LEG}{rest}" if alike else entry] = None
     line = ", ".join(json.dumps(entry) for entry in said)
     where = "in the mechanism file"
     if around.machine.model is not None:  # the file's own entries do not hold then

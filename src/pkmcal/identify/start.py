@@ -13,8 +13,8 @@ from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
-TURNS = 15
-ALIKE = 1e-4
+MEDIAN_TURN_STEPS = 15
+EQUAL_TURNS_ANGLE = 1e-4
 """rad, about; turns that differ by less are one."""
 
 
@@ -59,11 +59,11 @@ def middle_pose(poses: Array) -> Array:
     if not len(poses):
         return np.eye(4)
     weight, rot = np.ones(len(poses)), np.eye(3)
-    for _ in range(TURNS):
+    for _ in range(MEDIAN_TURN_STEPS):
         u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, poses[:, :3, :3]))
         rot = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         apart = np.linalg.norm(poses[:, :3, :3] - rot, axis=(1, 2))
-        weight = 1 / np.maximum(apart, ALIKE)
+        weight = 1 / np.maximum(apart, EQUAL_TURNS_ANGLE)
     return pose(rot, np.median(poses[:, :3, 3], axis=0))
 
 

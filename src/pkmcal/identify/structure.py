@@ -144,10 +144,10 @@ class Structure:
         for own, found in zip(lines, self._lines, strict=True):
             own[: len(found)] = u.shading.start + found
         parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
-        parts += [numbered(u.stations, station, 6), radii]
-        parts += [numbered(u.optics, camera, u.n_optics), lines]
+        parts += [numbered_columns(u.stations, station, 6), radii]
+        parts += [numbered_columns(u.optics, camera, u.n_optics), lines]
         if u.n_breathing:
-            parts.append(numbered(u.breathing, station, 1))
+            parts.append(numbered_columns(u.breathing, station, 1))
         return np.concatenate(parts, axis=1)
 
     @cached_property
@@ -198,6 +198,6 @@ class Structure:
         return np.pad(self.free, ((0, 1), (0, 0)))[self.closure_index]
 
 
-def numbered(part: slice, number: Integers, width: int) -> Integers:
+def numbered_columns(part: slice, number: Integers, width: int) -> Integers:
     """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
     return part.start + width * number[..., None] + np.arange(width)

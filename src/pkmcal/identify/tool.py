@@ -19,14 +19,14 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
 
-SAMPLES = 40
+POSES_AROUND_SESSION = 40
 """Poses around the session's: what a session's few poses hide, others show."""
-TURN, SHIFT = 0.2, 0.12
+AROUND_SESSION_TURN, AROUND_SESSION_SHIFT = 0.2, 0.12
 """How far they reach: rad, and share of the legs' mean length."""
 AS_REGULAR = 0.7
 """Part of the session's own distance from a singular pose that the others keep: near one, any
 error counts manifold, and nobody works there."""
-SEED = 4
+POSES_AROUND_SEED = 4
 NO_TURN = 1e-9
 """rad; what rounding leaves of a turn."""
 
@@ -69,14 +69,14 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
 
 def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     """Readings and poses of the session and of samples about it that the machine can take."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(POSES_AROUND_SEED)
     layout = machine.layout
     base, platform = machine.base_centers(), machine.platform_centers()
-    start = T_base_platform[rng.integers(len(T_base_platform), size=SAMPLES)]
+    start = T_base_platform[rng.integers(len(T_base_platform), size=POSES_AROUND_SESSION)]
     lift = float(np.linalg.norm(start[:, :3, 3].mean(axis=0) - base.mean(axis=0)))
     size = lift + float(np.linalg.norm(platform, axis=-1).max())
-    reach = np.array([TURN] * 3 + [SHIFT * size] * 3)
-    step = rng.uniform(-1, 1, (SAMPLES, 6)) * reach
+    reach = np.array([AROUND_SESSION_TURN] * 3 + [AROUND_SESSION_SHIFT * size] * 3)
+    step = rng.uniform(-1, 1, (POSES_AROUND_SESSION, 6)) * reach
     start = perturb(start, step @ layout.motion @ layout.motion.T)
     # constant legs and joints with axes leave the samples fewer ways: brought back onto them
     found = on_manifold(layout, machine.values, start)

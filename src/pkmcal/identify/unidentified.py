@@ -19,29 +19,29 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
-from pkmcal.identify.sentences import Found, Sentence, few, sentence
+from pkmcal.identify.motions import NamedChanges, Situation, all_radii, candidates
+from pkmcal.identify.sentences import OpenMotion, Sentence, few, sentence
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
-    from pkmcal.identify.covariance import Direction, Identifiability
+    from pkmcal.identify.covariance import Identifiability, ParameterDirection
     from pkmcal.measurements import EdgeSet, Measurements
 
-INSIDE = (0.999, 0.95)
+INSIDE_OPEN_SHARES = (0.999, 0.95)
 """Shares of a change (squared) that lie in the open space for it to explain part of that space:
 first what fits exactly, since much looks alike once frames are taken out, then what fits in all
 but name. The space is that of the estimate, whose poses' noise bends what would be exact."""
-HARDLY = 1 / 3
+HARDLY_TOLD_INFORMATION = 1 / 3
 """Information below which a direction counts as not told: the data then decide less than a tenth
 of its variance. Poses that only shift seem to turn by their noise, so directions that nothing fixes
 come out with a trace of information."""
-NEW = 0.1
+NEW_CHANGE_SINE = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
-FEWEST, CHEAP = 20, 10.0
+STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
 """Steps to the fewest numbers, and how much less a frame's costs: they are not said."""
-HELD = 1e-6
+CONVENTION_LEFT_UNDONE = 1e-6
 """Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
 a convention: both are derivatives at one machine, alike but for rounding."""
 
@@ -66,11 +66,11 @@ class Findings:
     """What the data tell and do not tell: the test, its words, and the paper's conditions.
 
     told : rank and spectrum. unidentified : what such data do not tell, of ``told.unidentified``
-    and of what they know ``HARDLY``. weak : what the drawing knows better. by_drawing : how far
-    (m, as ``Sentence.moves_platform``) the platform moves when all parameters are as wrong as the
-    drawing's tolerances let expect. conventional : held parameters for which any value would
-    do; also_conventional : combinations of the other held ones. bed : how flat it will be, where
-    nothing but heights was measured.
+    and of what they know ``HARDLY_TOLD_INFORMATION``. weak : what the drawing knows better.
+    by_drawing : how far (m, as ``Sentence.moves_platform``) the platform moves when all parameters
+    are as wrong as the drawing's tolerances let expect. conventional : held parameters for which
+    any value would do; also_conventional : combinations of the other held ones. bed : how flat it
+    will be, where nothing but heights was measured.
     """
 
     told: Identifiability
@@ -104,12 +104,12 @@ def explain(
     effect = platform_by_parameters(machine, poses)
     unseen = {id(d) for d in told.unidentified}
 
-    def said(directions: tuple[Direction, ...]) -> tuple[Sentence, ...]:
+    def said(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
         known = [0.0 if id(d) in unseen else d.information for d in directions]
-        return describe(around, vectors(directions, machine), np.array(known), effect)
+        return describe(around, direction_vectors(directions, machine), np.array(known), effect)
 
-    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
-    weak = tuple(d for d in told.weak if d.information >= HARDLY)
+    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY_TOLD_INFORMATION))
+    weak = tuple(d for d in told.weak if d.information >= HARDLY_TOLD_INFORMATION)
     # Poses and heights blend what they hardly see with what they do not: together it has names.
     sentences = (*said(lost), *said(weak)) if photographed else said((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
@@ -131,7 +131,7 @@ def only_heights(estimate: Estimate) -> bool:
     return not estimate.edge_weights.size and len(poses) > 0 and not poses[:, :5].any()
 
 
-def vectors(directions: tuple[Direction, ...], machine: Machine) -> Array:
+def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machine) -> Array:
     """Directions as rows (n, P), in the parameters' units."""
     return np.array([d.vector for d in directions]).reshape(-1, len(machine.parameters))
 
@@ -170,11 +170,11 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     q = q[:, s > 1e-9 * s.max(initial=0.0)]
     left = held - q @ (q.T @ held)
     # a metre moves joints by about a metre: without effect is without effect in metres
-    alone = np.linalg.norm(left, axis=0) < HELD
+    alone = np.linalg.norm(left, axis=0) < CONVENTION_LEFT_UNDONE
     names = tuple(name for name, said in zip(table.fixed, alone, strict=True) if said)
     others = left[:, ~alone]
-    kinds = np.unique(np.round(others / HELD), axis=1)  # what is tied counts once
-    rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > HELD))
+    kinds = np.unique(np.round(others / CONVENTION_LEFT_UNDONE), axis=1)  # what is tied counts once
+    rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > CONVENTION_LEFT_UNDONE))
     return names, kinds.shape[1] - rank
 
 
@@ -199,8 +199,8 @@ def describe(
 
     null : (n, P) changes of all parameters in their units, any basis.
     information : (n,) singular values of what the data know of each after all, in units of the
-    tolerance, 0 where absent: from ``HARDLY`` on it is said that the drawing knows it better, not
-    that it is free. effect : (r, P) as :func:`platform_by_parameters` gives it.
+    tolerance, 0 where absent: from ``HARDLY_TOLD_INFORMATION`` on it is said that the drawing knows
+    it better, not that it is free. effect : (r, P) as :func:`platform_by_parameters` gives it.
     """
     machine = around.machine
     space = _open(machine, null, information)
@@ -209,7 +209,7 @@ def describe(
     if effect is None:
         effect = platform_by_parameters(machine, around.T_base_platform)
     if not around.photographed:  # nobody asks a board how thick legs are
-        space = _without(space, _within(all_radii(around).columns, space, INSIDE[0]))
+        space = _without(space, _within(all_radii(around).columns, space, INSIDE_OPEN_SHARES[0]))
     found = _alike(around, _explained(around, space))
     said = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in found]
     return few(said)
@@ -243,12 +243,15 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
     return vt[s > least * max(float(s[0]), 1e-300)]
 
 
-def _explained(around: Situation, space: _Open) -> list[Found]:
+def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
     """Motions that lie in the open space, each with what it says anew."""
-    parts: list[Found] = []
+    parts: list[OpenMotion] = []
     done = np.zeros((0, space.rows.shape[1]))
     known, whole = list(candidates(around)), space
-    for motion, inside in [*((m, share) for share in INSIDE for m in known[:-1]), (known[-1], 0.0)]:
+    for motion, inside in [
+        *((m, share) for share in INSIDE_OPEN_SHARES for m in known[:-1]),
+        (known[-1], 0.0),
+    ]:
         if len(done) == len(whole.rows):
             break
         found = _within(motion.columns, space, inside)
@@ -260,7 +263,7 @@ def _explained(around: Situation, space: _Open) -> list[Found]:
         done = _orthonormal(np.concatenate([done, new]))
         numbers = _coefficients(motion, space, found)
         own = numbers @ motion.columns.T / space.unit
-        parts.append(Found(motion, motion.legs, found, numbers, own, len(new)))
+        parts.append(OpenMotion(motion, motion.legs, found, numbers, own, len(new)))
         if motion.convention:
             space = _without(space, new)
     return parts
@@ -278,7 +281,7 @@ def _directions(rows: Array) -> Array:
     if rows.size == 0:
         return rows[:0]
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
-    return vt[s > NEW]
+    return vt[s > NEW_CHANGE_SINE]
 
 
 def _within(changes: Array, space: _Open, inside: float) -> Array:
@@ -293,7 +296,7 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
     return u[:, s**2 > inside].T @ space.rows
 
 
-def _coefficients(motion: Motion, space: _Open, found: Array) -> Array:
+def _coefficients(motion: NamedChanges, space: _Open, found: Array) -> Array:
     """The motion's own numbers (k, m) for each direction, frames aside.
 
     Frames leave a choice: of a single change the numbers whose magnitudes have the smallest sum,
@@ -306,16 +309,16 @@ def _coefficients(motion: Motion, space: _Open, found: Array) -> Array:
     weight = np.ones(both.shape[1])
     few = len(found) == 1 and m > 1 and not (motion.how or motion.convention)
     solved = np.linalg.lstsq(both, found.T, rcond=1e-6)[0]
-    for _ in range(FEWEST if few else 0):
+    for _ in range(STEPS_TO_FEWEST_NUMBERS if few else 0):
         weight[:m] = np.sqrt(np.abs(solved[:m, 0]) / max(np.abs(solved[:m, 0]).max(), 1e-300))
-        weight[m:] = CHEAP
+        weight[m:] = CHEAP_FRAME_WEIGHT
         solved = np.linalg.lstsq(both * weight, found.T, rcond=1e-6)[0] * weight[:, None]
     return (solved[:m] / scale[:, None]).T
 
 
-def _alike(around: Situation, parts: list[Found]) -> list[Found]:
+def _alike(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
     """Parts with one sentence as one: the same of several legs, or the same legs' again."""
-    out: dict[tuple[object, ...], Found] = {}
+    out: dict[tuple[object, ...], OpenMotion] = {}
     for part in parts:
         single = len(part.legs) == 1
         key = (part.motion.one, *((part.how(around), len(part.space)) if single else part.legs))
@@ -323,7 +326,7 @@ def _alike(around: Situation, parts: list[Found]) -> list[Found]:
     return [_with_last_leg(part, parts) for part in out.values()]
 
 
-def _with_last_leg(part: Found, parts: list[Found]) -> Found:
+def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
     """Sizes of all legs but one, of which the common part is said too, are those of all legs."""
     alike = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
     single = bool(part.motion.labels) and len(part.motion.legs) == 1
@@ -332,7 +335,7 @@ def _with_last_leg(part: Found, parts: list[Found]) -> Found:
     return part
 
 
-def _moves(part: Found, space: _Open, effect: Array) -> tuple[float, bool]:
+def _moves(part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
     """How far (m) it moves the platform, and whether the data know something of it after all."""
     found = _directions(part.space)
     mixed = found @ space.rows.T
@@ -341,4 +344,4 @@ def _moves(part: Found, space: _Open, effect: Array) -> tuple[float, bool]:
     # the estimate's information is the drawing's, one, and the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
     known = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-    return float(np.sqrt(np.sum((moved @ covariance) * moved))), known >= HARDLY
+    return float(np.sqrt(np.sum((moved @ covariance) * moved))), known >= HARDLY_TOLD_INFORMATION

@@ -26,7 +26,7 @@ from pkmcal.wording import count, listed
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-FAR = 5.0
+FAR_FROM_DRAWING = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""
 TOO_NOISY = 4.0
 """Factor on the edges' stated noise beyond which the model does not explain the photographs."""
@@ -37,9 +37,9 @@ LEFT_OPEN = 0.05
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
 largest error, and one that more of the same photographs do not shrink. A result whose deviation is
 larger anyway is no worse for it."""
-MOSTLY = 0.5
+MOSTLY_SINGULAR_SHARE = 0.5
 """Share of configurations near a singular pose from which on nothing said here can be trusted."""
-LARGE = 0.3
+LARGE_CAUSE_SHARE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
 WORTH_SAYING = 0.5
 """Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
@@ -52,7 +52,7 @@ ENOUGH_TOUCHES = 15
 (benchmarks/heights.py)."""
 EXACT_SHARE = 1e-9
 """Part of a variance below which it is rounding."""
-POOR = 1.3
+POOR_MODEL_POSE_SCALE = 1.3
 """Factor on the poses' noise beyond which the model is too poor for them, if that is no chance."""
 
 
@@ -284,7 +284,7 @@ def _poses_doubted(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[
     s = estimate.statistics
     # the scale of n numbers that are noise has the standard deviation 1 / sqrt(2 n)
     chance = 1 + 4 / np.sqrt(2 * max(s.dof_poses, 1.0))
-    if not max(POOR, chance) < s.pose_scale <= TOO_NOISY:
+    if not max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= TOO_NOISY:
         return []
     return [
         f"The measured poses disagree with the model {s.pose_scale:.1f} times more than their"
@@ -306,7 +306,7 @@ def _singular(estimate: Estimate) -> list[str]:
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
-    if weak.mean() < MOSTLY:
+    if weak.mean() < MOSTLY_SINGULAR_SHARE:
         return []
     return [
         f"The machine is near a singular pose in {int(weak.sum())} of {weak.size} configurations:"
@@ -332,7 +332,7 @@ def _left_open(
     # where all else makes more of the deviation that was reached, that says enough
     if total <= np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
-    least = min(LARGE * total, max(s.moves_platform for s in open_))
+    least = min(LARGE_CAUSE_SHARE * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
     return large, tuple(s for s in open_ if s not in large)
 
@@ -360,11 +360,12 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
-    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR]
+    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_DRAWING]
     if far:
         out.append(
             f"{listed(far, 4)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
-            f" {FAR:.0f} tolerances (up to {change.max():.0f}): check the drawing and its frame."
+            f" {FAR_FROM_DRAWING:.0f} tolerances (up to {change.max():.0f}): check the drawing"
+            f" and its frame."
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
     out.extend(

@@ -17,13 +17,13 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.gather import by_focal, edges_by_camera
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
-from pkmcal.judge.held import MOVED, RATIO, Evidence
+from pkmcal.judge.held import USUAL_RATIO_CHANGE, USUAL_STATION_MOVE, Evidence
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import split_name
 
-Side = Literal["base", "platform"]
-SIDES: tuple[Side, Side] = ("base", "platform")
+JointSide = Literal["base", "platform"]
+JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,10 @@ class Cause:
     part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
     ``station``. columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or
     (P + C, k), then of the cameras' magnification; or of all columns of
-    :class:`~pkmcal.judge.held.Evidence`. sizes : (k,) usual ones: a drawing's tolerance, RATIO, or
-    MOVED. legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio. camera, station :
-    numbers in the session.
+    :class:`~pkmcal.judge.held.Evidence`. sizes : (k,) usual ones: a drawing's tolerance,
+    USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
+    nothing for a ratio.
+    camera, station : numbers in the session.
     """
 
     part: str
@@ -82,21 +83,28 @@ def common_scale(machine: Machine) -> Cause:
         [u == "m" and k != "axis" for u, k in zip(table.units, table.kinds, strict=True)]
     )
     column = np.where(lengths, machine.values, 0.0)[:, None]
-    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([RATIO]), "")
+    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([USUAL_RATIO_CHANGE]), "")
 
 
 def magnification(machine: Machine, camera: int) -> Cause:
     """A camera's picture larger by a factor, by its excess over 1."""
     column = np.zeros((len(machine.parameters) + camera + 1, 1))
     column[-1] = 1.0
-    return Cause("camera", (), column, np.array([RATIO]), "", camera)
+    return Cause("camera", (), column, np.array([USUAL_RATIO_CHANGE]), "", camera)
 
 
 def stations_moved(found: Evidence) -> tuple[Cause, ...]:
     """Each camera that is said to have been left in place turned and moved, (phi, s)."""
     columns = np.eye(found.by.shape[1])[:, found.by.shape[1] - 6 * len(found.kept) :]
     return tuple(
-        Cause("station", (), columns[:, 6 * k : 6 * k + 6], np.full(6, MOVED), "m", station=station)
+        Cause(
+            "station",
+            (),
+            columns[:, 6 * k : 6 * k + 6],
+            np.full(6, USUAL_STATION_MOVE),
+            "m",
+            station=station,
+        )
         for k, station in enumerate(found.kept)
     )
 
@@ -111,7 +119,7 @@ def single_causes(machine: Machine, found: Evidence | None = None) -> tuple[Caus
         for part in dict.fromkeys(machine.parameters.parts)
         if (cause := _of_names(machine, part, legs)).sizes.size
     ]
-    for side in SIDES:
+    for side in JOINT_SIDES:
         for pair in _neighbours(machine, side):  # a mount that both share
             one, other = (joint_of(machine, side, leg) for leg in pair)
             out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
@@ -123,7 +131,7 @@ def single_causes(machine: Machine, found: Evidence | None = None) -> tuple[Caus
     return (*out, *stations_moved(found))
 
 
-def joined(causes: Sequence[Cause]) -> Cause:
+def joined_causes(causes: Sequence[Cause]) -> Cause:
     """Several causes at once, each by its own numbers."""
     n = max(len(cause.columns) for cause in causes)
     columns = [np.pad(c.columns, ((0, n - len(c.columns)), (0, 0))) for c in causes]
@@ -136,7 +144,7 @@ def joined(causes: Sequence[Cause]) -> Cause:
     )
 
 
-def joint_of(machine: Machine, side: Side, leg: int) -> Cause:
+def joint_of(machine: Machine, side: JointSide, leg: int) -> Cause:
     """A leg's joint on one side, base or platform, moved by a vector."""
     index = centre_index(machine.layout)[side == "platform"][leg]
     columns = np.eye(len(machine.parameters))[:, index]
@@ -162,7 +170,7 @@ def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
     return Cause(part, legs, columns, tolerance, units.pop() if len(units) == 1 else "m")
 
 
-def _neighbours(machine: Machine, side: Side) -> list[tuple[int, int]]:
+def _neighbours(machine: Machine, side: JointSide) -> list[tuple[int, int]]:
     """Pairs of legs whose joints on one side are each other's nearest, and not of one arm."""
     index = centre_index(machine.layout)[side == "platform"]
     if machine.n_legs < 4:  # three joints have no sides

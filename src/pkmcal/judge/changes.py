@@ -18,10 +18,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.score import Score
 from pkmcal.judge.causes import (
-    SIDES,
+    JOINT_SIDES,
     Cause,
     common_scale,
-    joined,
+    joined_causes,
     joint_of,
     single_causes,
     stations_moved,
@@ -32,14 +32,14 @@ from pkmcal.judge.causes import (
 from pkmcal.judge.held import Evidence
 from pkmcal.mechanisms import Machine
 
-SEEN = 1.0
+LEAST_SEEN_DEVIATIONS = 1.0
 """Standard deviations that a change of one tolerance must make for its direction to be tested; a
 direction that is hardly seen would only add noise to the test."""
-POWER = 0.9
+DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
-DRAWS = 20_000
+WATCH_NOISE_DRAWS = 20_000
 """Draws of noise: a share of 0.01 of them is then known to 7 % of itself."""
-ODDS = 2 * np.log(100.0)
+TOLD_APART_LOG_ODDS = 2 * np.log(100.0)
 """Two causes are told apart where one makes the data a hundred times as likely as the other."""
 MOST_CAUSES = 4
 """Changes that are looked for one after the other; more are a machine that was taken apart."""
@@ -69,11 +69,11 @@ class Change:
         return {"change": self.value, "sigma": self.sigma}
 
 
-def directions(found: Evidence, cause: Cause) -> SeenCause:
+def seen_directions(found: Evidence, cause: Cause) -> SeenCause:
     """The directions in w of a cause that the data see."""
     scaled = found.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
-    seen = s > SEEN
+    seen = s > LEAST_SEEN_DEVIATIONS
     return SeenCause(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
 
 
@@ -81,19 +81,19 @@ def chi_square(found: Evidence, cause: Cause) -> Score:
     """Whether the data show the cause."""
     from scipy.special import chdtrc
 
-    q = directions(found, cause).q
+    q = seen_directions(found, cause).q
     chi2, dof = float(np.sum((q.T @ found.w) ** 2)), q.shape[1]
     return Score(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0)
 
 
-def likelihood(found: Evidence, cause: Cause) -> float:
+def twice_log_odds(found: Evidence, cause: Cause) -> float:
     """Twice the log of how many times likelier the data are with the cause than with no change.
 
     The change's numbers are averaged over normal distributions of their ``sizes``: what one cause
     explains by 0.5 mm and another by 8 mm is rather the first's, and a cause of three numbers must
     explain more than one of a single number.
     """
-    q, gain = directions(found, cause)
+    q, gain = seen_directions(found, cause)
     told, scaled = q.T @ found.w, gain * cause.sizes
     spread = np.eye(len(told)) + scaled @ scaled.T
     expected = float(told @ np.linalg.solve(spread, told))
@@ -104,8 +104,8 @@ def likelihood(found: Evidence, cause: Cause) -> float:
 class CommonLevel:
     """What several tests made at once are worth.
 
-    least : (DRAWS,) the smallest chance of all tests in each draw of pure noise, in order. count :
-    of the tests that see anything.
+    least : (WATCH_NOISE_DRAWS,) the smallest chance of all tests in each draw of pure noise, in
+    order. count : of the tests that see anything.
     """
 
     least: Array
@@ -128,7 +128,7 @@ class CommonLevel:
         return max(drawn, alpha / max(self.count, 1))
 
 
-def together(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
+def common_level(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
     """The tests of several causes made at once: the same noise goes through all of them.
 
     Tests overlap (legs share what poses take up), so that the usual allowance for their number
@@ -136,9 +136,9 @@ def together(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
     """
     from scipy.special import chdtrc
 
-    noise = np.random.default_rng(0).standard_normal((DRAWS, len(found.w)))
-    parts = [q for q in (directions(found, cause).q for cause in causes) if q.shape[1]]
-    least = np.ones(DRAWS)
+    noise = np.random.default_rng(0).standard_normal((WATCH_NOISE_DRAWS, len(found.w)))
+    parts = [q for q in (seen_directions(found, cause).q for cause in causes) if q.shape[1]]
+    least = np.ones(WATCH_NOISE_DRAWS)
     for q in parts:
         np.minimum(least, chdtrc(q.shape[1], np.sum((noise @ q) ** 2, axis=1)), out=least)
     return CommonLevel(np.sort(least), len(parts))
@@ -146,7 +146,7 @@ def together(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
 
 def change(found: Evidence, cause: Cause) -> Change:
     """The change by least squares, nothing else changed."""
-    seen = directions(found, cause)
+    seen = seen_directions(found, cause)
     inverse = np.linalg.pinv(seen.gain)
     covariance = inverse @ inverse.T
     # a number of which a part is not seen is not told
@@ -160,17 +160,17 @@ def change(found: Evidence, cause: Cause) -> Change:
 
 
 def detectable(found: Evidence, tester: Cause, along: Array, level: float) -> float:
-    """The smallest change along a direction that a test at a level detects with POWER.
+    """The smallest change along a direction that a test at a level detects with DETECTION_POWER.
 
     along : (P,) the change of the parameters by one unit (m, rad). inf where it is not seen.
     """
     from scipy.special import chdtri, chndtrinc
 
-    q = directions(found, tester).q
+    q = seen_directions(found, tester).q
     size = float(np.linalg.norm(q.T @ (found.along(along[:, None]))))
     if not q.shape[1] or size == 0.0:
         return float("inf")
-    need = float(chndtrinc(chdtri(q.shape[1], level), q.shape[1], 1 - POWER))
+    need = float(chndtrinc(chdtri(q.shape[1], level), q.shape[1], 1 - DETECTION_POWER))
     return float(np.sqrt(need) / size)
 
 
@@ -178,7 +178,7 @@ def detectable_range(
     found: Evidence, tester: Cause, part: Cause, level: float
 ) -> tuple[float, float]:
     """Smallest detectable changes of a part in the direction that is seen best, and worst."""
-    q = directions(found, tester).q
+    q = seen_directions(found, tester).q
     if not q.shape[1] or not part.sizes.size:
         return float("inf"), float("inf")
     gain = q.T @ found.along(part.columns)
@@ -194,8 +194,8 @@ class LegTest:
     legs : from 0. whole : test of all its numbers but the tubes' radii. zero : of its reading's
     zero alone, with the change of it, if nothing else changed; None for a leg without a reading.
     unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is detected
-    with POWER. detects_base, detects_platform : the same of its joints (m), in the direction seen
-    best, and worst.
+    with DETECTION_POWER. detects_base, detects_platform : the same of its joints (m), in the
+    direction seen best, and worst.
     """
 
     legs: tuple[int, ...]
@@ -327,7 +327,7 @@ class ChangeTests:
         return {
             "alpha": self.alpha,
             "level": self.level,
-            "power": POWER,
+            "power": DETECTION_POWER,
             "changed": self.changed,
             "machine": asdict(self.machine),
             "legs": [leg.document() for leg in self.legs],
@@ -355,7 +355,7 @@ def made_tests(
     causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
     causes += stations_moved(found)
     zero = zeros(machine)
-    level = together(found, [*causes, *(cause for cause in zero if cause)])
+    level = common_level(found, [*causes, *(cause for cause in zero if cause)])
 
     def test(cause: Cause) -> Score:
         told = chi_square(found, cause)
@@ -407,7 +407,7 @@ def _leg(
     """A leg's tests, of all of it and of its zero, and what they would have found."""
     base, platform = (
         detectable_range(found, whole, joint_of(machine, side, whole.legs[0]), level)
-        for side in SIDES
+        for side in JOINT_SIDES
     )
     least = float("inf")
     if zero is not None:
@@ -440,7 +440,10 @@ def explained(found: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[E
             break
         chosen = (*chosen, best)
         if len(chosen) == 2:
-            pairs = [(likelihood(found, joined(pair)), pair) for pair in combinations(causes, 2)]
+            pairs = [
+                (twice_log_odds(found, joined_causes(pair)), pair)
+                for pair in combinations(causes, 2)
+            ]
             chosen = max(pairs, key=lambda item: item[0])[1]
         chosen = _exchanged(found, chosen, causes)
     findings = [_finding(found, chosen, k, causes) for k in range(len(chosen))]
@@ -469,7 +472,7 @@ def _ranked(
     best first.
     """
     free = [c for c in causes if all(c is not other for other in others)]
-    scored = [(likelihood(found, joined((*others, cause))), cause) for cause in free]
+    scored = [(twice_log_odds(found, joined_causes((*others, cause))), cause) for cause in free]
     return sorted(scored, key=lambda item: -item[0])
 
 
@@ -480,8 +483,8 @@ def _finding(
     own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
     left = _beside(found, others)
     # what explains no more than nothing would is no rival, however weak the best
-    nothing = likelihood(found, joined(others)) if others else 0.0
-    least = max(likelihood(found, joined(chosen)) - ODDS, nothing)
+    nothing = twice_log_odds(found, joined_causes(others)) if others else 0.0
+    least = max(twice_log_odds(found, joined_causes(chosen)) - TOLD_APART_LOG_ODDS, nothing)
     near = [c for score, c in _ranked(found, others, causes) if score > least and c is not own]
     suspects = [Suspect(c, change(left, c), chi_square(left, c).chi2) for c in (own, *near)]
     return Explanation(suspects[0], chi_square(left, own), tuple(suspects[1:]))
@@ -491,7 +494,7 @@ def _beside(found: Evidence, chosen: Sequence[Cause]) -> Evidence:
     """The evidence without what other causes explain: their directions taken out."""
     left = found
     for cause in chosen:
-        q = directions(left, cause).q
+        q = seen_directions(left, cause).q
         rest = np.linalg.svd(q, full_matrices=True)[0][:, q.shape[1] :]
         left = replace(left, w=rest.T @ left.w, by=rest.T @ left.by)
     return left

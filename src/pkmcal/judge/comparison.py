@@ -12,22 +12,24 @@ from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
-REPEATS = 4000
+RATIO_BOOTSTRAP_DRAWS = 4000
 """Bootstrap draws: percentiles of the ratio are then known to a hundredth or two."""
-SURE = 0.95
+RATIO_INTERVAL_PROBABILITY = 0.95
 """Probability that the stated interval of the ratio holds."""
-CHANCE = 1e-3
+UNEXPLAINED_RESIDUAL_CHANCE = 1e-3
 """Probability below which residuals are not explained by the deviations."""
-MARGIN = 1.5
+ALLOWED_RESIDUAL_EXCESS = 1.5
 """Factor by which residuals may exceed the deviations: these cover noise, and a few tenths more
 come from shading and lenses in any photographs."""
-RANK = 1e-9
+NULL_EIGENVALUE_SHARE = 1e-9
 """Share of the largest eigenvalue, of scaled residuals, below which nothing can deviate."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times better: value, standard deviation, and the interval that holds it for SURE."""
+    """How many times better: value, standard deviation, and the interval that holds it for
+    RATIO_INTERVAL_PROBABILITY.
+    """
 
     value: float
     sigma: float
@@ -47,7 +49,8 @@ class Promise:
     chi2, dof, chance : of all residuals. factor : residuals over promise, root mean square.
     common : (m,) what each reading is off in all configurations alike, m or rad, and common_sigma :
     (m,) its standard deviation; common_chance : of all of them being zero. usual, steady : whether
-    residuals, and what they have in common, are not larger than promised but for MARGIN.
+    residuals, and what they have in common, are not larger than promised but for
+    ALLOWED_RESIDUAL_EXCESS.
     expected : (n, m) standard deviations that are promised, by_noise : (n, m) the part of the
     photographs' and the readings' noise, m or rad.
     """
@@ -72,7 +75,7 @@ class Promise:
     @property
     def joint_rms(self) -> Array:
         """Root mean squares (m,) of the readings' residuals that are promised, m or rad."""
-        return weighed(self.expected, self.by_noise)[1]
+        return weighed_mean_and_rms(self.expected, self.by_noise)[1]
 
 
 @dataclass(frozen=True)
@@ -111,10 +114,11 @@ class BesideDrawing:
     def figures(self, errors: ReadingErrors) -> WeighedErrors:
         """Of the drawing's or the calibrated machine's errors."""
         sigma = self.promise.by_noise
-        mean, root = weighed(errors.residuals, sigma)
+        mean, root = weighed_mean_and_rms(errors.residuals, sigma)
         each = np.sqrt(np.mean(sigma**2, axis=1))
         position, orientation = (
-            float(weighed(values, each)[1]) for values in (errors.position, errors.orientation)
+            float(weighed_mean_and_rms(values, each)[1])
+            for values in (errors.position, errors.orientation)
         )
         return WeighedErrors(mean, root, position, orientation)
 
@@ -156,7 +160,7 @@ class BesideDrawing:
         }
 
 
-def compare(
+def compare_with_drawing(
     drawing: Machine,
     covariance: Array,
     measurements: Measurements,
@@ -190,7 +194,7 @@ def compare(
         before=before,
         after=after,
         floor=weights.floor,
-        ratio=ratio(before, after),
+        ratio=improvement_ratio(before, after),
         promise=promise(new.residuals, noise, by @ covariance @ by.T),
     )
 
@@ -200,7 +204,7 @@ def finite_rms(values: Array) -> float:
     return rms(values[np.isfinite(values)])
 
 
-def weighed(values: Array, sigma: Array) -> tuple[Array, Array]:
+def weighed_mean_and_rms(values: Array, sigma: Array) -> tuple[Array, Array]:
     """Mean and root mean square over n configurations of values (n, ...), weighed by their noise.
 
     sigma : of the same shape; a pose that is hardly seen hardly counts. NaN is left out.
@@ -211,7 +215,7 @@ def weighed(values: Array, sigma: Array) -> tuple[Array, Array]:
     return mean, np.sqrt(np.sum(weight * values**2, axis=0) / total)
 
 
-def ratio(worse: Array, better: Array) -> Ratio:
+def improvement_ratio(worse: Array, better: Array) -> Ratio:
     """How many times smaller errors ``better`` (n,) are than ``worse``, root mean squares.
 
     Bootstrap over configurations n, both drawn together; those without one of the two are left out.
@@ -221,9 +225,11 @@ def ratio(worse: Array, better: Array) -> Ratio:
     old, new = old[both], new[both]
     if not old.size:
         return Ratio(*[float("nan")] * 4)
-    rows = np.random.default_rng(0).integers(old.size, size=(REPEATS, old.size))
+    rows = np.random.default_rng(0).integers(old.size, size=(RATIO_BOOTSTRAP_DRAWS, old.size))
     drawn = np.sqrt(old[rows].sum(axis=1) / np.maximum(new[rows].sum(axis=1), 1e-300))
-    low, high = np.quantile(drawn, [0.5 - SURE / 2, 0.5 + SURE / 2])
+    low, high = np.quantile(
+        drawn, [0.5 - RATIO_INTERVAL_PROBABILITY / 2, 0.5 + RATIO_INTERVAL_PROBABILITY / 2]
+    )
     value = float(np.sqrt(old.sum() / max(new.sum(), 1e-300)))
     return Ratio(value, float(drawn.std()), float(low), float(high))
 
@@ -240,7 +246,7 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
     shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    known = values > RANK * values[-1]
+    known = values > NULL_EIGENVALUE_SHARE * values[-1]
     whiten = (vectors[:, known] / np.sqrt(values[known])).T / scale
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
@@ -256,8 +262,11 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
         common=common,
         common_sigma=np.sqrt(np.diag(spread)),
         common_chance=float(chdtrc(dof_common, chi2_common)),
-        usual=bool(chdtrc(dof, chi2 / MARGIN**2) > CHANCE),
-        steady=bool(chdtrc(dof_common, chi2_common / MARGIN**2) > CHANCE),
+        usual=bool(chdtrc(dof, chi2 / ALLOWED_RESIDUAL_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE),
+        steady=bool(
+            chdtrc(dof_common, chi2_common / ALLOWED_RESIDUAL_EXCESS**2)
+            > UNEXPLAINED_RESIDUAL_CHANCE
+        ),
         expected=np.sqrt(np.diag(covariance)).reshape(shape),
         by_noise=np.sqrt(np.maximum(np.diag(noise), 0.0)).reshape(shape),
     )

@@ -13,20 +13,20 @@ from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.calibration.source import loaded
 from pkmcal.calibration.toolmap import ToolMap, map_of
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import plain
+from pkmcal.files import json_value
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.change import MachineChange, machine_change
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.region import AXES, Region
+from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
 from pkmcal.wording import amount, brief, capital, count, listed, number
 
-FORMAT = 1
-ALPHA = 0.01
+DIFFERENCE_FORMAT = 1
+DIFFERENCE_ALPHA = 0.01
 """Share of unchanged machines that are said to have changed all the same."""
-SAME = 1e-9
+SAME_NUMBER_DIFFERENCE = 1e-9
 """m or rad; numbers that differ by less are the same."""
-NAMED = 4
+MOST_CHANGES_NAMED = 4
 """Changes that the verdict names."""
 
 
@@ -78,9 +78,9 @@ class MachineDifference:
     def ordered(self) -> list[int]:
         """Parameters with a change to tell of, the one least like chance first."""
         size = np.abs(self.found.change)
-        some = np.flatnonzero(size > SAME)
+        some = np.flatnonzero(size > SAME_NUMBER_DIFFERENCE)
         if self.found.dof:
-            sigma = np.maximum(self.found.sigma, SAME)
+            sigma = np.maximum(self.found.sigma, SAME_NUMBER_DIFFERENCE)
             size = size / sigma
         else:
             size = size / self.a.machine.parameters.tolerance
@@ -89,7 +89,7 @@ class MachineDifference:
     @property
     def significant(self) -> list[int]:
         """Those that chance does not explain; between drawings, all that differ."""
-        return [k for k in self.ordered if not self.chances[k] >= ALPHA / 2]
+        return [k for k in self.ordered if not self.chances[k] >= DIFFERENCE_ALPHA / 2]
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
@@ -103,9 +103,9 @@ class MachineDifference:
             }
             for side in (self.a, self.b)
         ]
-        return plain(
+        return json_value(
             {
-                "pkmcal_diff": FORMAT,
+                "pkmcal_diff": DIFFERENCE_FORMAT,
                 "verdict": asdict(self.verdict),
                 "changed": self.changed,
                 "a": sides[0],
@@ -170,8 +170,8 @@ def difference(
         tool = f"There is no map of the workspace: {error}"
     chance, chances = _chances(found)
     least = float(np.nanmin(chances, initial=1.0))
-    held = (found.sigma <= SAME) & (np.abs(found.change) > SAME)
-    changed = bool(chance < ALPHA / 2 or least < ALPHA / 2 or held.any())
+    held = (found.sigma <= SAME_NUMBER_DIFFERENCE) & (np.abs(found.change) > SAME_NUMBER_DIFFERENCE)
+    changed = bool(chance < DIFFERENCE_ALPHA / 2 or least < DIFFERENCE_ALPHA / 2 or held.any())
     free = free_of_gauge(found.machine, found.covariance)
     out = MachineDifference(
         a=one,
@@ -219,7 +219,7 @@ def _one_drawing(both: list[SavedCalibration]) -> bool:
     """Whether two calibrations lean on the same values with the same tolerances."""
     one, other = both
     first, second = (saved.machine.parameters.tolerance for saved in both)
-    alike = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME)
+    alike = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
     return alike and np.allclose(first, second)
 
 
@@ -248,7 +248,7 @@ def _region(both: list[SavedCalibration]) -> Region | None:
     for saved in both:
         region = (saved.document.get("tool") or {}).get("region")
         if region:
-            sides = {k: tuple(region[k]) if region.get(k) else None for k in AXES}
+            sides = {k: tuple(region[k]) if region.get(k) else None for k in REGION_AXES}
             return Region(**sides, turn=region.get("turn"))
     return None
 
@@ -258,7 +258,7 @@ def _chances(found: MachineChange) -> tuple[float, Array]:
     from scipy.special import chdtrc, ndtr
 
     sigma = found.sigma
-    known = sigma > SAME
+    known = sigma > SAME_NUMBER_DIFFERENCE
     chances = np.full(len(sigma), np.nan)
     single = 2 * ndtr(-np.abs(found.change[known]) / sigma[known])
     chances[known] = np.minimum(1.0, single * found.dof)
@@ -281,7 +281,7 @@ def _assumed(
             *out,
             f"The drawing {drawn[0].name} is taken at its word; the standard deviations are the"
             " calibration's.",
-            MODEL,
+            UNMODELLED_CHANGES_TEXT,
         )
     out.append(
         "Both calibrations lean on the same drawing: where that alone decides, they agree, and its"
@@ -297,10 +297,10 @@ def _assumed(
         if shared
         else "They share no configuration, so the noise of one is independent of the other's."
     )
-    return (*out, MODEL)
+    return (*out, UNMODELLED_CHANGES_TEXT)
 
 
-MODEL = (
+UNMODELLED_CHANGES_TEXT = (
     "What the model leaves out and differs from one day to the next (bending, play, a lens, warmth)"
     " comes on top of the standard deviations, and counts as a change."
 )
@@ -313,7 +313,7 @@ def _judged(d: MachineDifference) -> MachineDifference:
         for side in (d.a, d.b)
         if side.saved is not None and not side.saved.verdict.usable
     ]
-    if not np.any(np.abs(d.found.change) > SAME):
+    if not np.any(np.abs(d.found.change) > SAME_NUMBER_DIFFERENCE):
         headline = "The two are the same: no number differs by more than rounding."
     elif not d.changed:
         headline = (
@@ -326,7 +326,7 @@ def _judged(d: MachineDifference) -> MachineDifference:
         headline = f"Drawing and calibration differ by more than chance explains{_of_tool(d)}."
     else:
         headline = f"The drawings differ{_of_tool(d)}."
-    named = [_named(d, k) for k in d.significant[:NAMED]] if d.changed else []
+    named = [_named(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
     left = len(d.significant) - len(named)
     if named and left > 0:
         named.append(f"{count(left, 'more number')}.")
@@ -380,6 +380,6 @@ def change_text(d: MachineDifference, k: int) -> str:
     sign = "+" if value >= 0 else "−"
     if unit in ("m", "rad"):
         text = f"{sign}{amount(abs(value), unit)}"
-        return f"{text} (±{amount(sigma, unit)})" if sigma > SAME else text
+        return f"{text} (±{amount(sigma, unit)})" if sigma > SAME_NUMBER_DIFFERENCE else text
     text = f"{sign}{abs(value):.2g}"
-    return f"{text} (±{sigma:.2g})" if sigma > SAME else text
+    return f"{text} (±{sigma:.2g})" if sigma > SAME_NUMBER_DIFFERENCE else text

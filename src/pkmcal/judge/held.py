@@ -35,11 +35,11 @@ from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
 from pkmcal.solver.search import Stop, minimise
 
-RATIO = 1e-3
+USUAL_RATIO_CHANGE = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
-MOVED = 1e-2
+USUAL_STATION_MOVE = 1e-2
 """m and rad: the same of a camera's place, what a tripod makes that somebody ran into."""
-UNSCALED = Kinds(1.0, 1.0)
+UNSCALED_NOISE = Kinds(1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Trust:
     """
 
     robust: Kinds[Array]
-    scale: Kinds[float] = UNSCALED
+    scale: Kinds[float] = UNSCALED_NOISE
     readings: float = 1.0
     shading: float = SHADING_SIGMA
 
@@ -67,7 +67,9 @@ class Trust:
         return cls(Kinds(np.ones(len(measurements.edges)), np.ones(len(measurements.poses))))
 
     @classmethod
-    def of(cls, estimate: Estimate, scale: Kinds[float] = UNSCALED, readings: float = 1.0) -> Trust:
+    def of(
+        cls, estimate: Estimate, scale: Kinds[float] = UNSCALED_NOISE, readings: float = 1.0
+    ) -> Trust:
         """An estimate's weights, for data as it found them
         (:meth:`~pkmcal.identify.estimate.Estimate.as_found`), where the calibration's factors on
         the stated noise are larger by as much more; of the readings the estimate's own where its
@@ -232,8 +234,8 @@ def evidence(held: Held, known: Known) -> Evidence:
     size = np.concatenate(
         [
             machine.parameters.tolerance,
-            np.full(n_cameras, RATIO),
-            np.full(6 * len(stations), MOVED),
+            np.full(n_cameras, USUAL_RATIO_CHANGE),
+            np.full(6 * len(stations), USUAL_STATION_MOVE),
         ]
     )
     by = rows * size

@@ -11,7 +11,7 @@ from pkmcal.calibration.aside import Neighbours, by_region, select
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
-from pkmcal.judge.comparison import BesideDrawing, compare
+from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
 from pkmcal.judge.prediction import predict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -70,7 +70,7 @@ def judged_without(
     out = region.rows[found.seen[region.rows]]
     used = np.setdiff1d(np.flatnonzero(found.seen), out)
     both = (
-        compare(drawing, estimate.covariance, measurements, found, None, rows)
+        compare_with_drawing(drawing, estimate.covariance, measurements, found, None, rows)
         for rows in (out, used)
     )
     return HoldOut(region, estimate, *both)

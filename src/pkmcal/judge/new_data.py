@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
 from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, digests
@@ -58,15 +58,15 @@ def check_new(known: Booleans, seen: Booleans, what: str, expected: str, next_st
         )
 
 
-def look(
-    saved: SavedCalibration, session: Session, seed: int, told: Progress, share: float
+def measured_new_data(
+    saved: SavedCalibration, session: Session, seed: int, told: CalibrationProgress, share: float
 ) -> Calibration:
     """The session measured, and a first estimate of where everything is; see the module. Its own
     session is without the photographs by hand that were not placed, and stations are numbered so.
 
     seed : of the search for the stations. told : gets the first ``share`` of the progress.
     """
-    return calibrate(
+    return calibrate_session(
         replace(session, machine=saved.machine),
         seed=seed,
         progress=lambda text, part: told(text, share * part),

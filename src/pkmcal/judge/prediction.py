@@ -3,9 +3,9 @@
 Stations, boards' mounts and the platform's poses are estimated from the photographs, the machine
 is held (:mod:`pkmcal.judge.held`). Where photographs leave open where stations and boards are (a
 board tells a pose in a camera that stands anywhere), readings of *other* configurations tell:
-closures stand in the estimate with the soft deviation :data:`SOFT`, which gives way to anything
-seen, and each configuration's own readings are then taken out again exactly, by their leverage
-(leave-one-out).
+closures stand in the estimate with the soft deviation :data:`SOFT_READING_NOISE`, which gives way
+to anything seen, and each configuration's own readings are then taken out again exactly, by their
+leverage (leave-one-out).
 
 With E the rows of readings and ``P = 1 - Q Q^T - q q^T`` the projector of
 :mod:`pkmcal.judge.held`, Q and q orthonormal bases of what a configuration's own unknowns and the
@@ -25,26 +25,26 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
-from pkmcal.identify.rows import PERFECT
+from pkmcal.identify.rows import PERFECT_CLOSURE_SIGMA
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.held import Held, hold, too_little
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.solver.elimination import Linear, Reduced, eliminate, stacked
+from pkmcal.solver.elimination import Linear, Reduced, eliminate, rows_on_shared
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 
-SOFT = 0.01
+SOFT_READING_NOISE = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
 photograph leaves open, so a seen pose hardly knows them."""
-ALONE = 1e-2
+LEAST_RESIDUAL_LEFT = 1e-2
 """Part of a reading's residual that its own fit leaves, below which hardly anything but the reading
-told where the platform was: what was seen left ten times SOFT open."""
-STEPS = 20
-SETTLED = 1e-10
+told where the platform was: what was seen left ten times SOFT_READING_NOISE open."""
+FRAME_LAYING_STEPS = 20
+FRAMES_LAID_CHANGE = 1e-10
 """Frame change (m, rad) below which the frames are laid."""
-OPEN = 1e-9
+UNREAD_FRAME_CHANGE_SHARE = 1e-9
 """Share of the largest singular value below which a frame change moves no reading."""
 
 
@@ -96,10 +96,10 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             expected="a session with photographs, or with a table of poses",
             next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
         )
-    held = hold(machine, replace(measurements, joint_noise=SOFT), start)
+    held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), start)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
-    own, shared = reduced.q[0], column_space(stacked(linear, reduced)[0][0])
+    own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
     picks = _picks(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape
 
@@ -107,7 +107,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
     left = np.eye(m) - along - beside @ beside.mT  # L
-    if float(np.linalg.eigvalsh(left).min(initial=1.0)) < ALONE:
+    if float(np.linalg.eigvalsh(left).min(initial=1.0)) < LEAST_RESIDUAL_LEFT:
         raise too_little()
     alone = np.linalg.inv(left)
     units = _size(held)[..., None] * alone
@@ -125,7 +125,9 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             _among_all(errors.position, held.seen),
             _among_all(errors.orientation, held.seen),
         ),
-        noise=_noise(along, beside, units, 1 - (measurements.joint_noise / SOFT) ** 2),
+        noise=_noise(
+            along, beside, units, 1 - (measurements.joint_noise / SOFT_READING_NOISE) ** 2
+        ),
         by_machine=(units @ picks @ by).reshape(n * m, -1),
     )
 
@@ -149,7 +151,7 @@ def _size(held: Held) -> Array:
     by_reading = c.by_reading[0]
     slope = np.sqrt(by_reading**2 @ layout.of_motor)
     sign = 1.0 if layout.shares_motors else np.sign(by_reading @ layout.of_motor)
-    return sign * np.hypot(PERFECT, SOFT * slope) / slope
+    return sign * np.hypot(PERFECT_CLOSURE_SIGMA, SOFT_READING_NOISE * slope) / slope
 
 
 def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
@@ -159,7 +161,7 @@ def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> 
     moved to where the others predict them; S, the rows A of the shared unknowns with own ones taken
     out, and N their normal matrix, in which open directions count as exact.
     """
-    half = inverse_root(stacked(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
+    half = inverse_root(rows_on_shared(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
     moved = alone @ linear.value[0, ..., None]
     others = half @ (half.T @ (reduced.rows[0].mT @ moved))
     own = reduced.q[0].mT @ (moved - linear.by_shared[0] @ others)
@@ -182,8 +184,8 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
 
     along : D (K', m, m), the readings' rows along their own unknowns; beside : F (K', m, a), along
     those of all: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but readings are sharper
-    than SOFT by the share ``less`` of it: the covariance of E P y is ``H - less H H``, written
-    without a difference of numbers that are nearly the same.
+    than SOFT_READING_NOISE by the share ``less`` of it: the covariance of E P y is ``H - less H
+    H``, written without a difference of numbers that are nearly the same.
     """
     n, m = along.shape[:2]
     block = (np.eye(m) - along) @ ((1 - less) * np.eye(m) + less * along)
@@ -224,7 +226,7 @@ def errors_on(machine: Machine, joints: Array, poses: Array) -> ReadingErrors:
     readings agree best. What that takes up is given back by the degrees of freedom, so few
     configurations flatter nobody.
     """
-    e, f, used = laid(machine, joints, poses)
+    e, f, used = closing_frame_changes(machine, joints, poses)
     own = e @ poses @ inverse(f)
     readings, internal = inverse_result(machine.layout, machine.values, own)
     found = forward(machine.layout, machine.values, joints, own, internal)
@@ -239,7 +241,9 @@ def errors_on(machine: Machine, joints: Array, poses: Array) -> ReadingErrors:
     )
 
 
-def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, int]:
+def closing_frame_changes(
+    machine: Machine, joints: Array, poses: Array
+) -> tuple[Array, Array, int]:
     """Frame changes E, F (4, 4) after which E X F^-1 closes the machine best at the readings, and
     how many numbers of them the readings fix.
 
@@ -248,7 +252,7 @@ def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, i
     """
     e, f = np.eye(4), np.eye(4)
     used = 0
-    for _ in range(STEPS):
+    for _ in range(FRAME_LAYING_STEPS):
         own = e @ poses @ inverse(f)
         internal = inverse_result(machine.layout, machine.values, own)[1]
         c = closure(machine.layout, machine.values, joints, own, np.nan_to_num(internal))
@@ -257,9 +261,11 @@ def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, i
             q = np.linalg.qr(c.rows.by_internal)[0]
             rest = np.eye(q.shape[-2]) - q @ q.mT
             jac, value = rest @ jac, (rest @ value[..., None])[..., 0]
-        y, _, rank, _ = np.linalg.lstsq(jac.reshape(-1, 12), -value.reshape(-1), rcond=OPEN)
+        y, _, rank, _ = np.linalg.lstsq(
+            jac.reshape(-1, 12), -value.reshape(-1), rcond=UNREAD_FRAME_CHANGE_SHARE
+        )
         used = int(rank)
         e, f = perturb(np.eye(4), y[:6]) @ e, perturb(np.eye(4), y[6:]) @ f
-        if np.abs(y).max() < SETTLED:
+        if np.abs(y).max() < FRAMES_LAID_CHANGE:
             break
     return e, f, used

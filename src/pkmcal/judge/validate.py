@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
-from pkmcal.calibration.calibrate import Progress
-from pkmcal.calibration.same_machine import read
+from pkmcal.calibration.calibrate import CalibrationProgress
+from pkmcal.calibration.same_machine import read_same_machine
 from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import ResultError
-from pkmcal.files import plain
-from pkmcal.judge.comparison import BesideDrawing, compare
+from pkmcal.files import json_value
+from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import check_new, known_rows, look, repeated_rows
+from pkmcal.judge.new_data import check_new, known_rows, measured_new_data, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
@@ -30,7 +30,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
 
-FORMAT = 1
+VALIDATION_FORMAT = 1
 NOT_INDEPENDENT = (
     "the session is not independent: the calibration was made from these photographs",
     "photographs that the calibration did not see",
@@ -65,7 +65,7 @@ class Validation:
         """Plain data for JSON: m and rad."""
         names = self.session.configurations
         found = {
-            "pkmcal_validation": FORMAT,
+            "pkmcal_validation": VALIDATION_FORMAT,
             "verdict": asdict(self.verdict),
             "new_data": self.judged.document(names) if self.judged else None,
             "known_configurations": [*compress(names, self.known)],
@@ -78,16 +78,16 @@ class Validation:
             },
             "timings": self.timings,
         }
-        return plain(found)
+        return json_value(found)
 
 
-def validate(
+def validate_calibration(
     calibration: SavedCalibration | Path | str,
     session: Session | Path | str,
     *,
     regions: int = 0,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: CalibrationProgress | None = None,
 ) -> Validation:
     """Errors of a calibration on a session that it did not see; nothing is written.
 
@@ -101,11 +101,11 @@ def validate(
     told = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
-        saved, session = read(calibration, session)
+        saved, session = read_same_machine(calibration, session)
         lines, known = paths_of(session), known_rows(saved, session)
         if not regions:
             check_new(known, _photographed(session), *NOT_INDEPENDENT)
-        looked = look(saved, session, seed, told, 0.8)
+        looked = measured_new_data(saved, session, seed, told, 0.8)
         session = replace(looked.session, machine=session.machine)
         estimate = looked.estimate
         data = estimate.as_found(looked.measurements)
@@ -123,7 +123,7 @@ def validate(
                 by_drawing = predict(drawing, data, estimate.state)
             except ResultError:  # so far off that its poses are not found
                 by_drawing = None
-            judged = compare(drawing, saved.covariance, data, found, by_drawing, new)
+            judged = compare_with_drawing(drawing, saved.covariance, data, found, by_drawing, new)
 
         told("Holding out regions", 0.9)
         held_out = by_regions(drawing, data, estimate, regions) if regions else ()

@@ -18,24 +18,24 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.aside import select
-from pkmcal.calibration.calibrate import Calibration, Progress
-from pkmcal.calibration.same_machine import read
+from pkmcal.calibration.calibrate import Calibration, CalibrationProgress
+from pkmcal.calibration.same_machine import read_same_machine
 from pkmcal.calibration.saved import Known, SavedCalibration
 from pkmcal.errors import InputError
-from pkmcal.files import plain
+from pkmcal.files import json_value
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
 from pkmcal.judge.held import Held, Trust, evidence, hold
-from pkmcal.judge.new_data import check_new, known_rows, look
+from pkmcal.judge.new_data import check_new, known_rows, measured_new_data
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
-FORMAT = 1
-ALPHA = 0.01
+WATCH_FORMAT = 1
+WATCH_ALPHA = 0.01
 """Share of machines that did not change that are flagged all the same."""
 LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
 NOTHING_NEW = (
@@ -74,9 +74,9 @@ class Watch:
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
         names = self.session.configurations
-        return plain(
+        return json_value(
             {
-                "pkmcal_watch": FORMAT,
+                "pkmcal_watch": WATCH_FORMAT,
                 "verdict": asdict(self.verdict),
                 **self.judged.document(self.calibration.machine),
                 "configurations": [*compress(names, self.seen)],
@@ -99,14 +99,14 @@ class Watch:
         )
 
 
-def watch(
+def watch_machine(
     calibration: SavedCalibration | Path | str,
     session: Session | Path | str,
     *,
-    alpha: float = ALPHA,
+    alpha: float = WATCH_ALPHA,
     seed: int = 0,
     same_place: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: CalibrationProgress | None = None,
 ) -> Watch:
     """Test a calibrated machine on new data; nothing is written.
 
@@ -122,12 +122,12 @@ def watch(
     told = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
-        saved, session = read(calibration, session)
+        saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
         session = _placed(saved, session, same_place)
         known = known_rows(saved, session)
         check_new(known, np.ones_like(known), *NOTHING_NEW)
-        looked = look(saved, session, seed, told, 0.9)
+        looked = measured_new_data(saved, session, seed, told, 0.9)
         session = replace(looked.session, machine=session.machine)
         seen = seen_configurations(looked.measurements)
         check_new(known, seen, *NOTHING_NEW)
@@ -181,7 +181,7 @@ def check_alpha(alpha: float) -> None:
             "this share of false alarms is not possible",
             where="--alpha",
             found=f"{alpha:g}",
-            expected=f"{LEAST_ALPHA:g} to {MOST_ALPHA:g}, such as {ALPHA:g}",
+            expected=f"{LEAST_ALPHA:g} to {MOST_ALPHA:g}, such as {WATCH_ALPHA:g}",
         )
 
 

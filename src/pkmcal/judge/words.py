@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.judge.changes import (
-    POWER,
+    DETECTION_POWER,
     Change,
     ChangeTests,
     Explanation,
@@ -20,22 +20,32 @@ from pkmcal.judge.changes import (
     StationTest,
     Suspect,
 )
-from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, ratio
+from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, improvement_ratio
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.wording import SCALES, amount, brief, count, decimals, listed, named, number, with_unit
+from pkmcal.wording import (
+    SHOWN_UNITS,
+    amount,
+    brief,
+    count,
+    decimals,
+    listed,
+    named,
+    number,
+    with_unit,
+)
 
 MOSTLY_NOISE = 2**0.5
 """Factor on the photographs' noise within which that is more than half of the mean square."""
-POOR = 2.0
+POOR_REGION_FACTOR = 2.0
 """Factor by which a region's errors must exceed those of the configurations in use to be told."""
-NOISIER = 1.5
+NOISIER_PHOTOGRAPHS_FACTOR = 1.5
 """Times the calibration's noise from which on the photographs are no longer the same kind."""
-STEEL = 12e-6
+STEEL_EXPANSION = 12e-6
 """Expansion of steel, 1/K, for a picture of what a common scale means."""
-UNEXPLAINED = 1e-3
+CHANCE_LEFT_UNEXPLAINED = 1e-3
 """Chance below which what the findings leave is said to be more than noise."""
 MOST_OTHERS = 4
 """Causes named beside the best; more are a table's."""
@@ -72,7 +82,7 @@ def validation_verdict(
         np.concatenate([getattr(g, name) for g in groups]) for name in ("before", "after")
     )
     floor = finite_rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
-    gain = ratio(before, after)
+    gain = improvement_ratio(before, after)
     reasons = [*_not_better(gain), *_broken(groups, units)]
     again = int(repeated[judged.rows].sum()) if judged and repeated is not None else 0
     every = judged is not None and again == len(judged.rows)
@@ -230,7 +240,7 @@ def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:
     out: list[str] = []
     for item in holdouts:
         off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
-        if off < POOR * usual:
+        if off < POOR_REGION_FACTOR * usual:
             continue
         how = f": {amount(off, unit)} against {amount(usual, unit)}" if unit else ""
         out.append(
@@ -327,7 +337,7 @@ def said(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
 
 def signed(value: float, sigma: float, unit: str) -> str:
     """``+0.31 mm (±0.04)``."""
-    scale, name = SCALES[unit]
+    scale, name = SHOWN_UNITS[unit]
     if not np.isfinite(sigma):
         return "an amount that these data do not tell"
     places = decimals(sigma * scale)
@@ -386,7 +396,7 @@ def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
     reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
-    if judged.left.dof and judged.left.chance < UNEXPLAINED:
+    if judged.left.dof and judged.left.chance < CHANCE_LEFT_UNEXPLAINED:
         reasons.append(
             "That does not explain all: what is left of the machine's test is more than noise"
             f" (χ² {judged.left.chi2:.0f} for {count(judged.left.dof, 'degree')} of freedom)."
@@ -429,7 +439,7 @@ def _cause_in_words(suspect: Suspect) -> str:
     if cause.part in ("base", "platform"):
         return ", as with a joint that came loose or was exchanged"
     if cause.part == "scale":
-        kelvin = abs(suspect.change.value[0]) / STEEL
+        kelvin = abs(suspect.change.value[0]) / STEEL_EXPANSION
         way = "warmer" if suspect.change.value[0] > 0 else "colder"
         return (
             f"; a steel frame that is {brief(kelvin)} K {way} than at the calibration, with scales"
@@ -475,13 +485,13 @@ def _would_have(judged: ChangeTests) -> str:
     what = "leg's length" if zeros[0].unit == "m" else "motor's zero"
     return (
         f"a change of any {what} by {with_unit(*found_from(zeros))}, depending on the leg, would"
-        f" have been found with a probability of {POWER:.0%}"
+        f" have been found with a probability of {DETECTION_POWER:.0%}"
     )
 
 
 def found_from(legs: Sequence[LegTest]) -> tuple[str, str]:
     """Smallest changes of the legs' zeros that would be found, such as ``0.3 to 0.5``, and unit."""
-    scale, name = SCALES[legs[0].unit]
+    scale, name = SHOWN_UNITS[legs[0].unit]
     sizes = [brief(f(leg.detects_zero for leg in legs) * scale) for f in (min, max)]
     return " to ".join(dict.fromkeys(sizes)), name
 
@@ -515,7 +525,7 @@ def _warnings(around: LookedAt) -> tuple[str, ...]:
             f"The calibration was made from configuration {listed(names, 4)}: nothing new, and left"
             " out of the tests."
         )
-    if around.noisier > NOISIER:
+    if around.noisier > NOISIER_PHOTOGRAPHS_FACTOR:
         out.append(
             f"The edges scatter {around.noisier:.1f} times as much as in the calibration; focus,"
             " light, a camera that moved between the photographs, or something that bends. The"

@@ -11,15 +11,15 @@ import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files import (
-    TOO_LARGE,
+    LARGEST_UNITLESS_LENGTH,
     Document,
     any_unit,
     closest,
     read_yaml,
-    validate,
+    validated_document,
     yaml_text,
 )
-from pkmcal.mechanisms.document import MechanismDocument, Model
+from pkmcal.mechanisms.document import DocumentModel, MechanismDocument
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import listed
@@ -78,7 +78,7 @@ def load_mechanism(
 def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
     """A file's fields, as they stand there and as the schema has them."""
     document = read_yaml(path, label)
-    return document, validate(document, MechanismDocument)
+    return document, validated_document(document, MechanismDocument)
 
 
 _drawing = cache(_read)
@@ -100,12 +100,12 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
     table = machine.parameters
     lengths = np.where(np.array(table.units) == "m", np.abs(table.drawing), 0.0)
     longest = int(np.argmax(lengths))
-    if lengths[longest] > TOO_LARGE and not any_unit(document.data):
+    if lengths[longest] > LARGEST_UNITLESS_LENGTH and not any_unit(document.data):
         raise InputError(
             "the drawing's lengths look like millimetres",
             where=document.where(*keys),
             found=f"{table.names[longest]} of {lengths[longest]:g} m",
-            expected=f"metres, at most {TOO_LARGE:g} where no value has a unit",
+            expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",
             next_step="Write each length with its unit, such as 269.3 mm, or divide them by 1000;"
             " in a session also the camera's pose, and head the columns of joints.csv leg1 [mm]",
         )
@@ -129,7 +129,7 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
     return next((keys for keys, name in entries if is_named(name)), ())
 
 
-def _model(document: MechanismDocument, name: str) -> Model:
+def _model(document: MechanismDocument, name: str) -> DocumentModel:
     """One of a machine's models by its name."""
     if name in document.models:
         return document.models[name]

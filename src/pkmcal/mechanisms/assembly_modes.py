@@ -13,18 +13,24 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import from_quaternion, pose, pose_difference, rotation
 from pkmcal.mechanisms.closure import base_ends, closure, platform_ends
-from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, scaled_rows, typical_reach
+from pkmcal.mechanisms.kinematics import (
+    CONVERGED_CLOSURE_ERROR,
+    Closed,
+    close,
+    scaled_rows,
+    typical_reach,
+)
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import assembly_sign, sign_of
 
-BATCH = 1000
+STARTS_A_BATCH = 1000
 """Starts at a time."""
-OFTEN = 10
+RAREST_MODE_FINDS = 10
 """Times that the rarest mode must have been found before the search ends. Were the next rarest
 half as likely to be met, it would have been missed with a chance of exp(-5), 0.7 percent."""
-SURE = 1e-3
+MISSED_MODE_CHANCE = 1e-3
 """Chance left that a mode of the share :attr:`AssemblyModes.missing` was missed."""
-APART = 1e-6
+SAME_MODE_DISTANCE = 1e-6
 """Poses (1 and m) nearer than this are one: where two modes merge, a closure that is right to
 1e-14 m leaves 1e-7."""
 
@@ -75,12 +81,12 @@ def assembly_modes(
     complete = False
     while not complete and starts < most:
         begin, internal = _starts(layout, theta, readings, home, rng)
-        at = np.broadcast_to(readings, (BATCH, readings.shape[-1]))
+        at = np.broadcast_to(readings, (STARTS_A_BATCH, readings.shape[-1]))
         result = close(layout, theta, at, begin, internal)
-        good = _coordinates(result)[result.error < CONVERGED]
+        good = _coordinates(result)[result.error < CONVERGED_CLOSURE_ERROR]
         modes, found = _counted(modes, found, good)
-        starts, closed = starts + BATCH, closed + len(good)
-        complete = bool(found.size) and bool(found.min() >= OFTEN)
+        starts, closed = starts + STARTS_A_BATCH, closed + len(good)
+        complete = bool(found.size) and bool(found.min() >= RAREST_MODE_FINDS)
         if not closed and starts >= most // 10:
             break
     poses, internal = _of_coordinates(modes)
@@ -88,7 +94,7 @@ def assembly_modes(
     poses, internal, found = poses[near], internal[near], found[near]
     own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
     sign = (own * assembly_sign(layout, theta, home)).astype(int)
-    missing = 1 - SURE ** (1 / closed) if closed else 1.0
+    missing = 1 - MISSED_MODE_CHANCE ** (1 / closed) if closed else 1.0
     return AssemblyModes(poses, internal, found, sign, starts, closed, missing, complete)
 
 
@@ -102,15 +108,15 @@ def _starts(
     """
     free = layout.free
     if free[:3].all():
-        turn = from_quaternion(rng.normal(size=(BATCH, 4)))
+        turn = from_quaternion(rng.normal(size=(STARTS_A_BATCH, 4)))
     else:
-        turn = rotation(rng.uniform(-np.pi, np.pi, (BATCH, 3)) * free[:3])
+        turn = rotation(rng.uniform(-np.pi, np.pi, (STARTS_A_BATCH, 3)) * free[:3])
     rot = turn @ home[:3, :3]
     a = base_ends(layout, theta, readings).a.mean(axis=-2)
     b = platform_ends(layout, theta, pose(rot, np.zeros(3))).b.mean(axis=-2)
-    shift = rng.normal(size=(BATCH, 3)) * typical_reach(layout, theta, readings)
+    shift = rng.normal(size=(STARTS_A_BATCH, 3)) * typical_reach(layout, theta, readings)
     position = np.where(free[3:], a - b + shift, home[:3, 3])
-    return pose(rot, position), rng.uniform(-np.pi, np.pi, (BATCH, layout.n_internal))
+    return pose(rot, position), rng.uniform(-np.pi, np.pi, (STARTS_A_BATCH, layout.n_internal))
 
 
 def _coordinates(result: Closed) -> Array:
@@ -137,7 +143,7 @@ def _counted(modes: Array, found: Integers, more: Array) -> tuple[Array, Integer
         if k == len(kept):
             kept.append(left[0])
             counts.append(0)
-        same: Booleans = np.abs(left - kept[k]).max(axis=-1) < APART
+        same: Booleans = np.abs(left - kept[k]).max(axis=-1) < SAME_MODE_DISTANCE
         counts[k] += int(np.count_nonzero(same))
         left = left[~same]
         k += 1

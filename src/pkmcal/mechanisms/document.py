@@ -26,7 +26,7 @@ from pkmcal.mechanisms.carriers.contract import (
     base_carriers,
     platform_carriers,
 )
-from pkmcal.mechanisms.parameters import EVERY
+from pkmcal.mechanisms.parameters import EVERY_LEG
 
 
 def _increasing(value: tuple[float, float]) -> tuple[float, float]:
@@ -79,16 +79,16 @@ Rod = Annotated[
     Discriminator(rod_kind),
 ]
 
-OFFSET = ParameterKind("offset", "m", "offset", part="zero")
-CONSTANT = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
-SCALE = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
-EXACT_TURNS, LEAD = 0.0, 0.0005
+OFFSET_KIND = ParameterKind("offset", "m", "offset", part="zero")
+CONSTANT_LENGTH_KIND = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
+READING_SCALE_KIND = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
+EXACT_TURNS, LEAD_TOLERANCE = 0.0, 0.0005
 """Tolerances of a reading's scale where the file gives none: of readings in rad, since an encoder
 counts whole turns and a gear has whole teeth; of readings in m, a ground screw's or a tape's."""
 
 
-Motion = Literal["spatial", "planar", "translation", "schoenflies", "planar-translation"]
-MOTIONS: dict[str, Array] = {
+PlatformMotion = Literal["spatial", "planar", "translation", "schoenflies", "planar-translation"]
+MOTION_DIRECTIONS: dict[str, Array] = {
     "spatial": np.eye(6),
     "planar": np.eye(6)[:, [2, 3, 4]],
     "translation": np.eye(6)[:, 3:],
@@ -114,7 +114,9 @@ class _OneOfTheCarriers:
         """The part, from a file's content or from another machine's document."""
         if isinstance(value, Schema):
             return value
-        return self.adapter().validate_json(json.dumps(value))  # as :func:`pkmcal.files.validate`
+        return self.adapter().validate_json(
+            json.dumps(value)
+        )  # as :func:`pkmcal.files.validated_document`
 
     def __get_pydantic_core_schema__(self, *_: Any) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self.read)
@@ -163,7 +165,7 @@ class Leg(Schema):
     tubes: tuple[Tube, ...] = ()
 
 
-class Tolerance(Schema):
+class DrawingTolerance(Schema):
     """Standard deviations of the drawing's values, metres; of axes and angles, radians; of scales,
     parts of one, where 0 is exact.
     """
@@ -195,7 +197,7 @@ def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
 
 def _several(group: tuple[str, ...]) -> tuple[str, ...]:
     """A tie has two members at least; one that stands for all legs counts as several."""
-    if len(group) < 2 and not any(EVERY in entry for entry in group):
+    if len(group) < 2 and not any(EVERY_LEG in entry for entry in group):
         counts = {"field_type": "Tuple", "min_length": 2, "actual_length": len(group)}
         raise PydanticKnownError("too_short", counts)
     return group
@@ -204,7 +206,7 @@ def _several(group: tuple[str, ...]) -> tuple[str, ...]:
 Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_several)], ...]
 
 
-class Model(Schema):
+class DocumentModel(Schema):
     """What a machine's model holds and ties, or the other file that describes it."""
 
     fixed: tuple[str, ...] = ()
@@ -221,10 +223,10 @@ class MechanismDocument(Schema):
     """A whole mechanism file."""
 
     name: Annotated[str, Field(max_length=LONGEST_NAME)]
-    motion: Motion
+    motion: PlatformMotion
     legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
-    tolerance: Tolerance = Tolerance()
+    tolerance: DrawingTolerance = DrawingTolerance()
     home: Home | None = None
     fixed: tuple[str, ...] = ()
     tied: Ties = ()
-    models: dict[str, Model] = Field(default_factory=dict)
+    models: dict[str, DocumentModel] = Field(default_factory=dict)

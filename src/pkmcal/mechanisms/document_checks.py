@@ -16,13 +16,13 @@ from pkmcal.errors import InputError
 from pkmcal.files.documents import field_path
 from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
-    PLANAR,
+    PLANAR_MOTIONS,
     Site,
     base_carriers,
     platform_carriers,
 )
 from pkmcal.mechanisms.document import (
-    MOTIONS,
+    MOTION_DIRECTIONS,
     ConstantLength,
     Leg,
     MechanismDocument,
@@ -32,13 +32,13 @@ from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
 
-SAME = 1e-9
+SAME_NUMBER_ROUNDING = 1e-9
 """Metres, or parts of a direction, by which equal numbers of a file differ when written."""
 
-Where: TypeAlias = Callable[..., str]
+PlaceInDocument: TypeAlias = Callable[..., str]
 
 
-def check_drawing(document: MechanismDocument, where: Where | None = None) -> None:
+def check_drawing(document: MechanismDocument, where: PlaceInDocument | None = None) -> None:
     """Raise InputError for a drawing whose joints and rods cannot make its motion.
 
     where : names a field's place in the file by its keys.
@@ -49,7 +49,7 @@ def check_drawing(document: MechanismDocument, where: Where | None = None) -> No
         for side, carrier in (("base", base), ("platform", platform)):
             site = Site(j + 1, side, document.motion, partial(place, "legs", j, side))
             carrier.check(getattr(leg, side), site)
-        if document.motion in PLANAR:
+        if document.motion in PLANAR_MOTIONS:
             _check_plane(document, j, leg, place)
         if document.motion in ("translation", "planar-translation"):
             _check_parallel(j, leg, place)
@@ -67,7 +67,7 @@ def check_drawing(document: MechanismDocument, where: Where | None = None) -> No
     _check_equations(document, place)
 
 
-def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) -> None:
+def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
     """A planar machine's legs lie in planes z = const."""
     if document.home and np.hypot(*document.home.rotation_vector[:2]) > IN_PLANE:
         raise InputError(
@@ -90,7 +90,7 @@ def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) ->
         )
 
 
-def _check_parallel(j: int, leg: Leg, place: Where) -> None:
+def _check_parallel(j: int, leg: Leg, place: PlaceInDocument) -> None:
     """A platform that only translates keeps axes parallel; unequal ones would turn it."""
     roles = (
         base_carriers()[leg.base.joint].axis_role(leg.base),
@@ -108,7 +108,7 @@ def _check_parallel(j: int, leg: Leg, place: Where) -> None:
         )
 
 
-def _check_motors(document: MechanismDocument, place: Where) -> None:
+def _check_motors(document: MechanismDocument, place: PlaceInDocument) -> None:
     used = {int(c) + 1 for c in motor_columns(document) if c >= 0}
     missing = sorted(set(range(1, max(used, default=0) + 1)) - used)
     if missing:
@@ -120,7 +120,7 @@ def _check_motors(document: MechanismDocument, place: Where) -> None:
         )
 
 
-def _check_scales(document: MechanismDocument, place: Where) -> None:
+def _check_scales(document: MechanismDocument, place: PlaceInDocument) -> None:
     """A scale belongs to a reading, and a reading has one, however many legs it moves."""
     columns = motor_columns(document)
     for j, leg in enumerate(document.legs):
@@ -132,7 +132,7 @@ def _check_scales(document: MechanismDocument, place: Where) -> None:
                 found=str(leg.scale),
                 expected="scale on legs whose length, crank or slider a motor moves",
             )
-        if columns[j] >= 0 and abs(leg.scale - first.scale) > SAME:
+        if columns[j] >= 0 and abs(leg.scale - first.scale) > SAME_NUMBER_ROUNDING:
             raise InputError(
                 f"leg {j + 1} has another scale than the other legs on its motor",
                 where=place("legs", j, "scale"),
@@ -142,14 +142,18 @@ def _check_scales(document: MechanismDocument, place: Where) -> None:
 
 
 def _check_equal(
-    document: MechanismDocument, side: str, legs: tuple[int, ...], field: str, place: Where
+    document: MechanismDocument,
+    side: str,
+    legs: tuple[int, ...],
+    field: str,
+    place: PlaceInDocument,
 ) -> None:
     """Legs on one motor, or on one body of the platform, are drawn with the same axis or hinge."""
     nodes = [getattr(document.legs[j], side) for j in legs]
     values = [getattr(node, field) for node in nodes]
     for j, value in zip(legs[1:], values[1:], strict=True):
         if (value is None) != (values[0] is None) or (
-            value is not None and np.abs(np.subtract(value, values[0])).max() > SAME
+            value is not None and np.abs(np.subtract(value, values[0])).max() > SAME_NUMBER_ROUNDING
         ):
             body = platform_carriers()[document.legs[j].platform.joint].body
             raise InputError(
@@ -161,7 +165,7 @@ def _check_equal(
             )
 
 
-def _check_equations(document: MechanismDocument, place: Where) -> None:
+def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> None:
     """Lengths and axes hold all freedoms of the platform, and of what turns on it."""
     passive = [
         j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
@@ -170,7 +174,7 @@ def _check_equations(document: MechanismDocument, place: Where) -> None:
     joints = [leg.platform.joint for leg in document.legs]
     turning = [j for j, joint in enumerate(joints) if platform_carriers()[joint].turns]
     hinges = len(set(bodies(document)[turning].tolist()))
-    freedoms = MOTIONS[document.motion].shape[1] + hinges
+    freedoms = MOTION_DIRECTIONS[document.motion].shape[1] + hinges
     if count >= freedoms:
         return
     why = ""

@@ -23,16 +23,16 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import cross, dot, nearest_rotation, pose
 from pkmcal.mechanisms.carriers.contract import Chain
 from pkmcal.mechanisms.closure import scales
-from pkmcal.mechanisms.kinematics import CONVERGED, forward
+from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR, forward
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
-MOST_STEPS = 8
+MOST_FOLLOWER_STEPS = 8
 """A pose a millimetre away takes three or four."""
-CLOSED = 0.1 * CONVERGED
+FOLLOWED_CLOSURE_ERROR = 0.1 * CONVERGED_CLOSURE_ERROR
 """Closure error (m) at which a search ends, of all rods together."""
-SHRINKS = 1e-8
+REUSED_FACTORS_SHRINK = 1e-8
 """Squared error that a step leaves, of that before it, beyond which the next finds new factors."""
-SQUARE = 512
+POSES_BETWEEN_SQUARINGS = 512
 """Poses after which rounding is taken out of the rotation: by then less than 1e-12."""
 
 
@@ -193,7 +193,7 @@ class Follower:
         off, square = rods.ends(readings)
         now, factors, twist = self._pose, self._factors, self._twist
         before = np.inf
-        for _ in range(MOST_STEPS):
+        for _ in range(MOST_FOLLOWER_STEPS):
             b = now[:3].dot(rods.on_body)
             line = b + off
             left = self._ones.dot(line * line)
@@ -201,9 +201,9 @@ class Follower:
             error = float(left.dot(left))
             if not error < before:
                 return False
-            if factors is None or (error > SHRINKS * before and before < np.inf):
+            if factors is None or (error > REUSED_FACTORS_SHRINK * before and before < np.inf):
                 factors = self._factors_at(b, line)
-                self._enough = 4 * CLOSED**2 * float(square.min())
+                self._enough = 4 * FOLLOWED_CLOSURE_ERROR**2 * float(square.min())
             if error <= self._enough:
                 self._pose, self._factors = now, factors
                 self._rest()
@@ -216,22 +216,22 @@ class Follower:
     def _factors_at(self, b: Array, line: Array) -> tuple[Array, Array]:
         """LU factors of half the rows' derivatives by the freedoms, (n, n)."""
         rows = np.empty((6, line.shape[1]))
-        rows[:3] = b[FIRST] * line[SECOND]
-        rows[:3] -= b[SECOND] * line[FIRST]
+        rows[:3] = b[FIRST_CROSS_COMPONENTS] * line[SECOND_CROSS_COMPONENTS]
+        rows[:3] -= b[SECOND_CROSS_COMPONENTS] * line[FIRST_CROSS_COMPONENTS]
         rows[3:] = line
         return self._factored(rows[self._free].T)[:2]
 
     def _rest(self) -> None:
         """Take the rounding of many steps out of the rotation."""
         self._since += 1
-        if self._since == SQUARE:
+        if self._since == POSES_BETWEEN_SQUARINGS:
             self._since, self._pose = (
                 0,
                 pose(nearest_rotation(self._pose[:3, :3]), self._pose[:3, 3]),
             )
 
 
-FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])
+FIRST_CROSS_COMPONENTS, SECOND_CROSS_COMPONENTS = np.array([1, 2, 0]), np.array([2, 0, 1])
 """Of two vectors' components those whose products are their cross product's, less the others."""
 
 

@@ -26,7 +26,7 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import Leg, MechanismDocument
 
-AXIS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
+JOINT_AXIS_KINDS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
 Equation = Literal["revolute base", "revolute platform", "torsion"]
 

@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.geometry.batches import WORTH, batch_last, damped_step, fresh, picked, stepped
+from pkmcal.geometry.batches import (
+    POSES_WORTH_BATCH_LAST,
+    batch_last,
+    damped_step,
+    fresh,
+    picked,
+    stepped,
+)
 from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms.closure import (
     BaseEnds,
@@ -34,26 +41,26 @@ from pkmcal.mechanisms.closure import (
 from pkmcal.mechanisms.layout import LimbLayout
 
 MAX_STEPS = 60
-CONVERGED = 1e-12
+CONVERGED_CLOSURE_ERROR = 1e-12
 """Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
-CHUNK = 2048
+CONFIGURATIONS_A_CHUNK = 2048
 """Rows of a batch at a time: their numbers stay in a processor's second cache."""
-HOPELESS = 1e3
+HOPELESS_DAMPING = 1e3
 """Damping at which a step that does not help is the last."""
-ROUNDING = 16 * float(np.finfo(float).eps)
+CLOSURE_ROUNDING = 16 * float(np.finfo(float).eps)
 """Of the longest rod: where a step does not help, a closure error below it is rounding."""
-SETTLING = 15
+SECOND_RODS_STEPS = 15
 """Steps for a machine's second rods; a pose that they all allow takes four."""
-SETTLED = 1e-15
+SECOND_RODS_SETTLED = 1e-15
 """A step of readings (rad) and hinges below which nothing changes any more."""
 SAME_EQUATION = 1e-9
 """Singular value of the scaled rows below which one of them says what the others do."""
-LEVELLING = 3
+LEVELLING_STEPS = 3
 """Steps to the pose that closes more rows than it has unknowns best; each leaves of the way what
 the closure error is of a rod."""
-GAP = 0.05
+OTHER_MACHINE_GAP = 0.05
 """Of a rod, the closure error beyond which readings are no machine's with errors, but another's."""
-GIVEN_UP = 5
+STEPS_OUT_OF_REACH = 5
 """Steps in a row out of a limb's reach after which no pose is looked for any more."""
 NEAR_SINGULAR = 0.02
 """Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
@@ -103,14 +110,14 @@ def close(
     its plane, and the internal coordinates.
     """
     out = Closed(np.empty(start.shape), np.empty(internal.shape), np.empty(len(start)))
-    for first in range(0, len(start), CHUNK):
-        rows = slice(first, first + CHUNK)
+    for first in range(0, len(start), CONFIGURATIONS_A_CHUNK):
+        rows = slice(first, first + CONFIGURATIONS_A_CHUNK)
         own = theta[rows] if theta.ndim > 1 else theta
         base = base_ends(layout, own, readings[rows])
         poses, phi = start[rows], internal[rows]
-        if len(poses) >= WORTH:
+        if len(poses) >= POSES_WORTH_BATCH_LAST:
             base, poses, phi = base_batch_last(base), batch_last(poses), batch_last(phi)
-        rounding = ROUNDING * float(np.fmax.reduce(np.abs(base.length), axis=None))
+        rounding = CLOSURE_ROUNDING * float(np.fmax.reduce(np.abs(base.length), axis=None))
         number, platform = first + np.arange(len(poses)), platform_parameters(layout, own)
         _close(_Task(layout, own, platform, base, number, rounding), poses, phi, out)
     return out
@@ -127,7 +134,7 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
     now = _at(task, poses, internal)
     damping, stuck = np.full(len(poses), 1e-6), np.zeros(len(poses), dtype=bool)
     for _ in range(MAX_STEPS):
-        done = stuck | (now.worst <= CONVERGED * 1e-2)
+        done = stuck | (now.worst <= CONVERGED_CLOSURE_ERROR * 1e-2)
         if 4 * np.count_nonzero(done) >= len(done):
             _write(task, now, out)
             left = np.flatnonzero(~done)
@@ -142,7 +149,7 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
         if np.count_nonzero(better) == len(better):
             now, stuck, damping = trial, done, np.maximum(damping * 0.05, 1e-14)
             continue
-        stuck = done | (~better & ((damping > HOPELESS) | (now.worst < task.rounding)))
+        stuck = done | (~better & ((damping > HOPELESS_DAMPING) | (now.worst < task.rounding)))
         damping = np.where(better, np.maximum(damping * 0.05, 1e-14), damping * 30)
         now = _chosen(better, trial, now)
     _write(task, now, out)
@@ -202,7 +209,7 @@ class ForwardResult:
 
     T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
     A machine with more rows than unknowns is closed as well as its readings allow, by least
-    squares; converged where that leaves errors of readings and of drawings, see GAP.
+    squares; converged where that leaves errors of readings and of drawings, see OTHER_MACHINE_GAP.
     internal : (..., n) the hinges' turns of an articulated platform, rad; n = 0 for a rigid one.
     layout, theta, readings : the machine, and what it was closed at.
     """
@@ -228,7 +235,9 @@ class ForwardResult:
         return singularity_of(self.layout, scaled_rows(c))
 
 
-def inverse(layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None) -> Array:
+def readings_at_poses(
+    layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None
+) -> Array:
     """Readings (..., m) at poses T_base_platform (..., 4, 4).
 
     Rods: q = (length - offset) / scale, [B] eq. 4. Cranks and sliders: the carrier's closed form,
@@ -301,14 +310,14 @@ def _settled(
     m = layout.n_readings
     pick = layout.of_motor.astype(float)
     x = np.concatenate([readings, internal], axis=-1)
-    for _ in range(SETTLING):
+    for _ in range(SECOND_RODS_STEPS):
         c = closure(layout, theta, x[..., :m], poses, x[..., m:])
         jac = np.concatenate([c.by_reading[..., None] * pick, c.rows.by_internal], axis=-1)
         # what is out of reach is NaN and stays so
         jac, value = np.nan_to_num(jac), np.nan_to_num(c.rows.value)
         step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
         x = x - step
-        if np.abs(step).max(initial=0.0) < SETTLED:
+        if np.abs(step).max(initial=0.0) < SECOND_RODS_SETTLED:
             break
     return x[..., :m], x[..., m:]
 
@@ -342,11 +351,11 @@ def forward(
     )
     poses, inner = found.poses.reshape(*shape, 4, 4), found.internal.reshape(*shape, n)
     error = found.error.reshape(shape)
-    converged = error < CONVERGED
+    converged = error < CONVERGED_CLOSURE_ERROR
     if layout.overdetermined:
         poses, inner, error = _at_least(layout, theta, readings, poses, inner)
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
-        converged = error < GAP * rods
+        converged = error < OTHER_MACHINE_GAP * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
 
 
@@ -357,7 +366,7 @@ def _at_least(
 
     Gauss-Newton: near it the squares are level to rounding, and tell a search nothing.
     """
-    for _ in range(LEVELLING):
+    for _ in range(LEVELLING_STEPS):
         c = closure(layout, theta, readings, poses, internal)
         back = np.linalg.pinv(np.nan_to_num(by_own(layout, c.rows)))
         step = (back @ np.nan_to_num(c.rows.value)[..., None])[..., 0] @ layout.own_motion.T
@@ -462,8 +471,8 @@ def on_manifold(
         value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
         lost[left] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[left] + 1)
-        more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED * 1e-2
-        more &= lost[left] < GIVEN_UP
+        more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
+        more &= lost[left] < STEPS_OUT_OF_REACH
         left = left[more]
         if not left.size:
             break
@@ -475,7 +484,9 @@ def on_manifold(
     reached = np.isfinite(c.rows.value).all(axis=-1)
     off = np.abs(undriven(c)[0]).max(axis=-1, initial=0.0)
     error = np.where(reached, off, np.inf)
-    return ForwardResult(current, error < CONVERGED, error, phi, layout, theta, readings)
+    return ForwardResult(
+        current, error < CONVERGED_CLOSURE_ERROR, error, phi, layout, theta, readings
+    )
 
 
 def undriven(c: Closure) -> tuple[Array, Array]:

@@ -11,12 +11,12 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.mechanisms.carriers.contract import base_carriers, of_part, platform_carriers
 from pkmcal.mechanisms.document import (
-    MOTIONS,
+    MOTION_DIRECTIONS,
     ActuatedLength,
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import AXIS, AngleLayout, angle_layout
+from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, AngleLayout, angle_layout
 from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 
@@ -295,7 +295,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
             )
             for j, leg in enumerate(legs)
         ),
-        motion=MOTIONS[document.motion],
+        motion=MOTION_DIRECTIONS[document.motion],
         n_parameters=len(positions),
     )
 
@@ -312,7 +312,9 @@ def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) 
     names = (
         f"legs[{j}].{side}.{kind.path}"
         for j, leg in enumerate(document.legs, start=1)
-        for kind in dict.fromkeys((*carriers[getattr(leg, side).joint].parameters, *AXIS))
+        for kind in dict.fromkeys(
+            (*carriers[getattr(leg, side).joint].parameters, *JOINT_AXIS_KINDS)
+        )
         if kind.unit == "1" and kind.path.endswith(".x")
     )
     first = [positions[name] for name in names if name in positions]

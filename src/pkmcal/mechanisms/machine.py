@@ -21,15 +21,15 @@ from pkmcal.mechanisms.carriers.contract import (
 )
 from pkmcal.mechanisms.closure import LimbEnds, joint_values, limb_ends, skeletons
 from pkmcal.mechanisms.document import (
-    CONSTANT,
-    OFFSET,
-    SCALE,
+    CONSTANT_LENGTH_KIND,
+    OFFSET_KIND,
+    READING_SCALE_KIND,
     ActuatedLength,
     MechanismDocument,
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_drawing
-from pkmcal.mechanisms.joints import AXIS, axes_in_use
+from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, axes_in_use
 from pkmcal.mechanisms.layout import LimbLayout, layout_of
 from pkmcal.mechanisms.motors import (
     built_in_fixed,
@@ -204,7 +204,7 @@ class Machine:
         (n, m); NaN where a limb cannot reach. An articulated platform's hinges turn as they must.
         """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        return kinematics.inverse(self.layout, self.values, poses, near)
+        return kinematics.readings_at_poses(self.layout, self.values, poses, near)
 
     def forward(self, joints: Array, start: Array | None = None) -> Array:
         """Platform poses T_base_platform (n, 4, 4) at readings (n, m).
@@ -301,12 +301,12 @@ class Machine:
     ) -> workspace.Grid:
         """The workspace at the orientation of a pose (4, 4), home when absent: along all of the
         motion's directions, or a section along two (2, 3); see
-        :func:`pkmcal.mechanisms.workspace.grid`.
+        :func:`pkmcal.mechanisms.workspace.workspace_grid`.
         """
         own = np.eye(3)[self.layout.free[3:]]
         axes = own if directions is None else _checked(directions, (3,), "directions")
         begin = self._home if middle is None else _checked(middle, (4, 4), "middle")
-        return workspace.grid(self.limits(), begin, axes, count)
+        return workspace.workspace_grid(self.limits(), begin, axes, count)
 
     def check_path(self, T_base_platform: Array) -> workspace.PathCheck:
         """Whether a path of poses (n, 4, 4) stays in the workspace and crosses no singular pose,
@@ -421,13 +421,17 @@ def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
         path = f"legs[{j + 1}]"
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
             node = getattr(leg, side)
-            kinds = carriers[node.joint].parameters + (AXIS if (j, side) in axes else ())
+            kinds = carriers[node.joint].parameters + (
+                JOINT_AXIS_KINDS if (j, side) in axes else ()
+            )
             yield from _rows_of(f"{path}.{side}", node, kinds, usual)
         if not isinstance(leg.length, PassiveLength):
-            kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
+            kind = OFFSET_KIND if isinstance(leg.length, ActuatedLength) else CONSTANT_LENGTH_KIND
             yield from _rows_of(f"{path}.length", leg.length, (kind,), usual)
         if scales[j] > 0:
-            yield from _rows_of(path, leg, (SCALE,), {SCALE.tolerance: scales[j]})
+            yield from _rows_of(
+                path, leg, (READING_SCALE_KIND,), {READING_SCALE_KIND.tolerance: scales[j]}
+            )
         for t, tube in enumerate(leg.tubes, start=1):
             name, label = f"{path}.tubes[{t}].radius", f"tube {t} radius"
             yield _Row(name, "m", "radius", label, "", tube.radius, usual["radius"])

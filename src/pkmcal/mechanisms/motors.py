@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.mechanisms.carriers.contract import PLANAR, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import (
     EXACT_TURNS,
-    LEAD,
+    LEAD_TOLERANCE,
     ActuatedLength,
     Leg,
     MechanismDocument,
@@ -77,7 +77,7 @@ def scale_tolerances(document: MechanismDocument) -> Array:
     reading's unit says; 0 where it is exact, and for a leg without a reading.
     """
     told, columns = document.tolerance.scale, motor_columns(document)
-    usual = [LEAD if unit == "m" else EXACT_TURNS for unit in motor_units(document)]
+    usual = [LEAD_TOLERANCE if unit == "m" else EXACT_TURNS for unit in motor_units(document)]
     by_motor = np.append(usual if told is None else np.full(len(usual), told), 0.0)
     return by_motor[columns]
 
@@ -121,7 +121,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
     columns, free = motor_columns(document), scale_tolerances(document) > 0
     motors = [np.flatnonzero(free & (columns == k)) for k in range(columns.max(initial=-1) + 1)]
     shared += tuple(tuple(f"legs[{j + 1}].scale" for j in legs) for legs in motors if len(legs) > 1)
-    if document.motion not in PLANAR:
+    if document.motion not in PLANAR_MOTIONS:
         return shared
     numbers = range(1, len(document.legs) + 1)
     heights = ((f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z") for j in numbers)
@@ -130,7 +130,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
 
 def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
     """Entries that are no unknowns: what leaves a planar machine's plane."""
-    if document.motion not in PLANAR:
+    if document.motion not in PLANAR_MOTIONS:
         return ()
     return tuple(
         f"legs[{j}].{side}.{field}"

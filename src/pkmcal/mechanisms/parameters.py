@@ -16,8 +16,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 
-EVERY = "legs[*]"
-PARALLEL = 1e-9
+EVERY_LEG = "legs[*]"
+PARALLEL_AXES_TOLERANCE = 1e-9
 """Axes whose components differ by less are one direction in the drawing."""
 
 
@@ -91,9 +91,9 @@ class ParameterTable:
 
     def _of_all(self, entry: str) -> tuple[str, ...]:
         """The entries that one with ``legs[*]`` stands for."""
-        if EVERY not in entry:
+        if EVERY_LEG not in entry:
             return (entry,)
-        first, _, rest = entry.partition(EVERY)
+        first, _, rest = entry.partition(EVERY_LEG)
         legs = dict.fromkeys(n[: n.index("]") + 1] for n in self.names)
         every = [f"{leg}{rest}" for leg in legs if self._whole(f"{leg}{rest}")]
         if first or not every:
@@ -110,7 +110,7 @@ class ParameterTable:
         if len(whole) > 1:
             return whole
         k = self.index(entry)
-        if self.kinds[k] == "axis" and abs(self.drawing[k]) > PARALLEL:
+        if self.kinds[k] == "axis" and abs(self.drawing[k]) > PARALLEL_AXES_TOLERANCE:
             raise InputError(
                 what=f"{entry} cannot be held alone: an axis is one direction",
                 expected=f"the whole axis, {entry.rpartition('.')[0]!r}",
@@ -144,7 +144,7 @@ class ParameterTable:
 
     def _check_parallel(self, group: tuple[str, ...], members: list[list[tuple[str, int]]]) -> None:
         axes = np.array([[s * self.drawing[self.index(n)] for n, s in m] for m in members])
-        if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL:
+        if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL_AXES_TOLERANCE:
             raise InputError(
                 what="axes that differ in the drawing are tied",
                 found=", ".join(group),
@@ -200,7 +200,7 @@ class ParameterTable:
         axis = self.drawing[first[0] : first[0] + 3]
         held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
         span = np.array([axis, *held])
-        rank = int(np.linalg.matrix_rank(span, tol=PARALLEL))
+        rank = int(np.linalg.matrix_rank(span, tol=PARALLEL_AXES_TOLERANCE))
         basis = np.linalg.svd(span)[2][rank:].T
         out = np.zeros((len(self), basis.shape[1]))
         for k in first:

@@ -10,18 +10,25 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.mechanisms.workspace import ALLOWED, ROUGH, Limits, extents, reachable, spans
+from pkmcal.mechanisms.workspace import (
+    ALLOWED_CONSTRAINT_ERROR,
+    ROUGH_EFFORT,
+    Limits,
+    extents,
+    reachable,
+    straight_way_spans,
+)
 
-Side = tuple[float, float]
-AXES = ("x", "y", "z")
-SPARSE = 200
+RegionSide = tuple[float, float]
+REGION_AXES = ("x", "y", "z")
+TRIES_A_WANTED_POSE = 200
 """Poses tried for each one wanted, at most: where the machine can take fewer than one in so many,
 fewer are found."""
-FLAT = 0.02
+CROOKED_WAY_SHARE = 0.02
 """Of the longest way: less is no way of its own, but what crooked axes let a platform do."""
 AT_LEAST = 5000
 """Poses tried before a region counts as out of reach."""
-AT_ONCE = 4096
+REGION_POSES_AT_ONCE = 4096
 """Poses at a time, at most."""
 
 
@@ -36,13 +43,13 @@ class Region:
     Raises InputError for sides that are no intervals and a turn that is none.
     """
 
-    x: Side | None = None
-    y: Side | None = None
-    z: Side | None = None
+    x: RegionSide | None = None
+    y: RegionSide | None = None
+    z: RegionSide | None = None
     turn: float | None = None
 
     def __post_init__(self) -> None:
-        for name, side in zip(AXES, self.sides, strict=True):
+        for name, side in zip(REGION_AXES, self.sides, strict=True):
             if side is not None and not (np.isfinite(side).all() and side[0] <= side[1]):
                 raise InputError(
                     what=f"the workspace's {name} is no interval",
@@ -57,7 +64,7 @@ class Region:
             )
 
     @property
-    def sides(self) -> tuple[Side | None, Side | None, Side | None]:
+    def sides(self) -> tuple[RegionSide | None, RegionSide | None, RegionSide | None]:
         """x, y and z."""
         return self.x, self.y, self.z
 
@@ -69,17 +76,19 @@ class Region:
         for k, side in enumerate(self.sides):
             if side is not None:
                 place = poses[..., k, 3]
-                out &= (place >= side[0] - ALLOWED) & (place <= side[1] + ALLOWED)
+                out &= (place >= side[0] - ALLOWED_CONSTRAINT_ERROR) & (
+                    place <= side[1] + ALLOWED_CONSTRAINT_ERROR
+                )
         if self.turn is not None:
             turned = np.linalg.norm(pose_difference(poses, limits.home)[..., :3], axis=-1)
-            out &= turned <= self.turn + ALLOWED
+            out &= turned <= self.turn + ALLOWED_CONSTRAINT_ERROR
         return out
 
     def __str__(self) -> str:
         boxed = [
             f"{name} {side[0] * 1e3:.4g}"
             + (f" to {side[1] * 1e3:.4g} mm" if side[1] > side[0] else " mm")
-            for name, side in zip(AXES, self.sides, strict=True)
+            for name, side in zip(REGION_AXES, self.sides, strict=True)
             if side is not None
         ]
         turned = [f"turned by up to {np.rad2deg(self.turn):.3g}°"] if self.turn else []
@@ -107,11 +116,14 @@ def within_reach(limits: Limits, region: Region) -> Within:
     low = high = limits.home[:3, 3]
     moves = 0
     if len(free):
-        near, far = spans(limits, limits.home, free, ROUGH)
+        near, far = straight_way_spans(limits, limits.home, free, ROUGH_EFFORT)
         low, high = low + near @ free, high + far @ free
-        moves = int(np.count_nonzero(far - near > FLAT * (far - near).max()))
-    for k, (name, side) in enumerate(zip(AXES, region.sides, strict=True)):
-        if side is not None and (side[1] < low[k] - ALLOWED or side[0] > high[k] + ALLOWED):
+        moves = int(np.count_nonzero(far - near > CROOKED_WAY_SHARE * (far - near).max()))
+    for k, (name, side) in enumerate(zip(REGION_AXES, region.sides, strict=True)):
+        if side is not None and (
+            side[1] < low[k] - ALLOWED_CONSTRAINT_ERROR
+            or side[0] > high[k] + ALLOWED_CONSTRAINT_ERROR
+        ):
             raise InputError(
                 what="the machine does not come to the workspace that was asked for",
                 found=f"{name} from {side[0]:g} to {side[1]:g} m",
@@ -136,11 +148,11 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     within = within_reach(limits, region)
     kept: list[Array] = []
     found = tried = 0
-    most = max(SPARSE * count, AT_LEAST)
+    most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
     while found < count and tried < most:
-        more = min(max(count, tried), AT_ONCE)
+        more = min(max(count, tried), REGION_POSES_AT_ONCE)
         poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
-        closed = on_manifold(limits.layout, limits.theta, poses, ROUGH.newton)
+        closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
         poses = poses[reachable(limits, poses).inside]

@@ -26,9 +26,10 @@ from pkmcal.mechanisms.closure import BaseEnds, Closure, by_motors
 from pkmcal.mechanisms.kinematics import closure_at, own_scale, platform_radius, scaled_rows
 from pkmcal.mechanisms.layout import LimbLayout
 
-LOST = 1e-9
+LEAST_GAIN_FOR_RATES = 1e-9
 """Smallest singular value of a scaled Jacobian that still gives rates: a pose is right to 1e-12 m
-(:data:`pkmcal.mechanisms.kinematics.CONVERGED`), so below it not three digits would be right."""
+(:data:`pkmcal.mechanisms.kinematics.CONVERGED_CLOSURE_ERROR`), so below it not three digits would
+be right."""
 
 
 def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
@@ -46,7 +47,7 @@ def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     rows = layout.driven_rows[np.argsort(layout.row_motor[layout.driven_rows])]
     legs = np.flatnonzero(layout.closing)[rows]
     gain = c.by_reading[..., rows]
-    usable = np.abs(gain) > LOST * _reading_scale(layout, c.base)[..., legs]
+    usable = np.abs(gain) > LEAST_GAIN_FOR_RATES * _reading_scale(layout, c.base)[..., legs]
     return -c.rows.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
 
 
@@ -96,7 +97,7 @@ def _pseudo_inverse(jac: Array) -> Array:
         return np.full((*jac.shape[:-2], jac.shape[-1], jac.shape[-2]), np.nan)
     known = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
     u, s, vt = np.linalg.svd(np.where(known[..., None, None], jac, 0.0), full_matrices=False)
-    usable = known[..., None] & (s[..., -1:] > LOST)
+    usable = known[..., None] & (s[..., -1:] > LEAST_GAIN_FOR_RATES)
     weights = np.where(usable, 1 / np.where(usable, s, 1.0), np.nan)
     return vt.mT @ (weights[..., None] * u.mT)
 

@@ -20,8 +20,8 @@ from pkmcal.mechanisms.kinematics import (
     MAX_STEPS,
     NEAR_SINGULAR,
     closure_at,
-    inverse,
     on_manifold,
+    readings_at_poses,
     scaled_rows,
     singularity_of,
     typical_reach,
@@ -30,7 +30,7 @@ from pkmcal.mechanisms.kinematics import (
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import sign_of
 
-ALLOWED = 1e-6
+ALLOWED_CONSTRAINT_ERROR = 1e-6
 """What the constant rods and axes must close to, m, and the motion, m and rad: more than rounding
 of a pose in a file, less than any drive's step."""
 
@@ -112,7 +112,7 @@ class Reach:
             return []
         reading, short = float(self.readings[at]), bool(self.too_short[at])
         end = float(low if short else high)
-        if abs(reading - end) < ALLOWED:
+        if abs(reading - end) < ALLOWED_CONSTRAINT_ERROR:
             return [f"motor {motor + 1} is at the end of its range, {end:.4g} {unit}"]
         where = f"below its range, which begins at {end:.4g} {unit}"
         if not short:
@@ -121,7 +121,7 @@ class Reach:
 
     def _forbidden(self, pose: tuple[int, ...]) -> str:
         off = float(self.off[pose])
-        if off > ALLOWED:
+        if off > ALLOWED_CONSTRAINT_ERROR:
             return (
                 "the rods of constant length and the joints' axes do not allow the pose, by"
                 f" {off * 1e3:.3g} mm"
@@ -146,7 +146,7 @@ def reachable(limits: Limits, poses: Array) -> Reach:
         too_short=readings < limits.ranges[:, 0],
         too_long=readings > limits.ranges[:, 1],
         off=off,
-        forbidden=(off > ALLOWED) | _elsewhere(limits, poses),
+        forbidden=(off > ALLOWED_CONSTRAINT_ERROR) | _elsewhere(limits, poses),
         singularity=singularity,
         singular=~lost.any(axis=-1) & ~(singularity >= least),
         crossed=own * sign < 0,
@@ -160,7 +160,7 @@ def _elsewhere(limits: Limits, poses: Array) -> Booleans:
     if not held.any():
         return np.zeros(poses.shape[:-2], dtype=bool)
     moved = np.abs(pose_difference(poses, limits.home)[..., held])
-    return np.asarray(moved.max(axis=-1) > ALLOWED)
+    return np.asarray(moved.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
 
 
 @dataclass(frozen=True)
@@ -176,14 +176,14 @@ class Effort:
     rounds: int = 4
 
 
-FINE = Effort()
-ROUGH = Effort(steps=40, halvings=14, newton=6, rounds=1)
+FINE_EFFORT = Effort()
+ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
 """For a box about the workspace."""
-AHEAD = 8
+WAY_POSES_AHEAD = 8
 """Poses of each way at a time."""
-KEPT = 0.99
+KEPT_WAY_SHARE = 0.99
 """Share of the way asked for that must be left when constant rods and axes had their say."""
-AT_ONCE = 20_000
+GRID_POSES_AT_ONCE = 20_000
 """Poses of a grid at a time."""
 
 
@@ -223,7 +223,7 @@ def extents(
     directions: Array,
     start: Array,
     most: float | None = None,
-    effort: Effort = FINE,
+    effort: Effort = FINE_EFFORT,
 ) -> Extents:
     """How far one comes from ``start`` (4, 4) along straight ways, until something stands against
     it: a range, a limb's reach, a singular pose.
@@ -246,8 +246,10 @@ def extents(
     way = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
     still = np.zeros(way.shape, dtype=bool)
     ahead: Integers = np.arange(len(way))
-    for first in range(0, effort.steps + 1, AHEAD):  # what comes after the end is not looked at
-        at = slice(first, first + AHEAD)
+    for first in range(
+        0, effort.steps + 1, WAY_POSES_AHEAD
+    ):  # what comes after the end is not looked at
+        at = slice(first, first + WAY_POSES_AHEAD)
         inside = _along(limits, start, twists[ahead, None], way[ahead, at], effort)[1].inside
         still[ahead, at] = np.logical_and.accumulate(inside, axis=1)
         ahead = ahead[inside.all(axis=1)]
@@ -275,7 +277,7 @@ def _farthest(limits: Limits, twists: Array) -> Array:
 
 def _reach(limits: Limits) -> float:
     """A rod's length at home, m."""
-    readings = inverse(limits.layout, limits.theta, limits.home)
+    readings = readings_at_poses(limits.layout, limits.theta, limits.home)
     return typical_reach(limits.layout, limits.theta, readings)
 
 
@@ -314,16 +316,16 @@ def _settled(
     settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
     for _ in range(effort.rounds):
         behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-        if np.all(np.abs(behind) <= (1 - KEPT) * 1e-2 * way):
+        if np.all(np.abs(behind) <= (1 - KEPT_WAY_SHARE) * 1e-2 * way):
             break
         ahead = perturb(settled, twists * behind[..., None])
         settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
     behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-    kept = np.abs(behind) <= (1 - KEPT) * way
+    kept = np.abs(behind) <= (1 - KEPT_WAY_SHARE) * way
     return np.where(kept[..., None, None], settled, poses)
 
 
-def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
+def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     """Positions about ``middle`` (4, 4), at its orientation.
 
     directions : (2, 3) or (3, 3) square to each other, base frame, for a section or a volume. The
@@ -333,7 +335,7 @@ def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     one of the directions without turning.
     """
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    low, high = spans(limits, middle, unit)
+    low, high = straight_way_spans(limits, middle, unit)
     _refuse_flat(limits, unit, high - low)
     cell = float((high - low).max()) / count
     # the middle pose is one of the points
@@ -351,7 +353,9 @@ def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     return Grid(axes, connected, singular.reshape(shape), size)
 
 
-def spans(limits: Limits, middle: Array, unit: Array, effort: Effort = FINE) -> tuple[Array, Array]:
+def straight_way_spans(
+    limits: Limits, middle: Array, unit: Array, effort: Effort = FINE_EFFORT
+) -> tuple[Array, Array]:
     """How far down and up (k,) along unit vectors (k, 3) straight ways from ``middle`` (4, 4) come,
     along them and between them, and a tenth more, m.
     """
@@ -376,8 +380,8 @@ def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
 def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Booleans, Array]:
     """Whether positions (n, 3) belong to the workspace, and their singularity, (n,) each."""
     inside, singular = np.zeros(len(positions), dtype=bool), np.zeros(len(positions))
-    for first in range(0, len(positions), AT_ONCE):
-        rows = slice(first, first + AT_ONCE)
+    for first in range(0, len(positions), GRID_POSES_AT_ONCE):
+        rows = slice(first, first + GRID_POSES_AT_ONCE)
         found = reachable(limits, pose(middle[:3, :3], positions[rows]))
         inside[rows], singular[rows] = found.inside, found.singularity
     return inside, singular
@@ -392,7 +396,7 @@ def _connected(inside: Booleans, start: tuple[int, ...]) -> Booleans:
     return np.asarray((parts == parts[start]) & inside)
 
 
-BETWEEN = 8
+LOOKS_A_PATH_STEP = 8
 """Poses looked at from one of the path's to the next."""
 
 
@@ -449,12 +453,12 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
             found=f"an array of shape {poses.shape}",
             expected="(n, 4, 4)",
         )
-    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * BETWEEN + 1)
+    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * LOOKS_A_PATH_STEP + 1)
     found = reachable(limits, _at(poses, places))
     leaves, why = _leaving(limits, poses, places, found)
     nearest = np.where(np.isfinite(found.singularity), found.singularity, np.inf)
     k = int(np.argmin(nearest))
-    own = slice(None, None, BETWEEN)
+    own = slice(None, None, LOOKS_A_PATH_STEP)
     return PathCheck(
         inside=found.inside[own],
         leaves=leaves,
@@ -482,7 +486,7 @@ def _leaving(
     if outside[0] == 0:
         return 0.0, found.why(0)
     low, high = places[outside[0] - 1], places[outside[0]]
-    for _ in range(FINE.halvings):
+    for _ in range(FINE_EFFORT.halvings):
         middle = (low + high) / 2
         good = bool(reachable(limits, _at(poses, np.array([middle]))).inside[0])
         low, high = (middle, high) if good else (low, middle)
@@ -495,7 +499,7 @@ def _crossings(limits: Limits, poses: Array, places: Array, found: Reach) -> tup
     changes = np.diff(found.crossed.astype(int)) != 0
     at = np.flatnonzero(changes & reached[1:] & reached[:-1])
     low, high = places[at], places[at + 1]
-    for _ in range(FINE.halvings if at.size else 0):
+    for _ in range(FINE_EFFORT.halvings if at.size else 0):
         middle = (low + high) / 2
         same = reachable(limits, _at(poses, middle)).crossed == found.crossed[at]
         low, high = np.where(same, middle, low), np.where(same, high, middle)

@@ -23,42 +23,48 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, dot, inverse, pose, rotation
-from pkmcal.observe.evidence import StationView, apart, descend, evidence_of, settle
-from pkmcal.observe.places import PLACES, TURNS, frame_of, sphere
+from pkmcal.observe.evidence import (
+    StationView,
+    descend,
+    distinct_silhouettes,
+    evidence_of,
+    settle_by_evidence,
+)
+from pkmcal.observe.places import CAMERA_DIRECTIONS, SIGHT_LINE_TURNS, frame_of, sphere
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tables import WORKING_WIDTH, distance_tables
-from pkmcal.observe.tubes import CELL, DIRECTIONS, TubeChart, tube_chart
+from pkmcal.observe.tubes import MAP_CELL_SIZE, PAIR_DIRECTIONS, TubeChart, tube_chart
 
-FILLS = (0.3, 1.5)
+PICTURE_SHARES_FILLED = (0.3, 1.5)
 """Share of the picture that the machine fills: from a third, to where its ends lie outside."""
-WIDEST = 1.2
+WIDEST_HALF_ANGLE = 1.2
 """Half the angle (rad) under which it is seen at most."""
-FURTHER = 1.18
+NEXT_DISTANCE_FACTOR = 1.18
 """Factor from one distance to the next: half of that moves a leg's end by half its width."""
-OFF = 0.2
+CHART_SHARE_OFF_MIDDLE = 0.2
 """Share of the chart's size by which the machine may lie off its middle, to each side."""
-STRIDE = 2
+CHART_STRIDE_CELLS = 2
 """Cells of the chart from one place in the picture to the next."""
-EACH = 2
+PICTURE_PLACES_A_TURN = 2
 """Places in the picture that are kept for each place and turn of the camera."""
-KEPT = 2000
+HYPOTHESES_THAT_DESCEND = 2000
 """Hypotheses that descend: in a cluttered laboratory the machine's is among the first thousand."""
-FEWER, FEW = 400, 120
+HYPOTHESES_ON_COARSE, HYPOTHESES_ON_FINER = 400, 120
 """How many go on after the first descents, and to the finer picture."""
 MANY_DIRECTIONS = 24
 """Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
-FINEST = 4 * WORKING_WIDTH, MANY_DIRECTIONS
+FINEST_TABLES = 4 * WORKING_WIDTH, MANY_DIRECTIONS
 """Width (px) and directions of the tables on which places are weighed."""
-FEWEST = 40
+HYPOTHESES_ON_FINEST = 40
 """How many go on to the finest picture, and beside them the look-alikes of the first two."""
-ALIKE = np.radians(20.0)
+SAME_PLACE_TURN = np.radians(20.0)
 """Turn within which two places are one: look-alikes are turned by 60 degrees at least."""
-FOLDS = (2, 3, 4, 6)
+MACHINE_FOLDS = (2, 3, 4, 6)
 """Equal parts that a machine may have."""
-ONTO = 0.2
+JOINT_ON_JOINT_DISTANCE = 0.2
 """Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
 equal that they could be exchanged, and yet from a photograph they could."""
-BATCH = 214
+PLACES_IN_A_BATCH = 214
 """Places that are looked up together: some ten megabytes."""
 
 
@@ -87,20 +93,20 @@ def find_alone(view: StationView, image: Integers) -> Alone:
     fine = replace(view, tables=distance_tables([image], 2 * WORKING_WIDTH, MANY_DIRECTIONS))
     found = _hypotheses(view, tube_chart(image, view.camera))
     found = descend(coarse, found, one, 2, (16, 14, 12, 10))
-    found = _most(coarse, found, 4, FEWER)
+    found = _most(coarse, found, 4, HYPOTHESES_ON_COARSE)
     found = descend(coarse, found, one, 4, (8, 7, 6, 5, 5))
-    found = _most(coarse, found, 5, FEW)
-    found, evidence = settle(fine, found, one, 8, 6)
+    found = _most(coarse, found, 5, HYPOTHESES_ON_FINER)
+    found, evidence = settle_by_evidence(fine, found, one, 8, 6)
     found = found[np.argsort(-evidence)]
-    found = found[apart(fine, found, one)][:FEWEST]
-    return weighed(view, image, np.concatenate([found, turned_about(view, found[:2])]))
+    found = found[distinct_silhouettes(fine, found, one)][:HYPOTHESES_ON_FINEST]
+    return weighed_places(view, image, np.concatenate([found, turned_about(view, found[:2])]))
 
 
-def weighed(view: StationView, image: Integers, found: Array) -> Alone:
+def weighed_places(view: StationView, image: Integers, found: Array) -> Alone:
     """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
     one = np.zeros(1, dtype=int)
-    view = replace(view, tables=distance_tables([image], *FINEST))
-    found, evidence = settle(view, found, one, 16, 6)
+    view = replace(view, tables=distance_tables([image], *FINEST_TABLES))
+    found, evidence = settle_by_evidence(view, found, one, 16, 6)
     order = np.argsort(-evidence)
     order = order[evidence[order] > 0]
     if not len(order):
@@ -111,9 +117,9 @@ def weighed(view: StationView, image: Integers, found: Array) -> Alone:
 
 def distinct(view: StationView, found: Array) -> Integers:
     """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
-    kept = np.array(apart(view, found, np.zeros(1, dtype=int)))
+    kept = np.array(distinct_silhouettes(view, found, np.zeros(1, dtype=int)))
     # near the first lies the same place, less well settled
-    return kept[(angle_between(found[kept], found[0]) >= ALIKE) | (kept == 0)]
+    return kept[(angle_between(found[kept], found[0]) >= SAME_PLACE_TURN) | (kept == 0)]
 
 
 def _unit(view: StationView, found: Array) -> float:
@@ -146,41 +152,57 @@ class _Tubes(NamedTuple):
 
 
 def _hypotheses(view: StationView, chart: TubeChart) -> Array:
-    """Poses T_camera_base (KEPT, 4, 4), best first."""
+    """Poses T_camera_base (HYPOTHESES_THAT_DESCEND, 4, 4), best first."""
     tubes = _tubes(view)
     width, height = chart.size
     half = min(width, height) / 2 / chart.scale
-    near, far = (tubes.size / np.sin(min(half * fill, WIDEST)) for fill in reversed(FILLS))
-    count = int(np.ceil(np.log(far / near) / np.log(FURTHER))) + 1
+    near, far = (
+        tubes.size / np.sin(min(half * fill, WIDEST_HALF_ANGLE))
+        for fill in reversed(PICTURE_SHARES_FILLED)
+    )
+    count = int(np.ceil(np.log(far / near) / np.log(NEXT_DISTANCE_FACTOR))) + 1
     distance = np.geomspace(near, far, count)
-    direction = sphere(PLACES)
+    direction = sphere(CAMERA_DIRECTIONS)
     look = frame_of(-direction)
     # what is looked up: each place in the picture is a shift of the maps
-    steps = [np.arange(-int(OFF * n / CELL), int(OFF * n / CELL) + 1, STRIDE) for n in chart.size]
+    steps = [
+        np.arange(
+            -int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE),
+            int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE) + 1,
+            CHART_STRIDE_CELLS,
+        )
+        for n in chart.size
+    ]
     windows = _windows(chart.rarity, steps)
     values: list[Array] = []
     shifts: list[Integers] = []
     for away in distance:
         point = tubes.ends - (tubes.centre + direction * away)[:, None, None]
         seen = np.einsum("pij,ptnj->ptni", look, point)
-        for turn in range(TURNS):
-            score = _scores(seen, tubes.radius, 2 * np.pi * turn / TURNS, chart, windows)
-            for _ in range(EACH):
+        for turn in range(SIGHT_LINE_TURNS):
+            score = _scores(seen, tubes.radius, 2 * np.pi * turn / SIGHT_LINE_TURNS, chart, windows)
+            for _ in range(PICTURE_PLACES_A_TURN):
                 best = score.argmax(axis=-1)[:, None]
                 shifts += [best]
                 values += [np.take_along_axis(score, best, axis=-1)]
                 np.put_along_axis(score, best, -np.inf, axis=-1)
-    # (distance * turn * EACH, place)
+    # (distance * turn * PICTURE_PLACES_A_TURN, place)
     value, best = (np.concatenate(part, axis=-1).T for part in (values, shifts))
-    order = np.argsort(-value.ravel())[:KEPT]
+    order = np.argsort(-value.ravel())[:HYPOTHESES_THAT_DESCEND]
     row, place = np.unravel_index(order, value.shape)
-    step, shift = row // EACH, best[row, place]
+    step, shift = row // PICTURE_PLACES_A_TURN, best[row, place]
     dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
-    x, y, zero = dx * CELL / chart.scale, dy * CELL / chart.scale, np.zeros(len(order))
+    x, y, zero = (
+        dx * MAP_CELL_SIZE / chart.scale,
+        dy * MAP_CELL_SIZE / chart.scale,
+        np.zeros(len(order)),
+    )
     tilt = rotation(np.stack([-y, x, zero], axis=-1))
-    roll = rotation(np.stack([zero, zero, 2 * np.pi / TURNS * (step % TURNS)], axis=-1))
+    roll = rotation(
+        np.stack([zero, zero, 2 * np.pi / SIGHT_LINE_TURNS * (step % SIGHT_LINE_TURNS)], axis=-1)
+    )
     rot = tilt @ roll @ look[place]
-    stand = tubes.centre + direction[place] * distance[step // TURNS][:, None]
+    stand = tubes.centre + direction[place] * distance[step // SIGHT_LINE_TURNS][:, None]
     return pose(rot, -(rot @ stand[..., None])[..., 0])
 
 
@@ -205,10 +227,17 @@ def _windows(rarity: Integers, steps: Sequence[Integers]) -> Integers:
     border = _border(rarity)
     padded = np.pad(rarity, ((0, 0), (0, 0), (border, border), (border, border)))
     nx, ny = (len(s) for s in steps)
-    shape = (*rarity.shape[:2], padded.shape[2] - STRIDE * ny, padded.shape[3] - STRIDE * nx)
+    shape = (
+        *rarity.shape[:2],
+        padded.shape[2] - CHART_STRIDE_CELLS * ny,
+        padded.shape[3] - CHART_STRIDE_CELLS * nx,
+    )
     stride = padded.strides
     return np.lib.stride_tricks.as_strided(
-        padded, (*shape, ny, nx), (*stride, STRIDE * stride[2], STRIDE * stride[3]), writeable=False
+        padded,
+        (*shape, ny, nx),
+        (*stride, CHART_STRIDE_CELLS * stride[2], CHART_STRIDE_CELLS * stride[3]),
+        writeable=False,
     )
 
 
@@ -227,18 +256,18 @@ def _scores(seen: Array, radius: Array, turn: float, chart: TubeChart, windows: 
     cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     chord = cell[:, :, 2] - cell[:, :, 0]
     normal = np.arctan2(chord[..., 0], -chord[..., 1])
-    number = np.rint(normal % np.pi * (DIRECTIONS / np.pi)).astype(np.intp) % DIRECTIONS
+    number = np.rint(normal % np.pi * (PAIR_DIRECTIONS / np.pi)).astype(np.intp) % PAIR_DIRECTIONS
     width = 2 * radius * chart.scale / np.sqrt(dot(seen[:, :, 1], seen[:, :, 1]))
     weight = np.hypot(chord[..., 0], chord[..., 1])
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    at = np.floor((cell[:, :, 1] + chart.middle) / CELL).astype(np.intp)
+    at = np.floor((cell[:, :, 1] + chart.middle) / MAP_CELL_SIZE).astype(np.intp)
     shifts = windows.shape[-2:]
-    first = _border(chart.rarity) - STRIDE * (np.array(shifts[::-1]) // 2)
+    first = _border(chart.rarity) - CHART_STRIDE_CELLS * (np.array(shifts[::-1]) // 2)
     at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
     which = chart.width_number(width)
     out = np.empty((len(seen), shifts[0] * shifts[1]), dtype=np.float32)
-    for k in range(0, len(seen), BATCH):
-        part = slice(k, k + BATCH)
+    for k in range(0, len(seen), PLACES_IN_A_BATCH):
+        part = slice(k, k + PLACES_IN_A_BATCH)
         worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
         out[part] = np.matmul(weight[part, None], worth)[:, 0]
@@ -253,9 +282,9 @@ def turned_about(view: StationView, found: Array) -> Array:
     base = machine.base_centers()
     middle = base.mean(axis=0)
     axis = np.linalg.svd(base - middle)[2][2]  # across the plane in which they lie, nearly
-    near = ONTO * np.sqrt(dot(base - middle, base - middle).max())
+    near = JOINT_ON_JOINT_DISTANCE * np.sqrt(dot(base - middle, base - middle).max())
     turns: list[Array] = []
-    for angle in 2 * np.pi * np.unique([k / n for n in FOLDS for k in range(1, n)]):
+    for angle in 2 * np.pi * np.unique([k / n for n in MACHINE_FOLDS for k in range(1, n)]):
         turn = rotation(angle * axis)
         moved = (base - middle) @ turn.T + middle
         apart = np.sqrt(dot(moved[:, None] - base, moved[:, None] - base))

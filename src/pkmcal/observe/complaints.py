@@ -97,7 +97,7 @@ class _Ear:
 _ear = _Ear()
 
 
-def listening(decode: Callable[[], Decoded]) -> tuple[Decoded, str]:
+def decoded_and_fault(decode: Callable[[], Decoded]) -> tuple[Decoded, str]:
     """What `decode` returns, and the first fault of the picture that it told on standard error."""
     with _ear.listening(alone=False) as heard:
         found = decode()

@@ -24,22 +24,22 @@ from pkmcal.observe.evidence import StationView, evidence_by_name, evidence_from
 from pkmcal.observe.stations import FoundStation, evidence_nearby, find_station
 from pkmcal.wording import listed
 
-DECIDED = math.log(30 / 0.05)
+DIAGNOSIS_LOG_ODDS = math.log(30 / 0.05)
 """Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
 another."""
-BESIDE = np.radians(15.0)
+NEAR_SEARCH_TURN = np.radians(15.0)
 """Turn from the pose by hand beyond which the search about it would not have come there."""
-ELSEWHERE = np.radians(45.0)
+FOUND_ELSEWHERE_TURN = np.radians(45.0)
 """Turn from the pose by hand beyond which the machine was found where the user does not see it: a
 machine of three or six equal parts looks the same from there."""
-ASSIGNED = 3
+NAMING_ROUNDS = 3
 """Rounds of names for photographs, and of the pose that these tell."""
-SEARCHED = 3
+HYPOTHESES_SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
-ENOUGH, USUAL = 4, 15
+ENOUGH_PHOTOGRAPHS_ALONE, USUAL_PHOTOGRAPHS = 4, 15
 """Photographs below which there are no two halves to search and to ask, and one that says little
 leaves it open whether the machine is there; and how many are usual."""
-PAIRS = 15
+STATION_PAIRS_SEARCHED = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 
 
@@ -58,7 +58,7 @@ class SeenStation(NamedTuple):
     @property
     def elsewhere(self) -> bool:
         """Whether the machine was found far from where the user says, or not at all."""
-        return not self.found.good or self.turned > ELSEWHERE
+        return not self.found.good or self.turned > FOUND_ELSEWHERE_TURN
 
     @property
     def turned(self) -> float:
@@ -99,7 +99,7 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
-    few = len(worst.view.configuration) < ENOUGH
+    few = len(worst.view.configuration) < ENOUGH_PHOTOGRAPHS_ALONE
     return InputError(
         f"the machine is not recognised in the photographs of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
@@ -107,7 +107,8 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         expected="one place where its legs lie on edges of the picture far oftener than any"
         " machine's would",
         next_step=(
-            f"Take more photographs from there, {USUAL} are usual: of so few it cannot be said"
+            f"Take more photographs from there, {USUAL_PHOTOGRAPHS} are usual: of so few it"
+            f" cannot be said"
             " whether anything is mixed up. If there are more, check"
             if few
             else "Check"
@@ -127,7 +128,7 @@ def _little(station: SeenStation) -> str:
     if count < 2:
         return "one photograph alone, and none to confirm what it seems to show"
     often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
-    few = f"{count} photographs alone, and " if count < ENOUGH else ""
+    few = f"{count} photographs alone, and " if count < ENOUGH_PHOTOGRAPHS_ALONE else ""
     return f"{few}legs that readings of other configurations fit as well {often}"
 
 
@@ -135,7 +136,7 @@ def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> 
     """Two stations each recognised near the other's pose, and better than mirrored at its own: a
     symmetric machine's mirror image looks much as the machine does from the other side.
     """
-    for one, other in islice(combinations(stations, 2), PAIRS):
+    for one, other in islice(combinations(stations, 2), STATION_PAIRS_SEARCHED):
         if one.by_hand is None or other.by_hand is None:
             continue
         swapped = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
@@ -146,7 +147,7 @@ def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> 
             continue
         view = replace(one.view, tables=one.view.tables.mirrored())
         mirrored = find_station(view, one.by_hand, rng, closely=True)
-        if not (mirrored.good and mirrored.likelier(swapped[0].found) > DECIDED):
+        if not (mirrored.good and mirrored.likelier(swapped[0].found) > DIAGNOSIS_LOG_ODDS):
             return InputError(
                 f"stations {one.name} and {other.name} are mixed up",
                 where="session.yaml, stations",
@@ -161,7 +162,7 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     """The hypothesis that explains a station's photographs better than the session, if any."""
     view, found = station.view, station.found
     starts = [found.T_camera_base] if found.good or station.by_hand is not None else []
-    wide = station.elsewhere or station.turned > BESIDE
+    wide = station.elsewhere or station.turned > NEAR_SEARCH_TURN
     if wide and station.by_hand is not None:
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
@@ -174,7 +175,7 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     # where the machine is as the user says, another word has to be better there at once
     likely = [k for k, e in enumerate(evidence) if e > own or station.elsewhere]
     likely.sort(key=lambda k: -evidence[k])
-    best = [hypotheses[k] for k in likely[:SEARCHED]]
+    best = [hypotheses[k] for k in likely[:HYPOTHESES_SEARCHED]]
     others = list(_other_photographs(station))
     asked = len(hypotheses) + len(others)
     return _likelier(station, [*others, *best], in_order, rng, asked)
@@ -209,7 +210,7 @@ def _likelier(
         return None
     better.sort(key=lambda item: -item[0])
     first, error = better[0][0], better[0][1].error
-    also = [h.error.what for o, h in better[1:] if first - o < DECIDED]
+    also = [h.error.what for o, h in better[1:] if first - o < DIAGNOSIS_LOG_ODDS]
     if station.elsewhere and found.good:
         also.append("the pose by hand is of another side of the machine")
     if not also:
@@ -232,7 +233,7 @@ def _replaces(
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    return odds > DECIDED and found.by_chance * asked < found.limit
+    return odds > DIAGNOSIS_LOG_ODDS and found.by_chance * asked < found.limit
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
@@ -288,8 +289,8 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     # any name could be on each photograph, and the fewest that bear wrong ones are two; without
     # this, photographs of configurations that are alike would change names for nothing
     choices = math.log(len(names))
-    keeps = np.eye(len(names)) * station.found.grain * (DECIDED / 2 + choices)
-    for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
+    keeps = np.eye(len(names)) * station.found.grain * (DIAGNOSIS_LOG_ODDS / 2 + choices)
+    for _ in range(NAMING_ROUNDS):  # the wrong names have moved the pose, and it the names
         fits = evidence_by_name(replace(view, configuration=names[columns]), T_camera_base, names)
         before, columns = columns, _best_names(fits + keeps)
         if np.array_equal(before, columns):

@@ -30,15 +30,15 @@ from pkmcal.observe.predict import (
     tubes_of,
     visible_stretch,
 )
-from pkmcal.observe.tables import BIN, DistanceTables
+from pkmcal.observe.tables import CHANCE_DISTANCE_BIN, DistanceTables
 
 FIRST_DAMPING = 1e-3
 """Of a step, relative to the normal equations' diagonal."""
-FURTHER = 1e4
+DISTANCE_OUTSIDE_IMAGE = 1e4
 """Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
-SETTLED = 0.1
+LEAST_EVIDENCE_GAIN = 0.1
 """Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
-AT_ONCE = 30_000
+SILHOUETTE_PLACES_AT_ONCE = 30_000
 """Places on silhouettes that are looked up together, so that what is worked out of them stays in
 the processor's cache."""
 NAMES_AT_ONCE = 16
@@ -47,9 +47,9 @@ LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
 """Other readings for each photograph, which tell what evidence chance gives."""
-AWAY = np.repeat([0.2, 0.1], 3)
+ELSEWHERE_TURN_AND_SHIFT = np.repeat([0.2, 0.1], 3)
 """Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
-APART = 8.0
+SILHOUETTES_APART = 8.0
 """Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
 
 
@@ -137,12 +137,12 @@ class StationView:
         rest = max(FEWEST_RIVALS - len(steps), 0)
         if not rest:
             return others
-        away = rng.normal(size=(rest, len(own), 6)) * AWAY
+        away = rng.normal(size=(rest, len(own), 6)) * ELSEWHERE_TURN_AND_SHIFT
         away[..., 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
         return others.joined(self.legs_at(perturb(self.poses, away), self.joints))
 
 
-def apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
+def distinct_silhouettes(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
     """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
     legs = view.legs(photographs).moved(candidates)
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
@@ -150,7 +150,7 @@ def apart(view: StationView, candidates: Array, photographs: Integers) -> list[i
     for h in range(len(candidates)):
         away = pixel[kept] - pixel[h]
         off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
-        if all(np.median(other) > APART for other in off):
+        if all(np.median(other) > SILHOUETTES_APART for other in off):
             kept.append(h)
     return kept
 
@@ -207,10 +207,11 @@ class _Mixture(NamedTuple):
 
 class _Look(NamedTuple):
     """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
-    FURTHER outside the image; its slope, by metres that the edge moves outward; one by the density
-    of such distances by chance; reduced pixels of silhouette for which each place stands, none
-    outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
-    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
+    DISTANCE_OUTSIDE_IMAGE outside the image; its slope, by metres that the edge moves outward; one
+    by the density of such distances by chance; reduced pixels of silhouette for which each place
+    stands, none outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the
+    camera frame does to an edge, in metres outward: at its first place, and how much more its turn
+    at the last.
     """
 
     found: Array
@@ -236,7 +237,7 @@ class _Look(NamedTuple):
             own = self.length * self.own(mixture)
             mine = _summed(own)
             square = _summed(own * self.found**2) / np.maximum(mine, 1e-9)
-            sigma = np.clip(np.sqrt(square), BIN, widest)
+            sigma = np.clip(np.sqrt(square), CHANCE_DISTANCE_BIN, widest)
             mixture = _Mixture(np.clip(1 - mine / total, 0.01, 0.99), sigma)
         return mixture
 
@@ -288,7 +289,7 @@ def descend(
     return candidates
 
 
-def settle(
+def settle_by_evidence(
     view: StationView,
     candidates: Array,
     photographs: Integers,
@@ -315,7 +316,7 @@ def settle(
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
         most = float(gain.max())
-        if max(last, most) < SETTLED:
+        if max(last, most) < LEAST_EVIDENCE_GAIN:
             break  # one step may have been too long
         last = most
     mixture = look.mixture(first_mixture(len(candidates)), 10, widest)
@@ -357,7 +358,9 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
     """The pose (4, 4) with the most evidence near another."""
-    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0][0]
+    return settle_by_evidence(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[
+        0
+    ][0]
 
 
 def evidence_from(view: StationView, places: Array) -> float:
@@ -367,7 +370,7 @@ def evidence_from(view: StationView, places: Array) -> float:
     photographs are compared from the same places.
     """
     every = view.few(len(view.configuration))
-    return float(settle(view, places, every, 8, 8)[1].max())
+    return float(settle_by_evidence(view, places, every, 8, 8)[1].max())
 
 
 def grain(view: StationView, T_camera_base: Array) -> float:
@@ -384,7 +387,7 @@ def grain(view: StationView, T_camera_base: Array) -> float:
 def _parts(view: StationView, count: int, places: int) -> list[slice]:
     """Of so many hypotheses those that are looked at together, at so many places of each edge."""
     each = max(places * len(view.tubes), 1)
-    parts = max(min(round(count * each / AT_ONCE), count), 1)
+    parts = max(min(round(count * each / SILHOUETTE_PLACES_AT_ONCE), count), 1)
     ends = [count * k // parts for k in range(parts + 1)]
     return [slice(*pair) for pair in pairwise(ends)]
 
@@ -411,7 +414,7 @@ def look_under(view: StationView, candidates: Array, photographs: Integers, samp
     grows = _stacked((cross(last - first, points.normal),), seen)
     shape = (len(candidates), -1, samples)
     return _Look(
-        np.where(inside, found, FURTHER).reshape(shape),
+        np.where(inside, found, DISTANCE_OUTSIDE_IMAGE).reshape(shape),
         (slope * np.where(inside, points.gain, 0.0)).reshape(shape),
         rare.reshape(shape),
         np.where(inside, length[..., None], 0.0).reshape(shape),

@@ -1,8 +1,9 @@
 """Photographs from disk to grey-level arrays; files that are not what they should be are named.
 
 Six thousand photographs do not fit into memory, and an ordinary session's should not be decoded at
-every look: so the first that fit into KEPT bytes are kept, and the others decoded when they are
-looked at and forgotten again. What looks at many does so in windows (`pkmcal.observe.legs`).
+every look: so the first that fit into KEPT_PHOTOGRAPH_BYTES bytes are kept, and the others decoded
+when they are looked at and forgotten again. What looks at many does so in windows
+(`pkmcal.observe.legs`).
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
 from pkmcal.files import check_regular, read_exif, stated_size
-from pkmcal.observe.complaints import listening
+from pkmcal.observe.complaints import decoded_and_fault
 
-KEPT = 128 * 2**20
+KEPT_PHOTOGRAPH_BYTES = 128 * 2**20
 """Bytes of decoded photographs that are kept: 160 of 1024x768, 10 of a telephone's."""
-THREADS = 2
+DECODING_THREADS = 2
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
-DEPTHS, DARK = (8, 10, 12), 15
+CAMERA_BIT_DEPTHS, UNSHIFTED_GREY_LEVEL = (8, 10, 12), 15
 """Bits that cameras measure and programs put into 16 without shifting them up, and the highest of
 256 grey levels that is left of them then."""
 JPEG_END = b"\xff\xd9"
@@ -66,13 +67,13 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     image: Any = None
     fault = ""
     with suppress(cv2.error):  # a size beyond what OpenCV takes on: a spoilt header
-        image, fault = listening(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags))
+        image, fault = decoded_and_fault(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags))
     if fault:
         kind = "PNG" if data[:4] == b"\x89PNG" else "JPEG"
         raise _broken(label, f"a {kind} file that is damaged ({fault})")
     if image is None:
         raise _broken(label, "no readable image")
-    if image.max() <= DARK:
+    if image.max() <= UNSHIFTED_GREY_LEVEL:
         _check_depth(data, label)
     if image.shape == tuple(image_size) and image_size[0] != image_size[1]:
         clockwise = {6: True, 8: False}.get(read_exif(data).orientation)
@@ -97,7 +98,7 @@ def _check_depth(data: bytes, label: str) -> None:
     if raw.dtype != np.uint16:
         return
     highest = int(raw.max())
-    bits = next(bits for bits in DEPTHS if highest < 2**bits)
+    bits = next(bits for bits in CAMERA_BIT_DEPTHS if highest < 2**bits)
     raise InputError(
         f"the photograph is nearly black: a 16-bit file whose grey levels fill {bits} bits",
         where=label,
@@ -214,7 +215,7 @@ class Pictures(LazyPictures):
             image = out[number]  # a fault is told here, before any work
             return image if number < most else None
 
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(DECODING_THREADS) as pool:
             found = list(pool.map(look, range(len(out))))
         out._kept = {number: image for number, image in enumerate(found) if image is not None}
         return out

@@ -41,26 +41,26 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.observe.profiles import EdgeFits, edge_set, fit_edges
 
-WINDOW = 32
+PHOTOGRAPHS_A_WINDOW = 32
 """Photographs that are looked at together: their profiles take some 80 MB."""
 WINDOW_BYTES = 96 * 2**20
 """Bytes that these take as grey levels at most; one may take more."""
-REACH = 10.0
+LEG_SEARCH_REACH = 10.0
 """Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
 times over, and what the station's pose leaves."""
-AGAIN = 4.0
+REPEATED_SEARCH_REACH = 4.0
 """The same once the other legs have told where it is: beyond lies a highlight, or a neighbour."""
-TILTS = np.arange(-4.0, 4.5, 1.0)
+SEARCH_TILTS = np.arange(-4.0, 4.5, 1.0)
 """Shifts of a leg's ends against its middle that are tried, px."""
-SMOOTH = 1.0
+LEG_SEARCH_BLUR = 1.0
 """Pixels of blur (standard deviation) against the noise of dark photographs."""
-PEAK = 2
+PEAK_HALF_WIDTH = 2
 """Pixels to each side within which the steepest place counts most."""
 GRADIENT_HALF = 1.5
 """Levels per pixel at which an edge counts half of a strong one: strong highlights must not outvote
 three weak edges. Levels are roots of grey levels (255 stays), whose noise is even: 0.3 a pixel once
 smoothed, so this is five times that."""
-RIVAL = 0.95
+RIVAL_SCORE_SHARE = 0.95
 """A second place with this share of the best one's score makes a leg ambiguous."""
 RIVAL_AWAY = 4.0
 """Pixels from the best place at which another one is a rival, not its flank."""
@@ -71,22 +71,22 @@ SEARCH_SIGMA = 1.0
 SEARCH_SAMPLES = 12
 LEG_TILTS = np.arange(-1.0, 1.25, 0.25)
 """Shifts of a leg's ends against its middle that are tried once it is known to a pixel, px."""
-SEGMENTS = 8
+EDGE_SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
-PLACES = 5 * SEGMENTS
+PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
 """Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-BETWEEN = 5
+PROFILES_A_POINT = 5
 """Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
-CLEARANCE = 5.0
+OTHER_OUTLINE_CLEARANCE = 5.0
 """Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
 _HIDDEN = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
-Done = Callable[[int], None]
+PhotographsLookedAt = Callable[[int], None]
 """Called with how many photographs more were looked at."""
 
 
@@ -117,14 +117,14 @@ def search_legs(
     tubes: TubeList,
     points: EdgePoints,
     clear: Booleans,
-    reach: float = REACH,
+    reach: float = LEG_SEARCH_REACH,
 ) -> LegPlaces:
     """Shift and tilt of every leg in the photographs of one station.
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
     steps = np.arange(-reach, reach + 0.5)
-    offsets = np.arange(steps[0] - TILTS[-1], steps[-1] + TILTS[-1] + 0.5)
+    offsets = np.arange(steps[0] - SEARCH_TILTS[-1], steps[-1] + SEARCH_TILTS[-1] + 0.5)
     strength = np.zeros((*clear.shape, len(offsets)), np.float32)
     for k, (image, seen) in enumerate(zip(images, clear, strict=True)):
         if not seen.any():  # no leg is in the picture
@@ -132,7 +132,7 @@ def search_legs(
         at = points.pixel[k][seen], points.outward[k][seen]
         strength[k][seen] = gradient_strength(image, *at, offsets)
     place = place_on_leg(points.along, clear, tubes)
-    scores = _by_tilt(strength, place, TILTS, len(steps), tubes)
+    scores = _by_tilt(strength, place, SEARCH_TILTS, len(steps), tubes)
     legs = range(tubes.leg.max() + 1)
     total = np.stack([clear[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
     points_of = np.array([max(int((tubes.leg == leg).sum()) * clear.shape[2], 1) for leg in legs])
@@ -173,9 +173,11 @@ def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Ar
     import cv2
 
     wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
-    level = np.sqrt(255.0 * levels_at(image, *_outward_of(pixel, outward, wide), blur=SMOOTH))
+    level = np.sqrt(
+        255.0 * levels_at(image, *_outward_of(pixel, outward, wide), blur=LEG_SEARCH_BLUR)
+    )
     slope = np.abs(level[:, 2:] - level[:, :-2]) / 2
-    about = np.ones((1, 2 * PEAK + 1), np.uint8)
+    about = np.ones((1, 2 * PEAK_HALF_WIDTH + 1), np.uint8)
     sharp = slope / np.maximum(cv2.dilate(slope, about), 1e-6)
     return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2)
 
@@ -212,8 +214,8 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
     away = np.abs(steps - steps[step][..., None]) >= RIVAL_AWAY
     rival = np.where(away, scores.max(axis=2), 0.0).max(axis=-1)
     inside = np.abs(steps[step]) < steps[-1]
-    clear = (total >= FEWEST_POINTS) & (rival < RIVAL * best) & inside
-    return LegPlaces(steps[step], TILTS[tilt], best, share, clear)
+    clear = (total >= FEWEST_POINTS) & (rival < RIVAL_SCORE_SHARE * best) & inside
+    return LegPlaces(steps[step], SEARCH_TILTS[tilt], best, share, clear)
 
 
 @dataclass(frozen=True)
@@ -246,7 +248,7 @@ class Photographs:
     @property
     def window(self) -> int:
         """How many photographs are looked at together."""
-        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), WINDOW)
+        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), PHOTOGRAPHS_A_WINDOW)
 
     def decoded(self) -> Photographs:
         """The same with every photograph decoded; for no more than a window of them."""
@@ -282,8 +284,8 @@ def search(
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
-    reach: float = REACH,
-    done: Done | None = None,
+    reach: float = LEG_SEARCH_REACH,
+    done: PhotographsLookedAt | None = None,
 ) -> StationEdges:
     """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel.
 
@@ -326,7 +328,7 @@ def measure(
     poses: Array,
     blur: float | None = None,
     refine_camera: bool = False,
-    done: Done | None = None,
+    done: PhotographsLookedAt | None = None,
 ) -> StationEdges:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
@@ -372,7 +374,7 @@ def joined_looks(looks: Sequence[StationEdges], blur: float, moved: float) -> St
 @dataclass(frozen=True)
 class _Seen:
     """A window's predicted places along edges, and the profiles where they are clear, ``full``
-    (K, E, SEGMENTS).
+    (K, E, EDGE_SEGMENTS).
     """
 
     tubes: TubeList
@@ -382,8 +384,10 @@ class _Seen:
 
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
-    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, PLACES)
-    middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
+    tubes, points, clear = predicted(
+        photographs, machine, T_camera_base, poses, PREDICTED_EDGE_POINTS
+    )
+    middles = np.arange(EDGE_SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
@@ -398,7 +402,7 @@ def _measured(
     tubes, places, full = seen.tubes, seen.places, seen.full
     across = profiles.without_highlights(seen.across)
     curves = profiles.residual_curves(across, blur)
-    about = _leg_lines(profiles.likelihood(across, curves), places.along, full, tubes)
+    about = _leg_lines(profiles.shift_log_likelihoods(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], found[full] = at.position, at.sigma, at.found
@@ -422,7 +426,7 @@ def predicted(
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
     points = edge_points(machine, photographs.camera, legs, tubes, samples)
-    clear = unobstructed(machine, photographs.camera, legs, tubes, points, CLEARANCE)
+    clear = unobstructed(machine, photographs.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
     return tubes, points, clear
 
 
@@ -431,13 +435,13 @@ def _segment_profiles(
 ) -> tuple[Booleans, profiles.Profiles]:
     """Mean profiles over each segment's clear samples.
 
-    Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
+    Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
     """
-    count = BETWEEN * _by_segment(clear).sum(axis=-1)
-    full = count >= FEWEST_SHARE * (BETWEEN * PLACES / SEGMENTS)
-    seen = np.repeat(_by_segment(clear)[full], BETWEEN, axis=-1)
+    count = PROFILES_A_POINT * _by_segment(clear).sum(axis=-1)
+    full = count >= FEWEST_SHARE * (PROFILES_A_POINT * PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
+    seen = np.repeat(_by_segment(clear)[full], PROFILES_A_POINT, axis=-1)
     seen = seen[:, None].astype(np.float32)
-    outward = np.repeat(_by_segment(points.outward)[full], BETWEEN, axis=-2)
+    outward = np.repeat(_by_segment(points.outward)[full], PROFILES_A_POINT, axis=-2)
     pixel = photographs.camera.project(_between(points, full))
     offsets = profiles.profile_offsets()
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
@@ -450,15 +454,17 @@ def _segment_profiles(
         rows = (v.reshape(-1, seen.shape[-1] * len(offsets)) for v in across)
         grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
-        np.matmul(seen[mine], grey >= profiles.SATURATED, out=clipped[mine])
+        np.matmul(seen[mine], grey >= profiles.SATURATED_GREY_LEVEL, out=clipped[mine])
     cut = profiles.cut_of(clipped[:, 0] > 0, half_width[full])
     mean = total[:, 0] / count[full][:, None]
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 
 def _by_segment(values: Array | Booleans) -> Any:
-    """Values (K, E, PLACES, ...) of edges' points, (K, E, SEGMENTS, points of one, ...)."""
-    return values.reshape(*values.shape[:2], SEGMENTS, -1, *values.shape[3:])
+    """Values (K, E, PREDICTED_EDGE_POINTS, ...) of edges' points, (K, E, EDGE_SEGMENTS, points of
+    one, ...).
+    """
+    return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
 def _between(points: EdgePoints, full: Booleans) -> Array:
@@ -469,8 +475,8 @@ def _between(points: EdgePoints, full: Booleans) -> Array:
     """
     k, e, segment = np.nonzero(full)
     start, step = points.point[..., 0, :], points.point[..., 1, :] - points.point[..., 0, :]
-    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
-    mine = fraction.reshape(SEGMENTS, -1)[segment]
+    fraction = (np.arange(PREDICTED_EDGE_POINTS * PROFILES_A_POINT) + 0.5) / PROFILES_A_POINT - 0.5
+    mine = fraction.reshape(EDGE_SEGMENTS, -1)[segment]
     return of_components(*(start[k, e, c, None] + mine * step[k, e, c, None] for c in range(3)))
 
 
@@ -483,7 +489,7 @@ def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList)
     every = np.zeros((*full.shape, likelihood.shape[-1]), np.float32)
     every[full] = likelihood
     place = place_on_leg(along, full, tubes)
-    steps = profiles.SHIFTS
+    steps = profiles.EDGE_SHIFTS
     tilts = LEG_TILTS / (steps[1] - steps[0])
     score = _by_tilt(every, place, tilts, len(steps), tubes)
     best = score.reshape(*score.shape[:2], -1).argmax(axis=-1)

@@ -12,9 +12,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 
-AROUND = 2
+INTERPOLATION_MARGIN = 2
 """Pixels about a place whose levels an interpolation takes."""
-FURTHEST = 4.0
+BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
 
@@ -30,9 +30,11 @@ def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: floa
     if not x.size:
         return np.zeros(x.shape, np.float32)
     x, y = (_numbers(v.astype(np.float32, copy=False)) for v in (x, y))
-    half = round(FURTHEST * blur)
+    half = round(BLUR_KERNEL_END * blur)
     height, width = image.shape
-    columns, rows = (_span(v, AROUND + half, size) for v, size in ((x, width), (y, height)))
+    columns, rows = (
+        _span(v, INTERPOLATION_MARGIN + half, size) for v, size in ((x, width), (y, height))
+    )
     part = image[rows, columns]
     if blur:
         kernel = cv2.getGaussianKernel(2 * half + 1, blur, cv2.CV_32F)

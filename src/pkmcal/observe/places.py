@@ -22,32 +22,38 @@ from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import dot, pose, rotation
 from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
-from pkmcal.observe.tables import DIRECTIONS, DistanceTables, alike, direction_of, distances
+from pkmcal.observe.tables import (
+    EDGE_DIRECTIONS,
+    DistanceTables,
+    alike,
+    direction_of,
+    write_distances,
+)
 
-PLACES = 642
+CAMERA_DIRECTIONS = 642
 """Directions from the machine to the camera: 8 degrees apart."""
-TURNS = 24
+SIGHT_LINE_TURNS = 24
 """Turns about the line of sight: 15 degrees apart."""
-NEAREST, FURTHEST = 0.05, 30.0
+NEAREST_DISTANCE_TRIED, FURTHEST_DISTANCE_TRIED = 0.05, 30.0
 """Distances from the machine's middle that are tried, in its own sizes."""
-DISTANCES = 28
-POINTS = 160
+DISTANCES_TRIED = 28
+SPREAD_POINTS = 160
 """Points of the legs, in all configurations, whose spread is looked at."""
-WIDER = (0.9, 1.2, 1.6)
+WIDER_THAN_LEGS = (0.9, 1.2, 1.6)
 """How much wider what moves may look than the legs do: shadows and cables move too."""
-HALF = 40
+CHART_HALF_CELLS = 40
 """Cells of the chart from its middle to its border."""
-COVER = 3.0
+CHART_HALF_WIDTHS = 3.0
 """Widths of what moves from the chart's middle to its border."""
-REACH = 10
+CHART_DISTANCE_CUT = 10
 """Cells at which distances on the chart are cut off."""
-BORDER = REACH
+CHART_BORDER_CELLS = CHART_DISTANCE_CUT
 """Cells about the chart in which nothing is near."""
-SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
+SIGHT_LINE_SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
 """Cells by which the line of sight may be off."""
-ALONG = np.array([0.05, 0.35, 0.65, 0.95])
+CHORD_ENDS_ALONG_LEG = np.array([0.05, 0.35, 0.65, 0.95])
 """Places along a leg's visible part between which its chords lie."""
-LONGEST = COVER * HALF
+LONGEST_CHORD = CHART_HALF_WIDTHS * CHART_HALF_CELLS
 """Cells that a chord counts for at most: from near by, a leg fills the sphere."""
 
 
@@ -81,10 +87,10 @@ def anywhere(
     best = best[np.argsort(scores.ravel()[best])]
     place, turn, shift = np.unravel_index(best, scores.shape)
     # the camera looks `off` away from the middle of what it sees, and is turned about that line
-    off = SHIFTS[shift] * (COVER / HALF * float(seen.width))
+    off = SIGHT_LINE_SHIFTS[shift] * (CHART_HALF_WIDTHS / CHART_HALF_CELLS * float(seen.width))
     zero = np.zeros(len(best))
     tilt = rotation(np.stack([-off[:, 1], off[:, 0], zero], axis=-1))
-    roll = rotation(np.stack([zero, zero, 2 * np.pi / TURNS * turn], axis=-1))
+    roll = rotation(np.stack([zero, zero, 2 * np.pi / SIGHT_LINE_TURNS * turn], axis=-1))
     rot = frame.T @ tilt @ roll @ frame_of(spread.middle[place])
     return pose(rot, -(rot @ places[place][..., None])[..., 0])
 
@@ -136,10 +142,10 @@ def _places(
     point = point.reshape(-1, 3)
     centre = weight @ point / weight.sum()
     size = np.sqrt(weight @ dot(point - centre, point - centre) / weight.sum())
-    few = evenly(len(point), POINTS)
+    few = evenly(len(point), SPREAD_POINTS)
     point, weight = point[few], weight[few]
-    direction = sphere(PLACES)
-    distance = size * np.geomspace(NEAREST, FURTHEST, DISTANCES)
+    direction = sphere(CAMERA_DIRECTIONS)
+    distance = size * np.geomspace(NEAREST_DISTANCE_TRIED, FURTHEST_DISTANCE_TRIED, DISTANCES_TRIED)
     place = centre + direction[:, None] * distance[:, None]
     # one component after the other, and no ray by itself: there are a million of them
     square = sum((point[:, k] - place[..., k, None]) ** 2 for k in range(3))
@@ -148,9 +154,13 @@ def _places(
     total = share @ point - share.sum(axis=-1)[..., None] * place
     spread = _spread(total, near.sum(axis=-1))
     nearest = [
-        np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1) for wider in WIDER
+        np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1)
+        for wider in WIDER_THAN_LEGS
     ]
-    at = np.concatenate([np.arange(PLACES)] * len(WIDER)), np.concatenate(nearest)
+    at = (
+        np.concatenate([np.arange(CAMERA_DIRECTIONS)] * len(WIDER_THAN_LEGS)),
+        np.concatenate(nearest),
+    )
     return place[at], Breadth(spread.middle[at], spread.width[at])
 
 
@@ -174,15 +184,20 @@ def _on_chart(rays: Array, width: float) -> Array:
     """Cells (..., 2) of unit rays (..., 3) in the chart's frame, from its middle."""
     away = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
     angle = np.arctan2(away, rays[..., 2])
-    return rays[..., :2] * (angle / np.maximum(away, 1e-12) * (HALF / COVER / width))[..., None]
+    return (
+        rays[..., :2]
+        * (angle / np.maximum(away, 1e-12) * (CHART_HALF_CELLS / CHART_HALF_WIDTHS / width))[
+            ..., None
+        ]
+    )
 
 
 def _chart_tables(
     camera: Camera, tables: DistanceTables, photographs: Integers, frame: Array, width: float
 ) -> Integers:
-    """Distance tables (K, DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
-    n = 2 * HALF + 1
-    out = np.empty((len(photographs), DIRECTIONS, n, n), dtype=np.float32)
+    """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
+    n = 2 * CHART_HALF_CELLS + 1
+    out = np.empty((len(photographs), EDGE_DIRECTIONS, n, n), dtype=np.float32)
     for row, k in enumerate(photographs):
         edges = tables.edges[k]
         along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
@@ -191,12 +206,12 @@ def _chart_tables(
         cell = _on_chart(rays[np.isfinite(rays).all(axis=(1, 2))] @ frame.T, width)
         chord = cell[:, 1] - cell[:, 0]
         number = direction_of(np.stack([-chord[:, 1], chord[:, 0]], axis=-1))
-        middle = np.rint(cell.mean(axis=1)).astype(int) + HALF
+        middle = np.rint(cell.mean(axis=1)).astype(int) + CHART_HALF_CELLS
         inside = ((middle >= 0) & (middle < n)).all(axis=1)
         place, number = middle[inside] @ (1, n), number[inside]
         for direction, table in enumerate(out[row]):
-            distances(place[alike(direction, DIRECTIONS).take(number)], table)
-    return np.rint(np.minimum(out, REACH)).astype(np.uint8)
+            write_distances(place[alike(direction, EDGE_DIRECTIONS).take(number)], table)
+    return np.rint(np.minimum(out, CHART_DISTANCE_CUT)).astype(np.uint8)
 
 
 def _scores(
@@ -208,48 +223,64 @@ def _scores(
     photographs: Integers,
     width: float,
 ) -> Array:
-    """Mean distance (P, TURNS, SHIFTS), in cells, of all legs' chords from edges so directed."""
+    """Mean distance (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of all legs' chords from
+    edges so directed.
+    """
     leg = np.unique(tubes.leg)
     a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
     low = np.array([tubes.start[tubes.leg == j].min() for j in leg])
     high = np.array([tubes.stop[tubes.leg == j].max() for j in leg])
     high = np.minimum(high, np.sqrt(dot(b - a, b - a)))
-    along = low[:, None] + (high - low)[..., None] * ALONG
+    along = low[:, None] + (high - low)[..., None] * CHORD_ENDS_ALONG_LEG
     point = (a[:, :, None] + along[..., None] * u[:, :, None]).reshape(-1, 3)
     ray = point - places[:, None]
     ray /= np.sqrt(dot(ray, ray))[..., None]
     cell = _on_chart(ray @ frame_of(spread.middle).mT, width)
-    cell = cell.reshape(len(places), -1, len(ALONG), 2)
+    cell = cell.reshape(len(places), -1, len(CHORD_ENDS_ALONG_LEG), 2)
     chord = np.diff(cell, axis=-2).reshape(len(places), -1, 2)
     middle = ((cell[..., 1:, :] + cell[..., :-1, :]) / 2).reshape(len(places), -1, 2)
     # one component after the other: NumPy is slow along an axis of two
     x, y = (np.ascontiguousarray(middle[..., k]) for k in (0, 1))
-    direction = (np.arctan2(chord[..., 1], chord[..., 0]) / np.pi + 0.5) * DIRECTIONS
-    weight = np.minimum(np.sqrt(dot(chord, chord)), LONGEST)
+    direction = (np.arctan2(chord[..., 1], chord[..., 0]) / np.pi + 0.5) * EDGE_DIRECTIONS
+    weight = np.minimum(np.sqrt(dot(chord, chord)), LONGEST_CHORD)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)[:, None]
-    table = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart)) * DIRECTIONS
+    table = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart)) * EDGE_DIRECTIONS
     # beyond the chart nothing is near; what lies further still is taken to its border
-    shifted, n = _shifted(chart), chart.shape[-1] + 2 * BORDER
-    limit = n // 2 - np.abs(SHIFTS).max() - 1
-    out = np.empty((len(places), TURNS, len(SHIFTS)), dtype=np.float32)
-    for turn in range(TURNS):
-        cos, sin = np.cos(2 * np.pi / TURNS * turn), np.sin(2 * np.pi / TURNS * turn)
+    shifted, n = _shifted(chart), chart.shape[-1] + 2 * CHART_BORDER_CELLS
+    limit = n // 2 - np.abs(SIGHT_LINE_SHIFTS).max() - 1
+    out = np.empty((len(places), SIGHT_LINE_TURNS, len(SIGHT_LINE_SHIFTS)), dtype=np.float32)
+    for turn in range(SIGHT_LINE_TURNS):
+        cos, sin = (
+            np.cos(2 * np.pi / SIGHT_LINE_TURNS * turn),
+            np.sin(2 * np.pi / SIGHT_LINE_TURNS * turn),
+        )
         column, row = (
             np.rint(np.clip(v, -limit, limit)).astype(np.intp) + n // 2
             for v in (cos * x - sin * y, sin * x + cos * y)
         )
-        number = np.floor(direction + 2 * DIRECTIONS / TURNS * turn).astype(np.intp) % DIRECTIONS
+        number = (
+            np.floor(direction + 2 * EDGE_DIRECTIONS / SIGHT_LINE_TURNS * turn).astype(np.intp)
+            % EDGE_DIRECTIONS
+        )
         cells = ((table + number) * n + row) * n + column
         out[:, turn] = (weight @ shifted.take(cells, axis=0))[:, 0]
     return out
 
 
 def _shifted(chart: Integers) -> Array:
-    """Distances (cells, SHIFTS) by every line of sight, at each cell of charts (K, DIRECTIONS,
-    n, n) with a border: what is looked up together lies together.
+    """Distances (cells, SIGHT_LINE_SHIFTS) by every line of sight, at each cell of charts (K,
+    EDGE_DIRECTIONS, n, n) with a border: what is looked up together lies together.
     """
-    around = ((0, 0), (0, 0), (BORDER, BORDER), (BORDER, BORDER))
-    flat = np.pad(chart, around, constant_values=REACH).astype(np.float32).ravel()
-    step = SHIFTS[:, 1] * (chart.shape[-1] + 2 * BORDER) + SHIFTS[:, 0]
+    around = (
+        (0, 0),
+        (0, 0),
+        (CHART_BORDER_CELLS, CHART_BORDER_CELLS),
+        (CHART_BORDER_CELLS, CHART_BORDER_CELLS),
+    )
+    flat = np.pad(chart, around, constant_values=CHART_DISTANCE_CUT).astype(np.float32).ravel()
+    step = (
+        SIGHT_LINE_SHIFTS[:, 1] * (chart.shape[-1] + 2 * CHART_BORDER_CELLS)
+        + SIGHT_LINE_SHIFTS[:, 0]
+    )
     # nothing is looked up so near the corners that a step leaves the tables
     return flat.take(np.arange(flat.size)[:, None] + step, mode="clip")

@@ -23,29 +23,29 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 
-INSIDE, OUTSIDE = 3.0, 3.0
+PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
 """Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
 other features and neighbours."""
-LIMB = 0.45
+MODELLED_LIMB_SHARE = 0.45
 """Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
-metal begin further in. On slim legs this is less than INSIDE."""
+metal begin further in. On slim legs this is less than PROFILE_REACH_INSIDE."""
 LEAST_INSIDE = 1.25
 """Pixels inside that are used in any case: less would not hold the limb's own brightness."""
 CLEAR_OUTSIDE = 1.0
 """Pixels outward of the predicted edge from which samples are taken for the background's level."""
-TURNED = 3.0
+HIGHLIGHT_DEVIATIONS = 3.0
 """Standard deviations by which the brightness inside has to come back to be a highlight's."""
-STEP = 0.5
-SHIFTS = np.arange(-1.5, 1.55, 0.1)
+PROFILE_STEP = 0.5
+EDGE_SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
-PITCH = 0.05
+PROFILE_MODEL_PITCH = 0.05
 """Pixels from one place to the next at which the model is worked out: in steps and shifts it goes
 without remainder, so that all samples of all trial positions are such places."""
-BRIGHTNESSES = 5
+BRIGHTNESS_UNKNOWNS = 5
 """Linear unknowns of the model: three inside the limb, two outside."""
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 """Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
-BLURS = np.arange(0.45, 1.5, 0.1)
+BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
 """Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
 USUAL_BLUR = 0.7
 """Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
@@ -60,28 +60,28 @@ slim ones, others tell it with them."""
 GREY_NOISE = 0.6
 """Least standard deviation (grey levels) believed of a profile's samples: 8-bit rounding and
 what the model leaves out; keeps a chance perfect fit from counting for everything."""
-MODEL_ERROR = 0.01
+PROFILE_MODEL_ERROR = 0.01
 """Share of the contrast by which real profiles differ from the model; weighs the two beliefs."""
 SHADING_SLOPE, SHADING_ROOT = 0.3, 1.0
 """Believed spread (in contrasts) of the shading's linear part per pixel, and of its root part at
 a pixel's depth. Whole profiles hardly feel it; where the leg is overexposed, and only its limb's
 flank is left, it says how much shading may hide there, so the position's sigma grows honestly."""
-SATURATED = 250
+SATURATED_GREY_LEVEL = 250
 """Grey level from which a sample is taken as clipped."""
 MOST_CUT = -0.25
 """Place (px) beyond which a profile must be free of saturation: its edge itself."""
-WINDOW = 0.5
+OWN_EDGE_WINDOW = 0.5
 """Pixels about the place of its leg as a whole within which a profile's own edge is looked for:
 further off lie highlights, which all places of an edge may show alike."""
-FAINT = 0.5
+FAINT_EDGE_SIGMA = 0.5
 """Standard deviation (px) of a position above which a profile shows no edge: the window's half."""
-FLOOR = 0.02
+EDGE_SIGMA_FLOOR = 0.02
 """Pixels below which no position is believed, however crisp the profile."""
-HALVES = 2.0
+MEASUREMENTS_AN_EDGE = 2.0
 """Independent measurements that an edge counts as, whatever its length. Shading and paint move
 all positions along an edge together, so they do not average out: an edge is one line measured
 once at each of two halves, not three hundred points."""
-FEWEST = 3
+FEWEST_PLACES_FOR_TILT = 3
 """Places along an edge without which its tilt is a guess."""
 
 
@@ -98,21 +98,21 @@ class ProfileEdges:
 
 def profile_offsets() -> Array:
     """Places along a profile, px outward from the predicted edge."""
-    return np.arange(-INSIDE, OUTSIDE + STEP / 2, STEP)
+    return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
 @lru_cache(maxsize=512)
 def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
     """Places x (px outward of the edge), (n,), and the five brightnesses there, blurred, (n, 5)."""
-    place = np.arange(-INSIDE - 8, OUTSIDE + 8, PITCH)
+    place = np.arange(-PROFILE_REACH_INSIDE - 8, PROFILE_REACH_OUTSIDE + 8, PROFILE_MODEL_PITCH)
     inside = (place < 0).astype(float)
-    inside[np.abs(place) < PITCH / 2] = 0.5
+    inside[np.abs(place) < PROFILE_MODEL_PITCH / 2] = 0.5
     depth = np.clip(-place, 0.0, 2 * half_width)
     root = np.sqrt(depth * (2 * half_width - depth))
     columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
     # an odd count: np.convolve centres an even one half a pitch aside, and the edge with it
-    half = int(np.ceil(5 * blur / PITCH))
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * PITCH / blur) ** 2)
+    half = int(np.ceil(5 * blur / PROFILE_MODEL_PITCH))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * PROFILE_MODEL_PITCH / blur) ** 2)
     smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
     return place, np.stack(smooth, axis=1)
 
@@ -126,12 +126,12 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     samples' rows are returned, which is all that a projection of such data needs.
     """
     place, model = _blurred_model(blur, half_width)
-    at = profile_offsets() - SHIFTS[:, None]
-    values = model[np.rint((at - place[0]) / PITCH).astype(int)]
+    at = profile_offsets() - EDGE_SHIFTS[:, None]
+    values = model[np.rint((at - place[0]) / PROFILE_MODEL_PITCH).astype(int)]
     values[:, :cut] = 0.0
-    beliefs = np.zeros((len(SHIFTS), 2, BRIGHTNESSES))
-    beliefs[:, 0, 1] = MODEL_ERROR / SHADING_SLOPE
-    beliefs[:, 1, 2] = MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
+    beliefs = np.zeros((len(EDGE_SHIFTS), 2, BRIGHTNESS_UNKNOWNS))
+    beliefs[:, 0, 1] = PROFILE_MODEL_ERROR / SHADING_SLOPE
+    beliefs[:, 1, 2] = PROFILE_MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
     bases = np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
     return np.ascontiguousarray(bases.T)
 
@@ -167,7 +167,7 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
     """
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
-    depth = np.maximum(LIMB * half_width, LEAST_INSIDE)
+    depth = np.maximum(MODELLED_LIMB_SHARE * half_width, LEAST_INSIDE)
     beyond = np.sum(profile_offsets() < -depth[:, None] - 1e-9, axis=-1)
     return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
@@ -178,16 +178,17 @@ def without_highlights(profiles: Profiles) -> Profiles:
     A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
     its far side in the profile its near border is the likelier edge. Its middle is where the
     departure from the background is largest before, further in, it is less by more than diffuse
-    light allows, whose cosine changes by LIMB down to that depth, and by more than noise.
+    light allows, whose cosine changes by MODELLED_LIMB_SHARE down to that depth, and by more than
+    noise.
     """
     offsets = profile_offsets()
     grey, contrast = profiles.grey, profiles.contrast()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
-    inside = np.flatnonzero(offsets <= -STEP)[::-1]  # from the limb inwards
+    inside = np.flatnonzero(offsets <= -PROFILE_STEP)[::-1]  # from the limb inwards
     away = np.abs(grey[:, inside] - background)
     most = np.maximum.accumulate(away, axis=1)
-    noise = (np.hypot(_noise(profiles), MODEL_ERROR) * contrast)[:, None]
-    less = most - away > np.maximum(TURNED * noise, LIMB * most)
+    noise = (np.hypot(_noise(profiles), PROFILE_MODEL_ERROR) * contrast)[:, None]
+    less = most - away > np.maximum(HIGHLIGHT_DEVIATIONS * noise, MODELLED_LIMB_SHARE * most)
     # the last place that was its own largest before it was less
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
     largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
@@ -201,7 +202,7 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
     scaled = profiles.grey - profiles.grey[:, -1:]
     scaled = scaled / profiles.contrast()[:, None]
     scaled[np.arange(scaled.shape[1]) < profiles.cut[:, None]] = 0.0
-    out = np.empty((len(scaled), len(SHIFTS)), dtype=scaled.dtype)
+    out = np.empty((len(scaled), len(EDGE_SHIFTS)), dtype=scaled.dtype)
     width = np.abs(np.log(profiles.half_width)[:, None] - np.log(HALF_WIDTHS)).argmin(axis=1)
     kind = width * scaled.shape[1] + np.minimum(profiles.cut, scaled.shape[1] - 1)
     for number in np.unique(kind):  # a few dozen combinations of width and cut
@@ -215,28 +216,32 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
     return np.maximum(out, 0.0)
 
 
-def likelihood(profiles: Profiles, curves: Array) -> Array:
+def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
     """Log likelihood (N, shifts) of every trial position, the noise's size unknown, less its
     largest value; 0 of profiles that are clipped up to their edge.
 
     curves : of :func:`residual_curves`.
     """
     samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
-    floor = samples * (_noise(profiles) ** 2 + MODEL_ERROR**2)
-    freedom = np.maximum(samples * STEP - BRIGHTNESSES, 1.0)
+    floor = samples * (_noise(profiles) ** 2 + PROFILE_MODEL_ERROR**2)
+    freedom = np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
     out = -freedom[:, None] / 2 * np.log(curves + floor[:, None])
     out -= out.max(axis=-1, keepdims=True)
     return np.where(_shows_its_edge(profiles)[:, None], out, 0.0)
 
 
 def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
-    """Edge positions of profiles, each within WINDOW of where its leg is, ``about`` (N,) px.
+    """Edge positions of profiles, each within OWN_EDGE_WINDOW of where its leg is, ``about`` (N,)
+    px.
 
     curves : of :func:`residual_curves`.
     """
-    step, half = SHIFTS[1] - SHIFTS[0], round(WINDOW / (SHIFTS[1] - SHIFTS[0]))
-    middle = np.rint((about - SHIFTS[0]) / step).astype(int)
-    middle = np.clip(middle, half, len(SHIFTS) - 1 - half)
+    step, half = (
+        EDGE_SHIFTS[1] - EDGE_SHIFTS[0],
+        round(OWN_EDGE_WINDOW / (EDGE_SHIFTS[1] - EDGE_SHIFTS[0])),
+    )
+    middle = np.rint((about - EDGE_SHIFTS[0]) / step).astype(int)
+    middle = np.clip(middle, half, len(EDGE_SHIFTS) - 1 - half)
     near = middle[:, None] + np.arange(-half, half + 1)
     lowest = np.argmin(np.take_along_axis(curves, near, axis=-1), axis=-1)
     best = middle - half + np.clip(lowest, 1, 2 * half - 1)
@@ -244,14 +249,16 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
         np.take_along_axis(curves, (best + d)[..., None], -1)[..., 0] for d in (-1, 0, 1)
     )
     bend = np.maximum(left - 2 * here + right, 1e-12)
-    position = SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
+    position = EDGE_SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
     # neighbouring samples of a profile at half a pixel share their noise: two count as one
-    freedom = (profiles.grey.shape[-1] - profiles.cut) * STEP - BRIGHTNESSES
-    variance = here * STEP / np.maximum(freedom, 1.0) + _noise(profiles) ** 2
-    # cost(x) = residual / (variance / STEP): its second derivative is 2 / sigma^2
-    sigma = np.sqrt(2 * (variance / STEP) / (bend / step**2))
+    freedom = (profiles.grey.shape[-1] - profiles.cut) * PROFILE_STEP - BRIGHTNESS_UNKNOWNS
+    variance = here * PROFILE_STEP / np.maximum(freedom, 1.0) + _noise(profiles) ** 2
+    # cost(x) = residual / (variance / PROFILE_STEP): its second derivative is 2 / sigma^2
+    sigma = np.sqrt(2 * (variance / PROFILE_STEP) / (bend / step**2))
     inside = (lowest > 0) & (lowest < 2 * half)
-    return ProfileEdges(position, sigma, inside & _shows_its_edge(profiles) & (sigma < FAINT))
+    return ProfileEdges(
+        position, sigma, inside & _shows_its_edge(profiles) & (sigma < FAINT_EDGE_SIGMA)
+    )
 
 
 def _noise(profiles: Profiles) -> Array:
@@ -276,21 +283,24 @@ def estimate_blur(profiles: Profiles) -> float:
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
     floor = (GREY_NOISE / profiles.contrast()) ** 2
-    costs = np.full((len(profiles.cut), len(BLURS)), np.inf)  # until they are tried
-    k = int(np.argmin(np.abs(BLURS - USUAL_BLUR)))
+    costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # until they are tried
+    k = int(np.argmin(np.abs(BLURS_TRIED - USUAL_BLUR)))
     while True:
-        for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS))):
+        for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS_TRIED))):
             if np.isinf(costs[0, near]):
-                costs[:, near] = residual_curves(profiles, BLURS[near]).min(axis=-1)
+                costs[:, near] = residual_curves(profiles, BLURS_TRIED[near]).min(axis=-1)
         total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
         best = int(np.argmin(total))
         if best == k:
             break
         k = best
-    k = int(np.clip(k, 1, len(BLURS) - 2))
+    k = int(np.clip(k, 1, len(BLURS_TRIED) - 2))
     left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
-    return float(BLURS[k] + (BLURS[1] - BLURS[0]) * np.clip((left - right) / (2 * bend), -1, 1))
+    return float(
+        BLURS_TRIED[k]
+        + (BLURS_TRIED[1] - BLURS_TRIED[0]) * np.clip((left - right) / (2 * bend), -1, 1)
+    )
 
 
 @dataclass(frozen=True)
@@ -322,7 +332,7 @@ def fit_edges(
     basis = tangent_basis(points.normal, middle)
     rows = np.where(found[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
     value = np.where(found, position, 0.0)
-    base = np.where(found, 1 / (sigma**2 + FLOOR**2), 0.0)
+    base = np.where(found, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
     turn, normal = _weighted(rows, value, base)
     off2 = _squared_misfit(rows, value, turn, base)
     weight = base
@@ -333,10 +343,10 @@ def fit_edges(
     used = found & (off2 < 9.0)
     count = used.sum(axis=-1)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
-    factor = np.maximum(scatter, 1.0) * np.maximum(count / HALVES, 1.0)
+    factor = np.maximum(scatter, 1.0) * np.maximum(count / MEASUREMENTS_AN_EDGE, 1.0)
     covariance = np.linalg.inv(normal) * factor[..., None, None]
     operator = np.linalg.solve(normal, (rows * weight[..., None]).mT)
-    good = (count >= FEWEST) & (count >= 0.5 * found.sum(axis=-1))
+    good = (count >= FEWEST_PLACES_FOR_TILT) & (count >= 0.5 * found.sum(axis=-1))
     good &= np.isfinite(covariance).all(axis=(-1, -2))
     return EdgeFits(turn, basis, covariance, operator, used, good)
 

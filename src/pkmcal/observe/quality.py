@@ -11,21 +11,21 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import SEARCH_SAMPLES, Photographs, predicted, search_legs
 from pkmcal.observe.levels import levels_at
-from pkmcal.observe.profiles import SATURATED
+from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
-BLACK = 8
+BLACK_GREY_LEVEL = 8
 """Grey level up to which a sample is taken as black: shading and edges drown in the noise."""
-ACROSS = np.array([0.25, 0.6, 1.0])
+DEPTHS_INSIDE_EDGE = np.array([0.25, 0.6, 1.0])
 """Depths inside an edge, in half widths of the leg, at which its grey levels are looked at."""
-REACH, PITCH = 8.0, 0.5
+BLUR_PROFILE_REACH, BLUR_PROFILE_PITCH = 8.0, 0.5
 """Pixels to each side of an edge, and between samples, of the profiles that tell the blur."""
-FLANK = 6.0
+EDGE_FLANK_WIDTH = 6.0
 """Pixels from the steepest place within which a blurred edge has its whole contrast."""
-CONTRAST = 30.0
+LEAST_BLUR_CONTRAST = 30.0
 """Grey levels that an edge needs to tell the blur in spite of noise."""
-SHARPEST = 25.0
+LENS_WIDTH_PERCENTILE = 25.0
 """Percentile of the edges' widths that is the lens's: shading makes the others wider."""
-BESIDE = (1.5, 4.0)
+BESIDE_EDGE_RANGE = (1.5, 4.0)
 """Pixels to each side of an edge between which its two levels are looked at: beyond the blur, and
 before what lies next."""
 
@@ -87,18 +87,20 @@ def _quality(
             pixel.shape[:-1]
         )
 
-    inside = look(edge - ACROSS * half_width)
-    offsets = np.arange(-REACH, REACH + PITCH / 2, PITCH)
+    inside = look(edge - DEPTHS_INSIDE_EDGE * half_width)
+    offsets = np.arange(
+        -BLUR_PROFILE_REACH, BLUR_PROFILE_REACH + BLUR_PROFILE_PITCH / 2, BLUR_PROFILE_PITCH
+    )
     across = look(edge + offsets).astype(float)
     found = clear & places.clear[:, tubes.leg][..., None]
-    near = (np.abs(offsets) >= BESIDE[0]) & (np.abs(offsets) <= BESIDE[1])
+    near = (np.abs(offsets) >= BESIDE_EDGE_RANGE[0]) & (np.abs(offsets) <= BESIDE_EDGE_RANGE[1])
     hidden = np.full((len(clear), machine.n_legs), np.nan)
     for leg in np.unique(tubes.leg):
         hidden[:, leg] = 1 - clear[:, tubes.leg == leg].mean(axis=(1, 2))
     return Quality(
         legs=places.clear,
-        saturated=_share(inside >= SATURATED, clear),
-        black=_share(inside <= BLACK, clear),
+        saturated=_share(inside >= SATURATED_GREY_LEVEL, clear),
+        black=_share(inside <= BLACK_GREY_LEVEL, clear),
         blur=np.array([_blur(a[f]) for a, f in zip(across, found, strict=True)]),
         hidden=hidden,
         level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
@@ -111,7 +113,11 @@ def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
     """Quality of photographs in which the machine was not found: of the whole pictures."""
     count = len(images)
     shares = np.array(
-        [(np.mean(image >= SATURATED), np.mean(image <= BLACK)) for image in images], dtype=float
+        [
+            (np.mean(image >= SATURATED_GREY_LEVEL), np.mean(image <= BLACK_GREY_LEVEL))
+            for image in images
+        ],
+        dtype=float,
     ).reshape(count, 2)
     return Quality(
         legs=np.zeros((count, n_legs), dtype=bool),
@@ -137,8 +143,8 @@ def _share(is_so: Booleans, clear: Booleans) -> Array:
 
 def _blur(profiles: Array) -> float:
     """Blur s (px) of profiles (N, n): a step of contrast C has the slope C / (s sqrt(2 pi))."""
-    flank = round(FLANK / PITCH)
-    slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * PITCH)
+    flank = round(EDGE_FLANK_WIDTH / BLUR_PROFILE_PITCH)
+    slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * BLUR_PROFILE_PITCH)
     # Near the middle, so that most of the contrast around it lies in the profile.
     near = slope[:, flank // 2 : -(flank // 2)]
     steepest = near.argmax(axis=1) + flank // 2
@@ -146,8 +152,8 @@ def _blur(profiles: Array) -> float:
     around = np.clip(around, 0, profiles.shape[1] - 1)
     contrast = np.ptp(np.take_along_axis(profiles, around, axis=1), axis=1)
     steep = near.max(axis=1)
-    use = (contrast > CONTRAST) & (steep > 0)
+    use = (contrast > LEAST_BLUR_CONTRAST) & (steep > 0)
     if not use.any():
         return float("nan")
     width = contrast[use] / steep[use] / np.sqrt(2 * np.pi)
-    return float(np.percentile(width, SHARPEST))
+    return float(np.percentile(width, LENS_WIDTH_PERCENTILE))

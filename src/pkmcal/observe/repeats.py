@@ -21,14 +21,14 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe.legs import StationEdges
 
-PRIOR = 10.0
+SCATTER_PRIOR_FREEDOM = 10.0
 """Degrees of freedom that the wider group's scatter counts for in a narrower one's: an edge of few
 repeats has the scatter of its leg's, a leg of few configurations its station's."""
-FAR = 5.0
+FAR_REPEAT_DEVIATIONS = 5.0
 """Standard deviations of a repeat from the others beyond which it is not one of them."""
-HARMLESS = 1.0
+HARMLESS_REPEAT_DEVIATIONS = 1.0
 """Stated standard deviations within which a repeat stays, however well the others agree."""
-MAJORITY = 0.5
+MAJORITY_OF_REPEATS = 0.5
 """Share of a configuration's repeats of which more must show an edge: those that show now and then
 are faint, and lie a pixel off as easily as not."""
 _RARE = "seen in only {} of {} repeats"
@@ -142,7 +142,7 @@ def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
     return parts @ parts.mT
 
 
-def deviations(edges: EdgeSet, groups: Groups) -> Array:
+def turns_from_first(edges: EdgeSet, groups: Groups) -> Array:
     """Turn (N, 2), rad, of each edge from the first of its group, in that one's tangent basis."""
     reference = groups.first[groups.member]
     turn = edges.normal - edges.normal[reference]
@@ -166,7 +166,7 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
     that towards its station's, by their degrees of freedom.
     """
     unit = groups.mean(pixel_units(edges))
-    turn = deviations(edges, groups)
+    turn = turns_from_first(edges, groups)
     turn = (turn - groups.mean(turn)[groups.member]) / unit[groups.member]
     squares = groups.total(turn[:, :, None] * turn[:, None, :])
     freedom, first = groups.count - 1.0, edges.select(groups.first)
@@ -180,7 +180,7 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
         total, number = level.total(squares), level.total(np.asarray(freedom))
         weight = np.maximum(number + prior, 1.0)[level.member]
         scatter = (total[level.member] + prior * scatter) / weight[:, None, None]
-        prior = PRIOR
+        prior = SCATTER_PRIOR_FREEDOM
     return scatter * unit[:, :, None] * unit[:, None, :]
 
 
@@ -207,18 +207,22 @@ class OddOnes:
 
 def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
     """Repeats of one station that lie further from the median of theirs than noise explains."""
-    turn, unit = deviations(edges, groups), pixel_units(edges)
+    turn, unit = turns_from_first(edges, groups), pixel_units(edges)
     away = np.abs(turn - groups.median(turn)[groups.member])
     stated = np.sqrt(edges.covariance[:, [0, 1], [0, 1]])
-    far = (away > FAR * _typical_spread(turn / unit, groups) * unit) & (away > HARMLESS * stated)
+    far = (away > FAR_REPEAT_DEVIATIONS * _typical_spread(turn / unit, groups) * unit) & (
+        away > HARMLESS_REPEAT_DEVIATIONS * stated
+    )
     far = far.any(axis=1)
     count = groups.count[groups.member]
     photos = groups_of(edges.station, edges.configuration)
     most = np.zeros(len(photos.first), dtype=int)
     np.maximum.at(most, photos.member, count)
     most = most[photos.member]
-    rare = count <= MAJORITY * most
-    disputed = (groups.total((~far).astype(float))[groups.member] <= MAJORITY * count) & ~rare
+    rare = count <= MAJORITY_OF_REPEATS * most
+    disputed = (
+        groups.total((~far).astype(float))[groups.member] <= MAJORITY_OF_REPEATS * count
+    ) & ~rare
     # a lone photograph is its own majority
     rare &= most > 1
     return OddOnes((away / stated).max(axis=1), far & ~disputed & ~rare, disputed, rare, most)

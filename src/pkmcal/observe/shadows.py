@@ -17,11 +17,11 @@ from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 from pkmcal.observe.tables import DistanceTables
 
-ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 """Places along the middle of a tube's visible part that are looked at."""
-MOSTLY = 0.5
+MOSTLY_CHANGED_SHARE = 0.5
 """Share of these, in all photographs, that have become darker, or brighter, than elsewhere."""
-TURNED = np.radians(20.0)
+SHADOW_TURN = np.radians(20.0)
 """Turn within which a place can be the other's shadow: its planes are nearly parallel."""
 
 
@@ -34,7 +34,7 @@ def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: Dista
     a, b, u = of_edges(legs, tubes)
     first, last = visible_stretch(a, b, tubes)
     length = np.maximum(last - first, 0.0)
-    at = (first + length * ALONG[:, None, None, None])[..., None]
+    at = (first + length * PLACES_ALONG_TUBE[:, None, None, None])[..., None]
     number = np.arange(len(tables.row))[:, None]
     sign, inside = tables.brighter(camera.project(a + at * u), number)
     count = np.maximum(inside.sum(axis=(0, 2, 3)), 1)
@@ -45,5 +45,5 @@ def without_shadows(places: Array, light: Array) -> Integers:
     """Numbers of those places (H, 4, 4) that are no other one's shadow; light : (H,) as `lightness`
     says.
     """
-    casts = (light > MOSTLY) & (angle_between(places[:, None], places) < TURNED)
-    return np.flatnonzero((light > -MOSTLY) | ~casts.any(axis=1))
+    casts = (light > MOSTLY_CHANGED_SHARE) & (angle_between(places[:, None], places) < SHADOW_TURN)
+    return np.flatnonzero((light > -MOSTLY_CHANGED_SHARE) | ~casts.any(axis=1))

@@ -22,14 +22,14 @@ from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.observe.evidence import (
     LAST_REACH,
     StationView,
-    apart,
     by_photograph,
     descend,
+    distinct_silhouettes,
     first_mixture,
     grain,
     look_under,
     score,
-    settle,
+    settle_by_evidence,
 )
 from pkmcal.observe.places import anywhere
 from pkmcal.observe.shadows import lightness, without_shadows
@@ -38,31 +38,31 @@ SEARCH_ANGLE = np.radians(6.0)
 SEARCH_DISTANCE = 0.06
 """Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
 is 10 degrees and 10 cm."""
-TRIES = 800
+POSES_TRIED = 800
 FEWER_TRIES = 160
 """Poses tried where one of thirty hypotheses is looked at."""
-CLOSER = 8
+POSES_A_CLOSER_LOOK = 8
 """One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
-ANYWHERE, LIKELIER = 1200, 300
+ANYWHERE_POSES_DESCENDING, ANYWHERE_POSES_KEPT = 1200, 300
 """Poses from all round the machine that descend, and how many of them go on: before a descent the
 pictures hardly tell which is near, least of all of three legs that are alike."""
-SHAKEN, LIKELY = 48, 16
+SHAKEN_POSES_TRIED, SHAKEN_POSES_KEPT = 48, 16
 """Poses beside the best ones that are tried before the last descent, and of how many two steps have
 shown that they may be the best."""
-ALIKE = 4
+LIKELIEST_PLACES_SETTLED = 4
 """Of the likeliest places, where all are one, those that are settled without a look beside them."""
-NEARBY = 8
+NEARBY_PLACES_SETTLED = 8
 """Places of each of thirty hypotheses that are settled."""
-HALVES, THIRDS, HALVES_TOLD = 7, 5, 4
+FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
 each in its turn. About a known pose two are enough to be searched."""
-DECIDED = 10.0
+EARLY_DECISION_FACTOR = 10.0
 """Times less than the probability asked for, by some of the photographs, at which the others need
 not be asked."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 """Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
 where it was looked for about a pose by hand, which says much the same already."""
-DOUBT = 0.05
+SECOND_PLACE_DOUBT = 0.05
 """Probability of a second place being as good above which neither is believed."""
 
 
@@ -96,12 +96,12 @@ class FoundStation:
     @property
     def good(self) -> bool:
         """Whether the machine was recognised, and at one place only."""
-        return self.by_chance < self.limit and self.second < DOUBT
+        return self.by_chance < self.limit and self.second < SECOND_PLACE_DOUBT
 
     @property
     def sure(self) -> bool:
         """Whether it was recognised without what is said of the pose."""
-        return self.by_chance < BY_CHANCE and self.second < DOUBT
+        return self.by_chance < BY_CHANCE and self.second < SECOND_PLACE_DOUBT
 
 
 def find_station(
@@ -118,8 +118,8 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    halves = HALVES if T_camera_base is None else HALVES_TOLD
-    folds = 2 if count >= halves else 3 if count >= THIRDS else count
+    halves = FEWEST_FOR_HALVES if T_camera_base is None else FEWEST_FOR_HALVES_TOLD
+    folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
@@ -128,18 +128,18 @@ def find_station(
         found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
-        if _by_chance(surely) < BY_CHANCE / DECIDED:
+        if _by_chance(surely) < BY_CHANCE / EARLY_DECISION_FACTOR:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
-    candidates, evidence = settle(view, candidates, every, 8, 8)
+    candidates, evidence = settle_by_evidence(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
     legs = view.legs(every).moved(candidates[order])
     light = lightness(view.camera, view.tubes, legs, view.tables)
     order = order[without_shadows(candidates[order], light)]
     first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
-    order = order[apart(view, candidates[order], every)]
+    order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
     # tell the place better
@@ -165,9 +165,9 @@ def _search(
     few, more = view.few(4), view.few(8)
     if T_camera_base is None:
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
-        candidates = _anywhere(view, few, each * ANYWHERE)
+        candidates = _anywhere(view, few, each * ANYWHERE_POSES_DESCENDING)
         candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
-        candidates = _best(view, candidates, few, reach=8, keep=each * LIKELIER)
+        candidates = _best(view, candidates, few, reach=8, keep=each * ANYWHERE_POSES_KEPT)
     else:
         candidates = _random_search(view, T_camera_base, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
@@ -175,14 +175,14 @@ def _search(
     likelier = candidates[: len(candidates) // 2]
     # of photographs that all took part in the descents none could disagree
     closely = closely or T_camera_base is None or len(more) == len(few)
-    if not closely and len(apart(view, likelier, more)) == 1:
-        others = apart(view, candidates, more)[1:3]
-        candidates = candidates[[*range(ALIKE), *others]]
+    if not closely and len(distinct_silhouettes(view, likelier, more)) == 1:
+        others = distinct_silhouettes(view, candidates, more)[1:3]
+        candidates = candidates[[*range(LIKELIEST_PLACES_SETTLED), *others]]
     else:
         candidates = _best_about(view, candidates, more, rng)
-    candidates, evidence = settle(view, candidates, more, 5, 5)
+    candidates, evidence = settle_by_evidence(view, candidates, more, 5, 5)
     candidates = candidates[np.argsort(-evidence)]
-    return candidates[apart(view, candidates, more)[:3]]
+    return candidates[distinct_silhouettes(view, candidates, more)[:3]]
 
 
 def _best_about(
@@ -191,14 +191,16 @@ def _best_about(
     """The likeliest places (H, 4, 4) that candidates descend to, and beside these."""
     candidates = descend(view, candidates, photographs, 5, (5, 4, 4, 3))
     candidates = _best(view, candidates, photographs, reach=3, keep=24)
-    candidates = candidates[apart(view, candidates, photographs)[:4]]
+    candidates = candidates[distinct_silhouettes(view, candidates, photographs)[:4]]
     # the picture is rugged: what lies beside a good place may be better
-    beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
+    beside = candidates[rng.integers(0, len(candidates), SHAKEN_POSES_TRIED)]
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
-    steps = rng.normal(size=(SHAKEN, 6)) * spread
+    steps = rng.normal(size=(SHAKEN_POSES_TRIED, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates, evidence = settle(view, np.concatenate([candidates, turned]), photographs, 3, 2)
-    return candidates[np.argsort(-evidence)[:LIKELY]]
+    candidates, evidence = settle_by_evidence(
+        view, np.concatenate([candidates, turned]), photographs, 3, 2
+    )
+    return candidates[np.argsort(-evidence)[:SHAKEN_POSES_KEPT]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
@@ -210,7 +212,7 @@ def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
 
 
 def _random_search(
-    view: StationView, T_camera_base: Array, rng: np.random.Generator, tries: int = TRIES
+    view: StationView, T_camera_base: Array, rng: np.random.Generator, tries: int = POSES_TRIED
 ) -> Array:
     """Candidates (16, 4, 4): a wide random draw, then a narrower one around its best."""
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3)
@@ -224,7 +226,7 @@ def _random_search(
     def likely(steps: Array, reach: float, keep: int) -> Array:
         # two photographs and few places tell which of them are not worth a closer look
         first = np.argsort(score(view, moved(steps), few[::2], reach, 3))
-        steps = steps[first[: max(len(steps) // CLOSER, keep)]]
+        steps = steps[first[: max(len(steps) // POSES_A_CLOSER_LOOK, keep)]]
         return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
 
     steps = rng.normal(size=(tries, 6)) * spread
@@ -264,11 +266,13 @@ def evidence_nearby(
     count = each.shape[1]
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
     ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 10, 8, 6, 5))
-    if count > NEARBY:
-        order = np.argsort(score(view, ends, few, 5).reshape(-1, count), axis=1)[:, :NEARBY]
+    if count > NEARBY_PLACES_SETTLED:
+        order = np.argsort(score(view, ends, few, 5).reshape(-1, count), axis=1)[
+            :, :NEARBY_PLACES_SETTLED
+        ]
         kept = (order + count * np.arange(len(legs))[:, None]).ravel()
         ends, view = ends[kept], view.guess(kept)
-    evidence = settle(view, ends, few, 5, 3)[1]
+    evidence = settle_by_evidence(view, ends, few, 5, 3)[1]
     return evidence.reshape(len(legs), -1).max(axis=1)
 
 
@@ -327,10 +331,10 @@ def _confirmed(view: StationView, place: Array, asked: Array, surely: list[Array
     from so many different ones this was chosen, and any may be confirmed by chance.
     """
     every = view.few(len(view.configuration))
-    own = [len(apart(view, np.stack([place, other]), every)) == 1 for other in asked]
+    own = [len(distinct_silhouettes(view, np.stack([place, other]), every)) == 1 for other in asked]
     if not any(own):
         return _by_chance(surely)
-    choices = len(apart(view, asked, every))
+    choices = len(distinct_silhouettes(view, asked, every))
     about = [sure for sure, mine in zip(surely, own, strict=True) if mine]
     return min(choices * _by_chance(about), 1.0)
 

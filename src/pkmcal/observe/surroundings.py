@@ -23,38 +23,38 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import angle_between, cross, dot, inverse, pose, rotation
-from pkmcal.observe.alone import ALIKE, Alone
+from pkmcal.observe.alone import SAME_PLACE_TURN, Alone
 from pkmcal.observe.predict import LegsInCamera
 
-LARGEST = 1600
+LARGEST_TEXTURE_SIDE = 1600
 """Pixels of a photograph's longer side on which texture is looked for: finer is mostly noise."""
-MOST = 3000
+MOST_TEXTURE_POINTS = 3000
 """Points of texture of a photograph, those of most contrast."""
-BETTER = 0.8
+PARTNER_DISTANCE_RATIO = 0.8
 """Distance to the likeliest partner, in that to the next, above which there is none (Lowe, 7.1)."""
-NEAR = 8.0
+TEXTURE_POINTS_APART = 8.0
 """Pixels within which points are one: a corner has several descriptions, and tells one thing."""
-FEWEST = 16
+FEWEST_POINT_PAIRS = 16
 """Pairs of points without which two photographs tell nothing of each other: of fewer nobody knows
 what chance makes of them."""
-REACHES = 1.5
+MACHINE_OUTLINE_FACTOR = 1.5
 """Size, in that of its joints' outline, of what may belong to the machine in a photograph: plates,
 motors and cables reach beyond the joints, and a drawing does not tell how far."""
-SPREADS = np.radians([0.1, 0.25, 0.6])
+EPIPOLAR_SPREADS = np.radians([0.1, 0.25, 0.6])
 """Standard deviations (rad) of points from their epipolar planes, of which the likeliest is taken:
 from what a feature is off, to what a drawing that is wrong by millimetres turns a camera."""
-SHARES = np.linspace(0.02, 0.98, 49)
+RIGHT_PAIR_SHARES = np.linspace(0.02, 0.98, 49)
 """Shares of right pairs, of which the likeliest is taken."""
-SHUFFLED, WINDOW = 20, np.radians(2.0)
+PARTNER_EXCHANGES, EPIPOLAR_WINDOW = 20, np.radians(2.0)
 """How often partners are exchanged, to see how many chance puts within this angle of the planes."""
 
-PARALLAX = np.radians(3.0)
+LEAST_LANDMARK_PARALLAX = np.radians(3.0)
 """Angle between two rays below which their crossing is no place: five of the widest spreads."""
-TRIES, AHEAD = 3000, 0.2
+LANDMARK_TRIPLES_TRIED, LEAST_COSINE_AHEAD = 3000, 0.2
 """Triples of landmarks that are tried for a photograph's place: one of ten right ones is enough for
 three of them to be found. Rays further off the camera's axis than its cosine are left out."""
 
-TURNED = 4
+PLACES_ASKED_OF_ROOM = 4
 """Places of a photograph about which the room is asked."""
 TURN_GRID = np.radians(
     np.stack(np.meshgrid(*[np.arange(-6.0, 7.0, 2.0)] * 2), axis=-1).reshape(-1, 2)
@@ -76,9 +76,9 @@ def texture_of(image: Integers, camera: Camera) -> Texture:
     """Points of texture of a photograph, grey levels (height, width)."""
     import cv2
 
-    scale = min(LARGEST / max(image.shape), 1.0)
+    scale = min(LARGEST_TEXTURE_SIDE / max(image.shape), 1.0)
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    points, found = cv2.SIFT.create(MOST).detectAndCompute(small, None)
+    points, found = cv2.SIFT.create(MOST_TEXTURE_POINTS).detectAndCompute(small, None)
     if not points:
         return Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
     pixel = (np.array([p.pt for p in points]) + 0.5) / scale - 0.5
@@ -107,7 +107,7 @@ def partners(one: Texture, other: Texture) -> Integers:
     for worth, j, k in sorted(mutual):
         at = np.stack([one.pixel[j], other.pixel[k]])
         away = np.abs(taken - at).max(axis=-1)
-        if worth < BETTER and (away >= NEAR).all():
+        if worth < PARTNER_DISTANCE_RATIO and (away >= TEXTURE_POINTS_APART).all():
             kept.append((j, k))
             taken = np.concatenate([taken, at[None]])
     return np.array(kept, dtype=int).reshape(-1, 2)
@@ -122,7 +122,7 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
     if len(joints) < 3:
         return np.ones(len(pixel), dtype=bool)
     middle = (joints.min(axis=0) + joints.max(axis=0)) / 2
-    outline = (middle + REACHES * (joints - middle)).astype(np.float32)
+    outline = (middle + MACHINE_OUTLINE_FACTOR * (joints - middle)).astype(np.float32)
     corner = cv2.convexHull(outline).reshape(-1, 2).astype(float)
     # outside of a convex outline is what lies outside of one of its sides
     side, away = np.roll(corner, -1, axis=0) - corner, pixel[:, None] - corner
@@ -138,18 +138,20 @@ def agreement(one: Array, other: Array, T_other_one: Array) -> float:
     all have in common, or lies where exchanged partners do. The share and the spread of the right
     ones are chosen to fit, and paid for as two numbers are (Schwarz, Annals of Statistics 6, 1978).
     """
-    if len(one) < FEWEST:
+    if len(one) < FEWEST_POINT_PAIRS:
         return 0.0
     ray = one @ T_other_one[:3, :3].T
     normal = cross(np.broadcast_to(T_other_one[:3, 3], ray.shape), ray)
     normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[:, None]
     rng = np.random.default_rng(0)
-    exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(SHUFFLED)])]
+    exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(PARTNER_EXCHANGES)])]
     off, by_chance = (np.arcsin(np.clip(dot(normal, v), -1, 1)) for v in (other, exchanged))
-    chance = max(float(np.mean(np.abs(by_chance) < WINDOW)), 1 / by_chance.size) / (2 * WINDOW)
-    spread = SPREADS[:, None]
+    chance = max(float(np.mean(np.abs(by_chance) < EPIPOLAR_WINDOW)), 1 / by_chance.size) / (
+        2 * EPIPOLAR_WINDOW
+    )
+    spread = EPIPOLAR_SPREADS[:, None]
     density = np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
-    gain = np.log1p(SHARES[:, None, None] * (density / chance - 1)).sum(axis=-1)
+    gain = np.log1p(RIGHT_PAIR_SHARES[:, None, None] * (density / chance - 1)).sum(axis=-1)
     return max(float(gain.max()) - np.log(len(one)), 0.0)
 
 
@@ -228,18 +230,18 @@ class Surroundings:
             rays.append(self.texture(one).ray[j[at]])
             points.append(known.point[where])
         ray, point = np.concatenate(rays), np.concatenate(points)
-        ahead = ray[:, 2] > AHEAD
+        ahead = ray[:, 2] > LEAST_COSINE_AHEAD
         ray, point = ray[ahead], point[ahead]
-        if len(ray) < FEWEST:
+        if len(ray) < FEWEST_POINT_PAIRS:
             return np.zeros((0, 4, 4))
         plane = np.ascontiguousarray(ray[:, :2] / ray[:, 2:])
-        off = float(np.tan(SPREADS[-1]))
+        off = float(np.tan(EPIPOLAR_SPREADS[-1]))
         ok, turn, shift, inside = cv2.solvePnPRansac(
             point, plane, np.eye(3), np.zeros(0),
-            iterationsCount=TRIES, reprojectionError=off, flags=cv2.SOLVEPNP_AP3P,
+            iterationsCount=LANDMARK_TRIPLES_TRIED, reprojectionError=off, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         which = np.asarray(inside, dtype=int).ravel() if ok else np.zeros(0, dtype=int)
-        if len(which) < FEWEST:
+        if len(which) < FEWEST_POINT_PAIRS:
             return np.zeros((0, 4, 4))
         turn, shift = cv2.solvePnPRefineLM(
             point[which], plane[which], np.eye(3), np.zeros(0), turn, shift
@@ -261,7 +263,7 @@ class Surroundings:
         legs : (H, L, 3) as each of the places has them.
         """
         out = [np.zeros((0, 4, 4))]
-        for h, T in enumerate(found.T_camera_base[:TURNED]):
+        for h, T in enumerate(found.T_camera_base[:PLACES_ASKED_OF_ROOM]):
             to_base = inverse(T)
             middle = to_base[:3, :3] @ np.concatenate([legs.a[h], legs.b[h]]).mean(axis=0)
             middle = middle + to_base[:3, 3]
@@ -292,7 +294,7 @@ class Surroundings:
             return found
         T = found.T_camera_base
         gain = self._gain(T, one, camera, [legs[h] for h in range(len(T))], placed)
-        alike = angle_between(T[:, None], T) < ALIKE
+        alike = angle_between(T[:, None], T) < SAME_PLACE_TURN
         worth = found.evidence + np.where(alike, gain, -np.inf).max(axis=1)
         order = np.argsort(-worth, kind="stable")
         order = order[~alike[order, order[0]] | (order == order[0])]
@@ -338,5 +340,10 @@ def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array
         to = point - start
         side = cross(to, along)
         off = np.maximum(off, np.sqrt(dot(side, side)) / np.maximum(np.sqrt(dot(to, to)), 1e-12))
-    good = (depth > 0) & (depth_b > 0) & (off < SPREADS[-1]) & (cosine < np.cos(PARALLAX))
+    good = (
+        (depth > 0)
+        & (depth_b > 0)
+        & (off < EPIPOLAR_SPREADS[-1])
+        & (cosine < np.cos(LEAST_LANDMARK_PARALLAX))
+    )
     return point, good

@@ -17,23 +17,23 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-DIRECTIONS = 8
+EDGE_DIRECTIONS = 8
 """Edge directions told apart; each table takes the neighbouring directions in as well."""
 WORKING_WIDTH = 256
 """Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
 apart, coarse enough to search quickly."""
-STILL = 5.0
+STILL_LEVEL_DIFFERENCE = 5.0
 """Levels from the station's median photograph within which a place counts as still."""
 ENOUGH_TO_COMPARE = 4
 """Photographs from which a median is a picture of the background."""
-CANNY = (20, 40)
+CANNY_SLOPES = (20, 40)
 """Sobel slopes from which an edge goes on and begins: five times what the noise of a level, that a
 reduced photograph has at most, makes of it; from half of that to the double, little changes."""
-FURTHEST = 32.0
+FURTHEST_EDGE_DISTANCE = 32.0
 """Reduced pixels beyond which distances are not told apart."""
-NOWHERE = 1e3
+NO_EDGE_DISTANCE = 1e3
 """Reduced pixels where a photograph has no edge of a direction."""
-BIN = 0.5
+CHANCE_DISTANCE_BIN = 0.5
 """Reduced pixels of a bin of the distances that chance gives."""
 MOST_ACROSS = 32_000
 """Rows and columns of a picture that OpenCV looks things up in, fewer than 2**15."""
@@ -52,10 +52,10 @@ class DirectionTables:
     direction is first looked for: the silhouettes of most machines have half of them.
 
     place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
-    direction numbers (n,). picture : (rows, h, columns, DIRECTIONS, w), in which the n-th
-    photograph's tables lie in row n % rows and column n // rows. chance : (DIRECTIONS, bins) of
-    BIN: how often a place taken anywhere has that distance. ready : (DIRECTIONS,) whether both are
-    worked out.
+    direction numbers (n,). picture : (rows, h, columns, EDGE_DIRECTIONS, w), in which the n-th
+    photograph's tables lie in row n % rows and column n // rows. chance : (EDGE_DIRECTIONS, bins)
+    of CHANCE_DISTANCE_BIN: how often a place taken anywhere has that distance. ready :
+    (EDGE_DIRECTIONS,) whether both are worked out.
     """
 
     place: tuple[Integers, ...]
@@ -68,12 +68,14 @@ class DirectionTables:
     def of_edges(
         cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
     ) -> DirectionTables:
-        """Those of edge points, none ready. shape : DIRECTIONS, h, w."""
+        """Those of edge points, none ready. shape : EDGE_DIRECTIONS, h, w."""
         directions, height, width = shape
         rows = min(len(place), MOST_ACROSS // height)
         columns = -(-len(place) // rows)
         picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
-        chance = np.zeros((directions, round(FURTHEST / BIN)), dtype=np.float32)
+        chance = np.zeros(
+            (directions, round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)), dtype=np.float32
+        )
         return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
 
     def get_ready(self, direction: Integers) -> None:
@@ -89,9 +91,9 @@ class DirectionTables:
         counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
-            distances(place[taken_in.take(number)], table)
+            write_distances(place[taken_in.take(number)], table)
             counted += _counted(table)
-        self.chance[direction] = counted / counted.sum() / BIN
+        self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
         self.ready[direction] = True  # at last, as others may look beside
 
     def mirrored(self) -> DirectionTables:
@@ -199,7 +201,7 @@ class DistanceTables:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
         self.tables.get_ready(direction)
         bins = self.tables.chance.shape[1]
-        number = np.minimum(found / np.float32(BIN), bins - 1).astype(np.int32)
+        number = np.minimum(found / np.float32(CHANCE_DISTANCE_BIN), bins - 1).astype(np.int32)
         return self.tables.chance.take(direction * bins + number)
 
     def select(self, photographs: Integers) -> DistanceTables:
@@ -223,7 +225,7 @@ class DistanceTables:
         )
 
 
-def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
+def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
     """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
     matter.
     """
@@ -239,14 +241,14 @@ def alike(direction: int, count: int) -> Booleans:
     return (np.arange(count) - (direction - 1)) % count < 3
 
 
-def distances(place: Integers, out: Array) -> None:
+def write_distances(place: Integers, out: Array) -> None:
     """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
     into ``out``, in single precision and each row in one piece.
     """
     import cv2
 
     if not len(place):
-        out[...] = NOWHERE
+        out[...] = NO_EDGE_DISTANCE
         return
     mask = np.ones(out.shape, dtype=np.uint8)
     mask.reshape(-1)[place] = 0
@@ -257,7 +259,7 @@ def distances(place: Integers, out: Array) -> None:
 def distance_tables(
     images: Sequence[Integers],
     width: int = WORKING_WIDTH,
-    directions: int = DIRECTIONS,
+    directions: int = EDGE_DIRECTIONS,
 ) -> DistanceTables:
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
@@ -296,7 +298,7 @@ def _against_median(small: Integers) -> Integers:
     # twice the median, in whole levels
     twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
     off = 2 * small.astype(np.int16) - twice
-    return (off > 2 * STILL).astype(np.int8) - (off < -2 * STILL)
+    return (off > 2 * STILL_LEVEL_DIFFERENCE).astype(np.int8) - (off < -2 * STILL_LEVEL_DIFFERENCE)
 
 
 def _moving(small: Integers, edges: PictureEdges) -> Array:
@@ -304,7 +306,7 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
     of one alone, where it has edges.
     """
     if len(small) > 1:
-        return (np.ptp(small.astype(float), axis=0) > STILL).astype(float)
+        return (np.ptp(small.astype(float), axis=0) > STILL_LEVEL_DIFFERENCE).astype(float)
     out = np.zeros(small.shape[1:])
     x, y = edges.pixel.astype(int).T
     out[y, x] = 1.0
@@ -315,8 +317,10 @@ def _counted(table: Array) -> Integers:
     """How often each distance occurs in a table (h, w), (bins,); at every other place of every
     other row.
     """
-    bins = round(FURTHEST / BIN)
-    number = np.minimum(table[::2, ::2] * np.float32(1 / BIN), bins - 1).astype(np.intp)
+    bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
+    number = np.minimum(table[::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(
+        np.intp
+    )
     return np.bincount(number.ravel(), minlength=bins)
 
 
@@ -333,7 +337,7 @@ def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
 
     dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
-    edges = cv2.Canny(dx, dy, *CANNY) > 0
+    edges = cv2.Canny(dx, dy, *CANNY_SLOPES) > 0
     if moving is not None:
         edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     y, x = np.divmod(np.flatnonzero(edges), edges.shape[1])  # faster than np.nonzero

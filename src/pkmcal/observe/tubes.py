@@ -20,31 +20,31 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
 
-CHART = 384
+FINE_CHART_CELLS = 384
 """Cells of the fine chart along the longer side of the picture: a leg that is a fiftieth of the
 picture wide, as where a machine fills it, has its edges eight cells apart."""
-CELL = 6
+MAP_CELL_SIZE = 6
 """Fine cells that are one cell of the maps, which are looked up 15 degrees and 8 degrees apart."""
-COARSE = 2
+SUPPORT_SPACING = 2
 """Fine cells between the places whose support is worked out."""
-DIRECTIONS = 24
+PAIR_DIRECTIONS = 24
 """Directions of a pair: 7.5 degrees apart."""
-WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
+PAIR_WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
 """Widths (fine cells) of a pair: nearer, its edges run together."""
-SLENDER = 4.0
+SUPPORT_LENGTH_WIDTHS = 4.0
 """Length, in widths, along which a pair's support is averaged: tubes are longer."""
-SHORTEST = 12.0
+SHORTEST_SUPPORT_LENGTH = 12.0
 """Fine cells along which it is averaged at least."""
-SLOPE = 2.5
+HALF_STRENGTH_SLOPE = 2.5
 """Levels a fine cell at which an edge counts half of a strong one: levels are roots (255 stays),
 whose noise is even and half a level at most, so five times that."""
-ASIDE = 2.0
+SLOPE_ALONG_WEIGHT = 2.0
 """Times that a slope along a pair counts against one across it: directions within 27 degrees."""
-CLEAR = 0.24
+LEAST_PAIR_SUPPORT = 0.24
 """Support below which a place is no pair at all: one place in four of its length."""
-RAREST = 4.0
+GREATEST_LOG_RARITY = 4.0
 """Logarithm of rarity beyond which rarer ones count no more: one leg must not outvote six."""
-WORTH = 60
+RARITY_STEPS = 60
 """Steps of the maps' numbers for each factor of e in rarity."""
 
 
@@ -64,7 +64,7 @@ class TubeChart(NamedTuple):
 
     def width_number(self, width: Array) -> Integers:
         """The numbers of widths (...), fine cells."""
-        apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(WIDTHS))
+        apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(PAIR_WIDTHS))
         return apart.argmin(axis=-1)
 
 
@@ -82,7 +82,7 @@ def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
     across = np.stack([np.linspace(0, width - 1, 65), np.full(65, (height - 1) / 2)], axis=-1)
     along = np.stack([np.full(65, (width - 1) / 2), np.linspace(0, height - 1, 65)], axis=-1)
     half = [float(np.nanmax(np.abs(_angle(camera.ray(line))))) for line in (across, along)]
-    scale = CHART / (2 * max(half))
+    scale = FINE_CHART_CELLS / (2 * max(half))
     w, h = (int(2 * angle * scale) for angle in half)
     x, y = np.meshgrid((np.arange(w) - (w - 1) / 2) / scale, (np.arange(h) - (h - 1) / 2) / scale)
     away = np.hypot(x, y)
@@ -105,28 +105,28 @@ def _angle(rays: Array) -> Array:
 
 
 def _support(grey: Array) -> Array:
-    """How clear a pair lies about each place, (WIDTHS, DIRECTIONS, h, w), 0 to 1; places lie COARSE
-    fine cells apart.
+    """How clear a pair lies about each place, (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1; places
+    lie SUPPORT_SPACING fine cells apart.
     """
     import cv2
 
     dx, dy = (cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *way) / 8 for way in ((1, 0), (0, 1)))
-    height, width = (n // COARSE for n in grey.shape)
-    out = np.empty((len(WIDTHS), DIRECTIONS, height, width), dtype=np.float32)
-    for k in range(DIRECTIONS):
-        angle = np.pi * k / DIRECTIONS
+    height, width = (n // SUPPORT_SPACING for n in grey.shape)
+    out = np.empty((len(PAIR_WIDTHS), PAIR_DIRECTIONS, height, width), dtype=np.float32)
+    for k in range(PAIR_DIRECTIONS):
+        angle = np.pi * k / PAIR_DIRECTIONS
         n = np.array([np.cos(angle), np.sin(angle)])
         slope, other = dx * n[0] + dy * n[1], np.abs(dy * n[0] - dx * n[1])
-        rising, falling = (_strength(sign * slope - ASIDE * other) for sign in (1, -1))
-        for w, wide in enumerate(WIDTHS):
+        rising, falling = (_strength(sign * slope - SLOPE_ALONG_WEIGHT * other) for sign in (1, -1))
+        for w, wide in enumerate(PAIR_WIDTHS):
             # at x + n wide/2 and x - n wide/2: a bright tube rises inwards, a dark one falls
             step = np.rint(n * wide / 2).astype(int)
             bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
             dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
-            pair = np.maximum(bright, dark)[: height * COARSE, : width * COARSE]
-            rows = reduce(np.maximum, (pair[n::COARSE] for n in range(COARSE)))
-            pair = reduce(np.maximum, (rows[:, n::COARSE] for n in range(COARSE)))
-            length = max(SLENDER * wide, SHORTEST) / COARSE
+            pair = np.maximum(bright, dark)[: height * SUPPORT_SPACING, : width * SUPPORT_SPACING]
+            rows = reduce(np.maximum, (pair[n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
+            pair = reduce(np.maximum, (rows[:, n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
+            length = max(SUPPORT_LENGTH_WIDTHS * wide, SHORTEST_SUPPORT_LENGTH) / SUPPORT_SPACING
             out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
     return out
 
@@ -136,7 +136,7 @@ def _strength(slope: Array) -> Array:
     import cv2
 
     up = np.square(np.maximum(slope, 0.0))
-    wide = cv2.dilate(up / (up + SLOPE**2), np.ones((3, 3), np.uint8))
+    wide = cv2.dilate(up / (up + HALF_STRENGTH_SLOPE**2), np.ones((3, 3), np.uint8))
     return np.asarray(wide, dtype=np.float32)
 
 
@@ -162,13 +162,13 @@ def _line(along: Array, length: float) -> Array:
 
 
 def _rarity(support: Array) -> Integers:
-    """The maps of :class:`TubeChart` from supports (W, DIRECTIONS, h, w).
+    """The maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
 
     A cell takes the best about it, and neighbouring directions, for hypotheses lie so far apart.
     """
     import cv2
 
-    cell = CELL // COARSE
+    cell = MAP_CELL_SIZE // SUPPORT_SPACING
     height, width = (n // cell for n in support.shape[-2:])
     around = np.ones((cell + 2, cell + 2), np.uint8)
     rows, columns = (slice(cell // 2, n * cell, cell) for n in (height, width))
@@ -181,7 +181,7 @@ def _rarity(support: Array) -> Integers:
     for place in np.ndindex(level.shape[:2]):
         count = np.bincount(level[place].ravel(), minlength=256)
         share = count[::-1].cumsum()[::-1] / count.sum()
-        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), RAREST)
-        worth[: round(255 * CLEAR)] = 0.0
-        out[place] = np.rint(WORTH * worth)[level[place]]
+        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), GREATEST_LOG_RARITY)
+        worth[: round(255 * LEAST_PAIR_SUPPORT)] = 0.0
+        out[place] = np.rint(RARITY_STEPS * worth)[level[place]]
     return out

@@ -1,6 +1,6 @@
 """Small charts as frozen views; the template ``charts.html.j2`` only draws them as SVG.
 
-Coordinates are SVG units in a box ``WIDTH`` wide, so that text keeps its size on a phone.
+Coordinates are SVG units in a box ``CHART_WIDTH`` wide, so that text keeps its size on a phone.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from pkmcal.wording import count, number
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-WIDTH = 360.0
-ROW = 18.0
-LETTER = 6.0
-"""Width of a letter of a row's label, about; ``LONGEST`` letters are shown."""
-LONGEST = 22
-OVER = 3.0
+CHART_WIDTH = 360.0
+CHART_ROW_HEIGHT = 18.0
+LABEL_LETTER_WIDTH = 6.0
+"""Width of a letter of a row's label, about; ``LONGEST_ROW_LABEL`` letters are shown."""
+LONGEST_ROW_LABEL = 22
+CUT_OFF_LENGTH_FACTOR = 3.0
 """Lines more than so many times as long as the middle one are cut off."""
 NORMAL_90 = 1.6449
 """Nine tenths of a normal distribution lie within this many standard deviations."""
@@ -47,7 +47,11 @@ class Spread:
     @property
     def name(self) -> str:
         """The label as far as there is room for it."""
-        return self.label if len(self.label) <= LONGEST else self.label[: LONGEST - 1] + "…"
+        return (
+            self.label
+            if len(self.label) <= LONGEST_ROW_LABEL
+            else self.label[: LONGEST_ROW_LABEL - 1] + "…"
+        )
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,8 @@ class RowChart:
     note : small words beside the title.
     """
 
-    width: ClassVar[float] = WIDTH
-    row: ClassVar[float] = ROW
+    width: ClassVar[float] = CHART_WIDTH
+    row: ClassVar[float] = CHART_ROW_HEIGHT
 
     title: str
     unit: str
@@ -73,17 +77,19 @@ class RowChart:
     @property
     def left(self) -> float:
         """Where the frame begins, behind the longest label."""
-        return 12 + LETTER * min(max(len(b.label) for b in self.boxes), LONGEST)
+        return 12 + LABEL_LETTER_WIDTH * min(
+            max(len(b.label) for b in self.boxes), LONGEST_ROW_LABEL
+        )
 
     @property
     def height(self) -> float:
         """Of the whole drawing: rows, ticks and the unit under them."""
-        return ROW * len(self.boxes) + 40
+        return CHART_ROW_HEIGHT * len(self.boxes) + 40
 
     def x(self, value: float) -> float:
         """Place of a value, kept inside the frame."""
         share = (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
-        return self.left + share * (WIDTH - self.left - 12)
+        return self.left + share * (CHART_WIDTH - self.left - 12)
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,7 @@ class BarChart:
     unit : what stands side by side, and what upwards. note : small words beside the title.
     """
 
-    width: ClassVar[float] = WIDTH
+    width: ClassVar[float] = CHART_WIDTH
 
     title: str
     unit: str
@@ -128,7 +134,7 @@ class BarChart:
     @property
     def step(self) -> float:
         """Width of a bar with its gap."""
-        return (WIDTH - self.left - 8) / max(len(self.bars), 1)
+        return (CHART_WIDTH - self.left - 8) / max(len(self.bars), 1)
 
     def x(self, bar: float) -> float:
         """Place of a bar's left side, counted from 0."""
@@ -199,7 +205,7 @@ def row_chart(
     if not there:
         return None
     reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in there]
-    reach = min(max(reaches), OVER * float(np.median(reaches)))
+    reach = min(max(reaches), CUT_OFF_LENGTH_FACTOR * float(np.median(reaches)))
     high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
     ticks = ticks_between(-high, high)
     return RowChart(title, unit, alt, there, -high, high, ticks, band, note)
@@ -239,4 +245,4 @@ def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
 def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
     """Charts beside each other, under what is remarkable in them; nothing without any."""
     there = [chart for chart in charts if chart]
-    return page.render("panels.html.j2", charts=there, remarks=remarks) if there else ""
+    return page.filled_template("panels.html.j2", charts=there, remarks=remarks) if there else ""

@@ -25,18 +25,18 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.wording import number
 
-CURVE = 13
+EDGE_CURVE_POINTS = 13
 """Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
-SIDES = ("right", "left")
+EDGE_SIDE_NAMES = ("right", "left")
 """The two edges of a leg as a picture shows them, looking along the leg from A to B."""
-FRACTIONS = np.linspace(0, 1, CURVE)
-STRAIGHT = 0.1
+EDGE_CURVE_FRACTIONS = np.linspace(0, 1, EDGE_CURVE_POINTS)
+STRAIGHT_CURVE_DEVIATION = 0.1
 """Curves that stay within this many pixels of their chord are written as two points."""
-FINE = 65
+FINE_EDGE_CURVE_POINTS = 65
 """Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
-NUMBER = 0.04
+LEG_NUMBER_WIDTH = 0.04
 """Width of a leg's number with its joint, in picture widths."""
-KEPT = 0.5
+KEPT_EDGE_WEIGHT = 0.5
 """Robust weight below which an edge counts as put aside; pictures draw it dashed."""
 
 
@@ -57,7 +57,7 @@ class Drawn:
 
 def edge_name(leg: int, tube: int, side: int) -> str:
     """One edge of a leg's tube in words; all count from 0 here."""
-    return f"leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge"
+    return f"leg {leg + 1}, tube {tube + 1}, {EDGE_SIDE_NAMES[side]} edge"
 
 
 def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str) -> Drawn | None:
@@ -125,7 +125,7 @@ class Picture:
     corners: tuple[Arrow, ...] = ()
 
 
-def laid_over(
+def machine_laid_over(
     machine: Machine,
     camera: Camera,
     T_camera_base: Array,
@@ -139,7 +139,7 @@ def laid_over(
     """
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, T_camera_base, T_base_platform[None], joints[None])
-    points = edge_points(machine, camera, legs, tubes, FINE)
+    points = edge_points(machine, camera, legs, tubes, FINE_EDGE_CURVE_POINTS)
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
     edges: list[Drawn] = []
     for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
@@ -158,7 +158,7 @@ def measured_curves(
     legs: LegsInCamera,
     photograph: Integers,
     edges: EdgeSet,
-    fraction: Array = FRACTIONS,
+    fraction: Array = EDGE_CURVE_FRACTIONS,
 ) -> Array:
     """Curves (n, m, 2) px of measured edges in photographs of one station, at fractions (m,) of
     their span.
@@ -188,7 +188,7 @@ def own_edges(
     return replace(edges, normal=own)
 
 
-def across(expected: Array, measured: Array) -> tuple[Array, Array]:
+def offsets_across_curves(expected: Array, measured: Array) -> tuple[Array, Array]:
     """Unit normals (n, m, 2) of curves (n, m, 2), px, and how far (n, m) others lie along them."""
     tangent = np.gradient(expected, axis=1)
     normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
@@ -216,7 +216,7 @@ def straightened(curves: Array) -> list[list[list[float]]]:
     chord, off = last - first, curves - first[:, None]
     area = np.abs(chord[:, :1] * off[..., 1] - chord[:, 1:] * off[..., 0])
     most = np.max(area, axis=1, where=seen, initial=0.0)
-    straight = (most <= STRAIGHT * np.hypot(*chord.T)) & (seen.sum(axis=1) > 2)
+    straight = (most <= STRAIGHT_CURVE_DEVIATION * np.hypot(*chord.T)) & (seen.sum(axis=1) > 2)
     ends = np.stack([first, last], axis=1).tolist()
     return [ends[k] if straight[k] else curves[k, seen[k]].tolist() for k in row]
 
@@ -225,7 +225,7 @@ def _spots(pixel: Array, seen: Booleans, width: int) -> tuple[Spot, ...]:
     """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
     another number.
     """
-    room, labels, spots = width * NUMBER, list[Array](), list[Spot]()
+    room, labels, spots = width * LEG_NUMBER_WIDTH, list[Array](), list[Spot]()
     for j in range(pixel.shape[1]):
         free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
         at = [end for end in (0, 1) if seen[end, j]]

@@ -12,17 +12,19 @@ from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
 from pkmcal.observe.images import Pictures
 
-LARGE, SMALL = 640, 256
+LARGE_JPEG_WIDTH, SMALL_JPEG_WIDTH = 640, 256
 """Widths, px: to look at one, and to look over all."""
-QUALITY = 70
-THREADS = 2
-AT_ONCE = 32
+PAGE_JPEG_QUALITY = 70
+JPEG_THREADS = 2
+JPEGS_DECODED_AT_ONCE = 32
 """Photographs that are decoded before it is asked whether there is room for more."""
 
 
 def jpeg(path: Path | None, size: tuple[int, int]) -> str:
-    """A photograph, ``LARGE`` or as wide as it is; empty where it is not there any more."""
-    return _packed(Pictures([path], size, [path.name]), 0, (LARGE,))[0] if path else ""
+    """A photograph, ``LARGE_JPEG_WIDTH`` or as wide as it is; empty where it is not there any
+    more.
+    """
+    return _packed(Pictures([path], size, [path.name]), 0, (LARGE_JPEG_WIDTH,))[0] if path else ""
 
 
 def small_and_large(
@@ -34,10 +36,12 @@ def small_and_large(
     photographs : each as a station's, and its number among them.
     """
     left, waiting = room, len(photographs)
-    with ThreadPoolExecutor(THREADS) as pool:
-        for first in range(0, len(photographs), AT_ONCE):
-            some = photographs[first : first + AT_ONCE]
-            for small, large in pool.map(lambda one: _packed(one[0], one[1], (SMALL, LARGE)), some):
+    with ThreadPoolExecutor(JPEG_THREADS) as pool:
+        for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
+            some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
+            for small, large in pool.map(
+                lambda one: _packed(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)), some
+            ):
                 if len(small) > left:
                     return
                 # that of this one and those that follow come before a large one
@@ -55,7 +59,7 @@ def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> l
     out: dict[int, str] = {}
     for width in sorted(widths, reverse=True):
         image = narrowed(image, width)
-        out[width] = base64.b64encode(coded(image, QUALITY)).decode("ascii")
+        out[width] = base64.b64encode(coded(image, PAGE_JPEG_QUALITY)).decode("ascii")
     return [out[width] for width in widths]
 
 

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from pkmcal.files import plain, remember, remembered
+from pkmcal.files import json_value, remember, remembered
 from pkmcal.wording import count
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def page_html(outcome: Outcome, made: datetime | None = None) -> str:
     )
 
 
-def render(template: str, **views: Any) -> Markup:
+def filled_template(template: str, **views: Any) -> Markup:
     """A template filled; every value in it is escaped, so that the whole is safe in another one."""
     from markupsafe import Markup
 
@@ -85,7 +85,7 @@ def environment() -> jinja2.Environment:
 
 def _as_json(value: Any, **options: Any) -> str:
     """What a page's scripts read: browsers stop at NaN, and would then draw no plot at all."""
-    return json.dumps(plain(value), allow_nan=False, **options)
+    return json.dumps(json_value(value), allow_nan=False, **options)
 
 
 @cache

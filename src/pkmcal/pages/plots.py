@@ -14,44 +14,50 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply
 
-CLEAR = "rgba(0,0,0,0)"
-LOOKS: dict[str, Any] = {
+TRANSPARENT_COLOUR = "rgba(0,0,0,0)"
+COMMON_PLOT_LAYOUT: dict[str, Any] = {
     "paper_bgcolor": "--card",
-    "plot_bgcolor": CLEAR,
+    "plot_bgcolor": TRANSPARENT_COLOUR,
     "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
     "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
 }
 """What the layouts of all plots have in common."""
-AXIS: dict[str, Any] = {
+COMMON_AXIS_LAYOUT: dict[str, Any] = {
     "color": "--muted",
     "gridcolor": "--rule",
     "zerolinecolor": "--rule",
     "linecolor": "--rule",
 }
 """And their axes."""
-BESIDE = 1.2
+EYE_BESIDE_CAMERA = 1.2
 """rad that the eye stands beside a camera at most, so that a single one looks across."""
-CORNER = {"x": 1.45, "y": -1.45, "z": 0.8}
-VIEW = np.pi / 4
+EYE_AT_CORNER = {"x": 1.45, "y": -1.45, "z": 0.8}
+PLOTLY_VIEW_ANGLE = np.pi / 4
 """From below to above in a picture in space, rad: Plotly's."""
-COLOURS = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
+MAGNITUDE_COLOUR_SCALE = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
 """Of magnitudes, the least first."""
-WIDE, NARROW = (1.5, 0.76), (1.0, 0.66)
+WIDE_SPACE_PICTURE, NARROW_SPACE_PICTURE = (1.5, 0.76), (1.0, 0.66)
 """Widths of pictures in space, in heights, and the part of each that what is drawn may take: names
 and numbers stand beside it, of the same size in a small picture."""
-BORDER = 6
+FRUSTUM_POINTS_A_SIDE = 6
 """Points of each side of a picture's border that a frustum is drawn through."""
 
 
 def plane(x: str, y: str) -> dict[str, Any]:
     """Layout of a plot of y against x, which are named by the axes' titles; the legend above."""
     return {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
         # see-through, for the highest tick's number stands half behind it
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "bgcolor": CLEAR},
-        "xaxis": {**AXIS, "title": {"text": x}},
-        "yaxis": {**AXIS, "title": {"text": y}},
+        "legend": {
+            "orientation": "h",
+            "x": 0,
+            "y": 1.0,
+            "yanchor": "bottom",
+            "bgcolor": TRANSPARENT_COLOUR,
+        },
+        "xaxis": {**COMMON_AXIS_LAYOUT, "title": {"text": x}},
+        "yaxis": {**COMMON_AXIS_LAYOUT, "title": {"text": y}},
     }
 
 
@@ -141,7 +147,7 @@ def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) ->
     look = {
         "size": 4,
         "color": [float(f"{x:.3g}") for x in values.tolist()],
-        "colorscale": COLOURS,
+        "colorscale": MAGNITUDE_COLOUR_SCALE,
         "showscale": True,
         "colorbar": {
             "title": {"text": unit, "side": "top"},
@@ -162,11 +168,11 @@ def ring(points: Array) -> Array:
     return points[[*around, around[0]]]
 
 
-def space_layout(eye: dict[str, float] = CORNER) -> dict[str, Any]:
+def space_layout(eye: dict[str, float] = EYE_AT_CORNER) -> dict[str, Any]:
     """The layout of a figure in space, seen from ``eye``, a corner unless told."""
-    axis = {**AXIS, "showbackground": False, "tickfont": {"size": 10}, "nticks": 6}
+    axis = {**COMMON_AXIS_LAYOUT, "showbackground": False, "tickfont": {"size": 10}, "nticks": 6}
     return {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "uirevision": "keep",
         "scene": {
@@ -181,21 +187,21 @@ def space_layout(eye: dict[str, float] = CORNER) -> dict[str, Any]:
     }
 
 
-def beside(cameras: Array) -> Array:
+def way_between_cameras(cameras: Array) -> Array:
     """The way (3,) from which a machine and its cameras, at (S, 3) m from its middle, are looked
     at: between two cameras, so that none stands before it.
     """
     around = np.sort(np.arctan2(cameras[:, 1], cameras[:, 0])) if len(cameras) else [-np.pi / 4]
     gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
-    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, BESIDE))
+    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, EYE_BESIDE_CAMERA))
     return np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
 
 
 def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
     """The layout of a figure in space that is seen with all of ``data`` in the picture.
 
-    way : (3,) from what is drawn towards the eye. In ``meta`` stands how ``NARROW`` pictures are
-    looked at; the page takes it where they are narrower than ``WIDE``.
+    way : (3,) from what is drawn towards the eye. In ``meta`` stands how ``NARROW_SPACE_PICTURE``
+    pictures are looked at; the page takes it where they are narrower than ``WIDE_SPACE_PICTURE``.
     """
     least, most = (
         np.array([f([v for t in data for v in t[axis] if v is not None]) for axis in "xyz"])
@@ -211,7 +217,7 @@ def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
     def camera(width: float, inside: float) -> dict[str, dict[str, float]]:
         # a corner at depth d before the eye is inside where it lies within slope d of the middle,
         # so on each axis the corners on either side decide how far away, and what the middle is
-        slope = inside * np.tan(VIEW / 2) * np.array([width, 1.0])
+        slope = inside * np.tan(PLOTLY_VIEW_ANGLE / 2) * np.array([width, 1.0])
         near, across = (corners @ way)[:, None], corners @ axes / slope
         one, other = (near + across).max(axis=0), (near - across).max(axis=0)
         middle = axes @ (slope * (one - other) / 2)
@@ -222,8 +228,10 @@ def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
         }
 
     layout = space_layout({})
-    layout["scene"]["camera"] = camera(*WIDE)
-    return layout | {"meta": {"wide": WIDE[0], "narrow": camera(*NARROW)}}
+    layout["scene"]["camera"] = camera(*WIDE_SPACE_PICTURE)
+    return layout | {
+        "meta": {"wide": WIDE_SPACE_PICTURE[0], "narrow": camera(*NARROW_SPACE_PICTURE)}
+    }
 
 
 def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
@@ -234,7 +242,7 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
     """
     right, bottom = camera.image_size[0] - 0.5, camera.image_size[1] - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
-    at = np.arange(4 * BORDER + 1) / BORDER
+    at = np.arange(4 * FRUSTUM_POINTS_A_SIDE + 1) / FRUSTUM_POINTS_A_SIDE
     border = np.stack([np.interp(at, np.arange(5), corners[:, c]) for c in (0, 1)], axis=-1)
     centre = (border.max(axis=0) + border.min(axis=0)) / 2
     share = np.linspace(1, 0, 41)[:, None, None]
@@ -247,4 +255,4 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
     points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
     seen = apply(T_base_camera, points)
     eye = T_base_camera[:3, 3]
-    return [seen, *(np.stack([eye, seen[k * BORDER]]) for k in range(4))]
+    return [seen, *(np.stack([eye, seen[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4))]

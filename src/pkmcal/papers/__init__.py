@@ -15,5 +15,5 @@ holds is named *printed*; :doc:`formulation` says why.
 
 from typing import Literal
 
-Method = Literal["four-step", "linear", "inverse-kinematic"]
+PaperMethod = Literal["four-step", "linear", "inverse-kinematic"]
 """Of them, those that ``methods`` has."""

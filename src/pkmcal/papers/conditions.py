@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Booleans, Integers
 from pkmcal.identify.unidentified import Condition
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.legs import legs_of
+from pkmcal.papers.legs import legs_as_drawn
 from pkmcal.wording import named
 
 
@@ -21,7 +21,12 @@ def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
 
     Necessary at most, see the module.
     """
-    out = [every_leg(seen), base(machine, seen), offsets(machine, seen), platform(machine, seen)]
+    out = [
+        every_leg(seen),
+        base(machine, seen),
+        offsets_condition(machine, seen),
+        platform(machine, seen),
+    ]
     return (*out, *at_once(machine, seen))
 
 
@@ -42,7 +47,7 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
     all its normal; their products say nothing of the plane's points and are not counted.
     """
-    n, legs = seen.shape[1], legs_of(machine)
+    n, legs = seen.shape[1], legs_as_drawn(machine)
     count = seen.sum(axis=1)
     if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
@@ -55,7 +60,7 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     return _condition("11, 12", needed, int(available.sum()), text)
 
 
-def offsets(machine: Machine, seen: Booleans) -> Condition:
+def offsets_condition(machine: Machine, seen: Booleans) -> Condition:
     """[A] 15: distances between platform joints against offsets and constant lengths."""
     closing = machine.layout.closing
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
@@ -71,7 +76,7 @@ def platform(machine: Machine, seen: Booleans) -> Condition:
     """
     closing = machine.layout.closing
     n = int(closing.sum())
-    needed = 1 + 2 * (n - 2) if legs_of(machine).planar else 3 + 3 * (n - 3)
+    needed = 1 + 2 * (n - 2) if legs_as_drawn(machine).planar else 3 + 3 * (n - 3)
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
     return _condition("17", needed, available, text)
@@ -82,7 +87,7 @@ def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
 
     Legs with a revolute joint count among the three themselves, passive ones do not.
     """
-    legs = legs_of(machine)
+    legs = legs_as_drawn(machine)
     count = (seen & legs.closing).sum(axis=1)
     out: list[Condition] = []
     for j in np.flatnonzero(~legs.closing | legs.platform_revolute):

@@ -34,19 +34,19 @@ from pkmcal.papers.four_step_base import (
     Base,
     Items,
     StationViews,
-    apart,
     base_by_products,
     base_by_registration,
     gathered_directions,
     gathered_points,
     joined_by_boards,
     rough_rotations,
-    together,
+    stations_apart,
+    stations_together,
     with_boards,
     with_signs,
 )
 from pkmcal.papers.four_step_platform import (
-    offsets,
+    joint_distance_offsets,
     passive_centres,
     platform_axes,
     platform_by_distances,
@@ -62,11 +62,11 @@ from pkmcal.papers.leg_axes import (
     revolute_axes,
     through_centres,
 )
-from pkmcal.papers.legs import DrawnLegs, base_gauge, legs_of, platform_gauge
-from pkmcal.papers.registration import Body, extent, fixes_pose, laid
+from pkmcal.papers.legs import DrawnLegs, base_gauge, legs_as_drawn, platform_gauge
+from pkmcal.papers.registration import RegisteredBody, extent, fixes_pose, poses_laying_items
 
-Form = Literal["corrected", "printed"]
-VAGUE = 0.1
+FourStepForm = Literal["corrected", "printed"]
+VAGUE_CENTRE_SHARE = 0.1
 """Standard deviation of a base centre, of the base's size, beyond which it does not count."""
 
 
@@ -102,7 +102,7 @@ def base_items(
 
     a_camera : (B, S, L, 3) centres in the camera frames, found (S, L).
     """
-    legs, n = legs_of(machine), len(found)
+    legs, n = legs_as_drawn(machine), len(found)
     centres, seen = gathered_points(a_camera, found, views)
     if legs.planar:
         v, v_found = plane_normals(axes.u, axes.seen, axes.station, n, axes.information)
@@ -116,12 +116,12 @@ def base_items(
     return with_signs(items, rough_rotations(machine, axes, items, views))
 
 
-def solve(
+def solve_from_centres(
     machine: Machine,
     axes: Axes,
     a_camera: Array,
     found: Booleans,
-    form: Form,
+    form: FourStepForm,
     views: StationViews | None = None,
 ) -> FourSteps:
     """Steps 2 to 4 from the base centres in the camera frames, all runs at once.
@@ -129,8 +129,8 @@ def solve(
     a_camera : (B, S, L, 3) with (S, L) whether found; the drawing's values start the search.
     views : stations joined beforehand, each on its own when absent.
     """
-    legs = legs_of(machine)
-    views = apart(len(found)) if views is None else views
+    legs = legs_as_drawn(machine)
+    views = stations_apart(len(found)) if views is None else views
     items = base_items(machine, axes, a_camera, found, views)
     join = base_by_registration if form == "corrected" else base_by_products
     base = join(items, base_gauge(machine, legs))
@@ -154,9 +154,11 @@ def solve(
     weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         # distances leave a translating platform turned against the base frame
-        rot = laid(platform[:, None], b[:, posed], weight[:, posed])[..., :3, :3].mean(axis=1)
+        rot = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])[
+            ..., :3, :3
+        ].mean(axis=1)
         platform = platform @ nearest_rotation(rot).mT
-    T = laid(platform[:, None], b, weight, motion=legs.motion)
+    T = poses_laying_items(platform[:, None], b, weight, motion=legs.motion)
     if legs.planar:  # the platform frame keeps the height that the drawing gives it
         T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
     if not legs.closing.all():
@@ -164,7 +166,7 @@ def solve(
         passive, known = passive_centres(merged.u, base.centres, rows, T)
         passive = np.where(known[:, None], passive, np.nan)
         platform = np.where(legs.closing[:, None], platform, passive)
-    v, w = _axes(machine, legs, merged, posed, base, Body(platform, T), form)
+    v, w = _axes(machine, legs, merged, posed, base, RegisteredBody(platform, T), form)
     return FourSteps(
         base.centres, q0, platform, T_camera_base, v, w, T, merged.configuration, posed
     )
@@ -174,7 +176,7 @@ def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple
     """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
     with_length = replace(merged, seen=merged.seen & legs.closing)
     a = np.broadcast_to(base[:, None], merged.u.shape)
-    q0 = offsets(with_length, a, legs.rod, "corrected")
+    q0 = joint_distance_offsets(with_length, a, legs.rod, "corrected")
     b = a + (merged.readings + q0[:, None])[..., None] * merged.u
     posed = fixes_pose(legs.platform, with_length.seen, motion=legs.motion)
     gauge = platform_gauge(machine, legs)
@@ -189,7 +191,7 @@ def _ends_printed(
 ) -> tuple[Array, Array]:
     """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
     with_length = replace(axes, seen=axes.seen & legs.closing)
-    q0 = offsets(with_length, a_photo, legs.rod, "printed")
+    q0 = joint_distance_offsets(with_length, a_photo, legs.rod, "printed")
     b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
     gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
     if legs.planar:  # distances say nothing of the heights, which are the base's
@@ -204,8 +206,8 @@ def _axes(
     merged: Axes,
     posed: Booleans,
     base: Base,
-    body: Body,
-    form: Form,
+    body: RegisteredBody,
+    form: FourStepForm,
 ) -> tuple[Array, Array]:
     """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion.
 
@@ -245,7 +247,7 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
     if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
         return out
     known = np.isfinite(centres[..., 0]).astype(float)
-    rot = laid(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), known)
+    rot = poses_laying_items(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), known)
     return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
@@ -272,7 +274,7 @@ def four_step(
     machine: Machine,
     measurements: Measurements,
     *,
-    form: Form = "corrected",
+    form: FourStepForm = "corrected",
     T_camera_base_guess: Array | None = None,
     rng: np.random.Generator | None = None,
 ) -> State:
@@ -298,7 +300,7 @@ def four_step(
     views = _views(machine, measurements, axes, a_camera, found, T_camera_base_guess)
     usable = base_items(machine, axes, a_camera, found, views).fixed()[views.of_station]
     checks.platform_can_be_found(machine, axes, usable, form)
-    steps = solve(machine, axes, a_camera, found, form, views)
+    steps = solve_from_centres(machine, axes, a_camera, found, form, views)
     checks.lengths_are_fixed(machine, axes, usable, steps.base, steps.T_camera_base, steps.offsets)
     checks.passive_legs_are_fixed(machine, steps.platform)
     stations = steps.T_camera_base[0]
@@ -307,7 +309,7 @@ def four_step(
     theta = parameters_of(machine, steps)[0]
     poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
     state = with_boards(measurements, theta, stations, poses)
-    if legs_of(machine).framed:
+    if legs_as_drawn(machine).framed:
         return state  # in the machine's own frames already
     return in_gauge(machine, state, default_gauge(machine))
 
@@ -317,7 +319,7 @@ def _well_known(found: linear.LinearCentres, machine: Machine) -> Booleans:
     size = extent(machine.base_centers())
     finite = np.all(np.isfinite(found.centres), axis=-1)
     covariance = np.where(finite[..., None, None], found.covariance, np.eye(3))
-    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE * size) ** 2)
+    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE_CENTRE_SHARE * size) ** 2)
 
 
 def _views(
@@ -336,7 +338,7 @@ def _views(
         checks.stations_are_fixed(items, views, machine)
         checks.stations_are_joined(items, views)
     elif checks.free_ways(items).shape[-1]:
-        return together(guess)
+        return stations_together(guess)
     return views
 
 

@@ -32,8 +32,8 @@ from pkmcal.papers.registration import (
     extent,
     fit_body,
     fixes_pose,
-    laid,
     points_by,
+    poses_laying_items,
 )
 
 
@@ -52,12 +52,12 @@ class StationViews(NamedTuple):
         return int(self.of_station.max()) + 1
 
 
-def apart(n_stations: int) -> StationViews:
+def stations_apart(n_stations: int) -> StationViews:
     """Every station a view of its own."""
     return StationViews(np.arange(n_stations), np.tile(np.eye(4), (n_stations, 1, 1)))
 
 
-def together(T_camera_base: Array) -> StationViews:
+def stations_together(T_camera_base: Array) -> StationViews:
     """All stations in one view, their poses (S, 4, 4) given: the view is that base frame."""
     return StationViews(np.zeros(len(T_camera_base), dtype=int), np.asarray(T_camera_base))
 
@@ -87,7 +87,7 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
     """
     used = poses.select(on_base[poses.mount])
     if not len(used):
-        return apart(n_stations)
+        return stations_apart(n_stations)
     pair, group = np.unique(used.station * len(on_base) + used.mount, return_inverse=True)
     T_camera_mount = mean_pose(used.T_station_target, used.whiten, group, len(pair))
     seen = list(zip(*np.divmod(pair, len(on_base)), T_camera_mount, strict=True))
@@ -227,7 +227,7 @@ class Items(NamedTuple):
     def placed(self, items: Array) -> Array:
         """Poses (B, V, 4, 4) of the views on items (B, L + D, 3)."""
         weight = np.broadcast_to(self.seen, self.measured.shape[:-1]).astype(float)
-        return laid(items[:, None], self.measured, weight, self.n_directions)
+        return poses_laying_items(items[:, None], self.measured, weight, self.n_directions)
 
 
 def base_by_registration(items: Items, gauge: Array) -> Base:

@@ -14,18 +14,18 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step_base import Items, StationViews
-from pkmcal.papers.four_step_platform import COLLAPSED, deviations
+from pkmcal.papers.four_step_platform import COLLAPSED_LENGTH_SHARE, joint_distance_deviations
 from pkmcal.papers.leg_axes import Axes, in_base
-from pkmcal.papers.legs import DrawnLegs, legs_of
+from pkmcal.papers.legs import DrawnLegs, legs_as_drawn
 from pkmcal.papers.registration import fixes_pose, loose, parts_of
 from pkmcal.wording import named
 
-FLAT = 1e-3
+FREE_OFFSETS_SINGULAR_VALUE = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
 which a combination of offsets is free."""
-VAGUE = 0.5
+VAGUE_LENGTH_SHARE = 0.5
 """Standard deviation of a combination of lengths, of a leg's own, beyond which it is free."""
-BUNDLE = "use the joint method (bundle)"
+USE_JOINT_METHOD = "use the joint method (bundle)"
 
 
 def can_be_tried(machine: Machine, edges: int) -> None:
@@ -37,12 +37,12 @@ def can_be_tried(machine: Machine, edges: int) -> None:
         raise ResultError(
             what="the four steps are for legs with one joint on the base and one on the platform",
             found=f"mechanism {machine.name!r} with joints that move on cranks, slides or bars",
-            next_step=BUNDLE,
+            next_step=USE_JOINT_METHOD,
         )
     if not edges:
         raise ResultError(
             what="the four steps need photographs of the legs, and no edge of one was measured",
-            next_step=f"photograph the legs, or {BUNDLE} with a board on the platform",
+            next_step=f"photograph the legs, or {USE_JOINT_METHOD} with a board on the platform",
         )
 
 
@@ -53,7 +53,7 @@ def every_leg_seen(machine: Machine, found: Booleans) -> None:
         raise ResultError(
             what=f"leg {lost[0] + 1} of {machine.n_legs} is seen by no station well enough",
             expected="every leg seen in two directions at least, [A] 3.3",
-            next_step=f"add configurations or a station, or {BUNDLE}",
+            next_step=f"add configurations or a station, or {USE_JOINT_METHOD}",
         )
 
 
@@ -64,12 +64,14 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
         return
     seen = items.centres_seen[views.of_station[few[0]]]
     which = f" ({named(np.flatnonzero(seen))})" if seen.any() else ""
-    need = "two or more" if legs_of(machine).planar else "three or more that are not on one line"
+    need = (
+        "two or more" if legs_as_drawn(machine).planar else "three or more that are not on one line"
+    )
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
         found=f"{seen.sum()} base centres{which}",
         expected=f"{need}, each leg seen in two directions",
-        next_step=f"give the station's pose, fix a board to the base, or {BUNDLE}",
+        next_step=f"give the station's pose, fix a board to the base, or {USE_JOINT_METHOD}",
     )
 
 
@@ -91,7 +93,7 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
         found="; ".join(sees),
         expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
         next_step="fix a calibration board to the base where the stations see it, or let a "
-        f"station see more legs, or {BUNDLE} with the stations' poses",
+        f"station see more legs, or {USE_JOINT_METHOD} with the stations' poses",
     )
 
 
@@ -102,7 +104,7 @@ def free_ways(items: Items) -> Array:
 
 def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
     """[A] 3.5: enough legs with a length at once, each leg with enough others."""
-    legs = legs_of(machine)
+    legs = legs_as_drawn(machine)
     seen = axes.seen & usable[axes.station][:, None]
     if form == "corrected":
         configurations, row = np.unique(axes.configuration, return_inverse=True)
@@ -123,7 +125,8 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
             f"{named(names[b])}",
             found="no configurations that show enough of both at once",
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
-            next_step=f"photograph the same configurations from more stations, or {BUNDLE}",
+            next_step=f"photograph the same configurations from more stations, or"
+            f" {USE_JOINT_METHOD}",
         )
     _needs_poses(legs, seen & posed[:, None])
 
@@ -138,7 +141,7 @@ def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
         found=f"{at_once.sum(axis=1).max(initial=0)} at most",
         expected=f"{need}, [A] 3.5",
         next_step=f"let a station see more legs, photograph one configuration from several "
-        f"stations, or {BUNDLE}",
+        f"stations, or {USE_JOINT_METHOD}",
     )
 
 
@@ -155,7 +158,7 @@ def _needs_poses(legs: DrawnLegs, seen: Booleans) -> None:
                 found=f"seen in {seen[:, short[0]].sum()} configurations together with enough "
                 "legs with a length",
                 expected="two directions at least, with three legs with a length at once, [A] 3.5",
-                next_step=f"add configurations or a station that sees it, or {BUNDLE}",
+                next_step=f"add configurations or a station that sees it, or {USE_JOINT_METHOD}",
             )
 
 
@@ -166,17 +169,19 @@ def lengths_are_fixed(
 
     base (1, L, 3), T_camera_base (1, S, 4, 4) and offsets q0 (1, L) as the steps found them.
     """
-    legs = legs_of(machine)
+    legs = legs_as_drawn(machine)
     not_collapsed(legs, q0[0])
     seen = axes.seen & usable[axes.station][:, None] & legs.closing
     merged = in_base(replace(axes, seen=seen), T_camera_base)
     a = np.broadcast_to(base[:, None], merged.u.shape)
-    value, slopes = (rows[0] for rows in deviations(merged, a, q0, "corrected"))
+    value, slopes = (rows[0] for rows in joint_distance_deviations(merged, a, q0, "corrected"))
     freedom = max(np.count_nonzero(np.any(slopes, axis=1)) - int(legs.closing.sum()), 1)
     values, vectors = np.linalg.eigh(slopes[:, legs.closing].T @ slopes[:, legs.closing])
     sigma = np.sqrt(np.sum(value**2) / freedom / np.maximum(values, 1e-300))
     length = float(np.mean(legs.rod[legs.closing] + merged.readings[0][:, legs.closing]))
-    free = (values < FLAT**2 * len(merged.configuration)) | (sigma > VAGUE * length)
+    free = (values < FREE_OFFSETS_SINGULAR_VALUE**2 * len(merged.configuration)) | (
+        sigma > VAGUE_LENGTH_SHARE * length
+    )
     if not free.any():
         return
     part = np.abs(vectors[:, free]).max(axis=1)
@@ -185,20 +190,20 @@ def lengths_are_fixed(
         what=f"the photographs do not tell the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",
         expected="legs that change their directions against each other, seen at once, [A] 3.4",
-        next_step=f"add configurations that tilt and turn the platform more, or {BUNDLE}",
+        next_step=f"add configurations that tilt and turn the platform more, or {USE_JOINT_METHOD}",
     )
 
 
 def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
     """No constant length in the false minimum of [A] 14, where both its joints fall together."""
-    short = np.flatnonzero(legs.constant & (q0 < COLLAPSED * legs.rod))
+    short = np.flatnonzero(legs.constant & (q0 < COLLAPSED_LENGTH_SHARE * legs.rod))
     if short.size:
         raise ResultError(
             what=f"leg {short[0] + 1} of constant length shrank to nothing in the third step",
             found=f"{1e3 * q0[short[0]]:.0f} mm",
             expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
             "joints fall together, which fits the photographs for a wrong reason",
-            next_step=f"check the drawing's length, add configurations, or {BUNDLE}",
+            next_step=f"check the drawing's length, add configurations, or {USE_JOINT_METHOD}",
         )
 
 
@@ -210,5 +215,5 @@ def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
             what=f"passive leg {lost[0] + 1} of {machine.n_legs} does not change its direction "
             "on the platform, so its joint could lie anywhere along it",
             expected="two directions at least, [A] 3.5",
-            next_step=f"add configurations that tilt or shift the platform, or {BUNDLE}",
+            next_step=f"add configurations that tilt or shift the platform, or {USE_JOINT_METHOD}",
         )

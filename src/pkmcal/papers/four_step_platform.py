@@ -18,19 +18,25 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, inverse
-from pkmcal.papers.leg_axes import Axes, across, nearest_points, revolute_axes
-from pkmcal.papers.registration import ANY_MOTION, SCALE, fit_body, minimise_dense, points_by
+from pkmcal.papers.leg_axes import Axes, across_directions, nearest_points, revolute_axes
+from pkmcal.papers.registration import (
+    ANY_MOTION,
+    REGISTRATION_UNIT_SIGMA,
+    fit_body,
+    minimise_dense,
+    points_by,
+)
 
-COLLAPSED = 0.5
+COLLAPSED_LENGTH_SHARE = 0.5
 """A constant length below this part of its drawing is the false minimum B = A."""
-WIDE = 20.0
+TORSION_NOISE_TOLERANCES = 20.0
 """Tolerances within which the torsion's noise is looked for."""
-TORSION_STEPS, SETTLED = 40, 1e-13
-ROUNDING = 1e-12
+TORSION_STEPS, TORSION_SETTLED = 40, 1e-13
+ROUNDED_INFORMATION_SHARE = 1e-12
 """Share of the best known direction's information below which a direction is rounding."""
 
 
-def offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
+def joint_distance_offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
     """Step 3, [A] 13-14: offsets (B, L) that keep the distances between platform joints.
 
     axes : only legs with a length in ``seen``. a_photo : (B, C, L, 3) base centres in each
@@ -38,13 +44,15 @@ def offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
     """
 
     def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
-        value, jac = deviations(axes.of_runs(runs), a_photo[runs], x, form)
-        return value / SCALE, jac / SCALE
+        value, jac = joint_distance_deviations(axes.of_runs(runs), a_photo[runs], x, form)
+        return value / REGISTRATION_UNIT_SIGMA, jac / REGISTRATION_UNIT_SIGMA
 
     return minimise_dense(rows, np.broadcast_to(start, (len(a_photo), len(start))).copy()).state
 
 
-def deviations(axes: Axes, a_photo: Array, at: Array, form: str) -> tuple[Array, Array]:
+def joint_distance_deviations(
+    axes: Axes, a_photo: Array, at: Array, form: str
+) -> tuple[Array, Array]:
     """The criterion's rows (B, r) m at offsets (B, L), and their derivatives (B, r, L).
 
     printed: differences of consecutive photographs of a station, C_2 as [A] 14 has it. corrected
@@ -183,7 +191,7 @@ def universal_axes(
 
     count = np.maximum(seen.sum(axis=0), 5)
     start = np.zeros((len(u), u.shape[2], 4))
-    x, variance = _beside_drawing(rows, start, count, WIDE * tolerance)
+    x, variance = _beside_drawing(rows, start, count, TORSION_NOISE_TOLERANCES * tolerance)
     x, _ = _beside_drawing(rows, x, count, tolerance, variance)
     return _tilted(drawn[0], x[..., :2])[0], _tilted(drawn[1], x[..., 2:])[0]
 
@@ -193,7 +201,7 @@ def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
     tangents = tangent_basis(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
     moved = axis + (tangents @ x[..., None])[..., 0]
     size = np.sqrt(dot(moved, moved))[..., None]
-    return moved / size, across(moved / size) @ tangents / size[..., None]
+    return moved / size, across_directions(moved / size) @ tangents / size[..., None]
 
 
 def _beside_drawing(
@@ -220,9 +228,9 @@ def _beside_drawing(
         right = (normal @ x[..., None])[..., 0] - np.einsum("bkli,bkl->bli", jac, value)
         along = (vectors.mT @ right[..., None])[..., 0]
         # directions that the data do not know at all stay as drawn even without noise
-        hold = noise / tolerance**2 + ROUNDING * values[..., -1] + 1e-300
+        hold = noise / tolerance**2 + ROUNDED_INFORMATION_SHARE * values[..., -1] + 1e-300
         share = values / (values + hold[..., None])
         before, x = x, (vectors @ (along / (values + hold[..., None]))[..., None])[..., 0]
-        if np.max(np.abs(x - before), initial=0.0) < SETTLED:
+        if np.max(np.abs(x - before), initial=0.0) < TORSION_SETTLED:
             break
     return x, noise

@@ -38,16 +38,16 @@ from pkmcal.mechanisms import Machine
 from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Values, minimise, take
 
-TURN = 0.03
+DRAWN_POSE_TURN_SIGMA = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""
-SHIFT = 0.02
+DRAWN_POSE_SHIFT_SHARE = 0.02
 """The same of positions, as a share of the limbs' length: 10 mm of half a metre."""
-ROUNDS = 4
-UNKNOWN = 0.3
+HAND_EYE_ROUNDS = 4
+UNKNOWN_CAMERA_TURN = 0.3
 """Standard deviation (rad) of the camera's turn above which the poses do not tell it."""
-LEAST = 3
+LEAST_PAIR_CONFIGURATIONS = 3
 """Configurations that a station and a mount need together."""
-RANKS = (1, 2, 4)
+HAND_EYE_RANKS = (1, 2, 4)
 
 
 class Pair(NamedTuple):
@@ -130,9 +130,16 @@ def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
     body, seen = (np.concatenate([part] * n) for part in (body, seen))
-    problem = PairProblem(body, seen, np.ones(body.shape[:2]), TURN, SHIFT * size, size)
+    problem = PairProblem(
+        body,
+        seen,
+        np.ones(body.shape[:2]),
+        DRAWN_POSE_TURN_SIGMA,
+        DRAWN_POSE_SHIFT_SHARE * size,
+        size,
+    )
     apart = np.zeros(body.shape[:2])
-    for _ in range(ROUNDS):
+    for _ in range(HAND_EYE_ROUNDS):
         every = minimise(problem, every).state
         apart = np.linalg.norm(problem.differences(every), axis=-1)
         # weights that fall beyond the poses' usual disagreement, after Cauchy
@@ -152,7 +159,7 @@ def _check_told(problem: PairProblem, pair: Pair) -> None:
     # as loose as a full turn where nothing tells
     normal = normal + np.diag(np.tile(np.repeat([0.1, 1e-3 / problem.size], 3) ** 2, 2))
     turn = np.linalg.inv(normal)[:, :3, :3]
-    if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN:
+    if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN_CAMERA_TURN:
         raise ResultError(
             what="the boards' poses do not tell how the camera stands to the machine",
             found="configurations along a line, or all alike",
@@ -180,7 +187,7 @@ def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
     laid = quaternion(register(body[..., :3, 3], seen[..., :3, 3])[..., :3, :3])
     along = u.mT @ laid[..., None]
     out: list[tuple[Array, Array]] = []
-    for rank in RANKS:
+    for rank in HAND_EYE_RANKS:
         kept = along * (np.arange(4) < rank)[:, None]
         camera, mount = u @ kept, vt.mT @ kept
         out.append((from_quaternion(camera[..., 0]), from_quaternion(mount[..., 0])))
@@ -210,7 +217,7 @@ def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
     right = seen[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
     off_rot = (rot - rot.mean(axis=1, keepdims=True)).reshape(len(body), -1, 3)
     off = (right - right.mean(axis=1, keepdims=True)).reshape(len(body), -1, 1)
-    normal = off_rot.mT @ off_rot + SHIFT**2 * np.eye(3)
+    normal = off_rot.mT @ off_rot + DRAWN_POSE_SHIFT_SHARE**2 * np.eye(3)
     t_mount = np.linalg.solve(normal, off_rot.mT @ off)
     t_camera = right.mean(axis=1) - (rot.mean(axis=1) @ t_mount)[..., 0]
     return Pair(pose(camera, t_camera), pose(mount, t_mount[..., 0]))
@@ -234,7 +241,8 @@ def start_from_poses(
     if lost.size:
         raise InputError(
             what=f"nothing ties station {lost[0] + 1} of {n_stations} to the machine",
-            expected=f"a board on the platform in {LEAST} configurations, a board that another"
+            expected=f"a board on the platform in {LEAST_PAIR_CONFIGURATIONS} configurations, a"
+            f" board that another"
             " station also sees, or a rough pose",
             next_step="give the station's pose: in session.yaml",
         )
@@ -282,7 +290,7 @@ def _carried_on(
             pair, count = np.unique(
                 [seen.station[fit], seen.mount[fit]], axis=1, return_counts=True
             )
-            if count.max(initial=0) < LEAST:
+            if count.max(initial=0) < LEAST_PAIR_CONFIGURATIONS:
                 return stations, mounts
             s, m = pair[:, np.argmax(count)]
             rows = good & (seen.station == s) & (seen.mount == m)

@@ -26,7 +26,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
-from pkmcal.identify.rows import PERFECT
+from pkmcal.identify.rows import PERFECT_CLOSURE_SIGMA
 from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
@@ -34,19 +34,19 @@ from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
-from pkmcal.solver.elimination import Linear, eliminate, stacked
+from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
 
-Form = Literal["joint", "implicit"]
-PRINTED = 1e-4
+PoseFitForm = Literal["joint", "implicit"]
+UNWHITENED_ROW_SIGMA = 1e-4
 """Metres (and radians) that count as one standard deviation where rows are not whitened; it only
 sets where the search stops."""
-ROUNDS = 2
+WHITENING_ROUNDS = 2
 """Whitening again, at the solution: it changes by a thousandth after the second."""
-MOST_STEPS = 100
-PLACED = 0.1
+MOST_POSE_FIT_STEPS = 100
+PLACEMENT_PRIOR_SIGMA = 0.1
 """How well stations and mounts are known before any data, rad and m: far less than a drawing."""
-RANK_TOLERANCE = 1e-8
+POSE_FIT_RANK_TOLERANCE = 1e-8
 """Singular values of the scaled Jacobian below this share of the largest are zero: with exact
 derivatives at data without noise, rounding leaves 1e-12."""
 
@@ -103,7 +103,7 @@ class ImplicitProblem:
     n_mounts: int
     T_camera_board: Array
     readings: Array
-    form: Form
+    form: PoseFitForm
     weigh: Array
     prior: Array
     keep: Booleans
@@ -155,7 +155,7 @@ class ImplicitProblem:
         internal = state.internal if self.layout.n_internal else None
         readings = self.readings
         if self.form == "joint":
-            readings = kinematics.inverse(self.layout, theta, own.pose)
+            readings = kinematics.readings_at_poses(self.layout, theta, own.pose)
         c = closure(self.layout, theta, readings, own.pose, internal)
         scale = np.ones(c.rows.value.shape)
         value = c.rows.value
@@ -179,7 +179,7 @@ class ImplicitProblem:
         slope = (rows.scale * rows.closure.by_reading)[..., None] * self.layout.of_motor
         e = slope.shape[-2]
         covariance[..., :e, :e] += joint_noise**2 * (slope @ slope.mT)
-        covariance[..., :e, :e] += PERFECT**2 * np.eye(e) * rows.scale[..., None] ** 2
+        covariance[..., :e, :e] += PERFECT_CLOSURE_SIGMA**2 * np.eye(e) * rows.scale[..., None] ** 2
         return np.linalg.inv(np.linalg.cholesky(covariance))
 
     def platform_poses(self, state: ImplicitState) -> Array:
@@ -192,7 +192,7 @@ class ImplicitProblem:
         Ranks are told there: at the data, noise makes what cannot be told look faintly known.
         """
         poses = self.platform_poses(state)
-        readings = kinematics.inverse(self.layout, self.theta(state)[:, None], poses)
+        readings = kinematics.readings_at_poses(self.layout, self.theta(state)[:, None], poses)
         readings = np.where(np.isfinite(readings), readings, self.readings)
         seen = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
         return replace(self, T_camera_board=seen, readings=readings)
@@ -264,7 +264,9 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
         "implicit",
     )
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)
-    fit = fit_poses(machine, problem, state, noise, measurements.joint_noise, use_drawing=True)
+    fit = fit_machine_to_poses(
+        machine, problem, state, noise, measurements.joint_noise, use_drawing=True
+    )
     return _session_state(machine, measurements, start, fit)
 
 
@@ -274,7 +276,7 @@ def pose_problem(
     T_camera_board: Array,
     readings: Array,
     start: State,
-    form: Form,
+    form: PoseFitForm,
 ) -> tuple[ImplicitProblem, ImplicitState]:
     """The problem of B runs on the measurements' stations and mounts, unweighted, and its start.
 
@@ -304,7 +306,9 @@ def pose_problem(
         T_camera_board=T_camera_board,
         readings=readings,
         form=form,
-        weigh=np.diag(np.repeat([1 / PRINTED, 0.0], [layout.n_equations, off]))[None, None],
+        weigh=np.diag(np.repeat([1 / UNWHITENED_ROW_SIGMA, 0.0], [layout.n_equations, off]))[
+            None, None
+        ],
         prior=np.zeros((0, z.shape[-1])),
         keep=np.ones(z.shape[-1] + 6 * (n_stations + n_mounts), dtype=bool),
     )
@@ -321,7 +325,7 @@ def pose_problem(
     return problem, state
 
 
-def fit_poses(
+def fit_machine_to_poses(
     machine: Machine,
     problem: ImplicitProblem,
     start: ImplicitState,
@@ -342,12 +346,12 @@ def fit_poses(
         problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
     keep, rank = unknowns_kept(machine, problem, state, whitened=noise is not None)
     problem = replace(problem, keep=keep)
-    solution = minimise(problem, state, max_steps=MOST_STEPS)
+    solution = minimise(problem, state, max_steps=MOST_POSE_FIT_STEPS)
     if noise is not None:
-        for _ in range(ROUNDS):
+        for _ in range(WHITENING_ROUNDS):
             state, steps = solution.state, solution.steps
             problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
-            solution = minimise(problem, state, MOST_STEPS)
+            solution = minimise(problem, state, MOST_POSE_FIT_STEPS)
             solution = replace(solution, steps=steps + solution.steps)
     return PoseFit(problem, solution, rank)
 
@@ -397,8 +401,8 @@ def unknowns_kept(
     """
     first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     linear = first.ideal(begin).linearize(begin)
-    jac = stacked(linear, eliminate(linear))[0][0]
-    sizes = np.full(problem.unknowns.count, PLACED)
+    jac = rows_on_shared(linear, eliminate(linear))[0][0]
+    sizes = np.full(problem.unknowns.count, PLACEMENT_PRIOR_SIGMA)
     sizes[problem.unknowns.machine] = machine.parameters.tolerances_free()
     keep = np.ones(len(sizes), dtype=bool)
     rank, _ = _loose(jac, sizes)
@@ -416,7 +420,7 @@ def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
     extreme = np.abs(jac).max(axis=0)
     extreme = np.where(extreme > 0, extreme, 1.0)
     s, vt = np.linalg.svd(jac / extreme)[1:]
-    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+    rank = int(np.sum(s > POSE_FIT_RANK_TOLERANCE * s[0]))
     return rank, vt[rank:] / (extreme * sizes)
 
 

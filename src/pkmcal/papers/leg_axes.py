@@ -21,7 +21,7 @@ from pkmcal.mechanisms.closure import joint_values
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
-REWEIGHTED = 3
+REVOLUTE_WEIGHT_ROUNDS = 3
 """Rounds of weighing a revolute axis's equations; the weights change little after the first."""
 ONE_PLANE = 1e-4
 """The same for a revolute axis: directions within 10 mrad of each other leave it to the noise."""
@@ -67,7 +67,7 @@ class Axes:
         )
 
 
-def across(u: Array) -> Array:
+def across_directions(u: Array) -> Array:
     """Projections I - u u^T (..., 3, 3) on the planes across unit directions (..., 3)."""
     return np.eye(3) - u[..., :, None] * u[..., None, :]
 
@@ -81,7 +81,7 @@ def nearest_points(
     equations that are not independent. u, point : (B, C, L, 3) in the frames of ``group``
     (C,). Returns A (B, G, L, 3) and (G, L) whether there are two directions.
     """
-    project = np.where(seen[..., None, None], across(u), 0.0)
+    project = np.where(seen[..., None, None], across_directions(u), 0.0)
     right = (project @ np.where(seen[..., None], point, 0.0)[..., None])[..., 0]
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
     normal = np.einsum("sc,bclij->bslij", of_group, project)
@@ -131,7 +131,7 @@ def revolute_axes(
         known = seen[..., None, None] & (size > 0)
         along = size * (u[..., :, None] * u[..., None, :])
         covariance = np.linalg.inv(np.where(known, information + along, np.eye(3)))
-        for _ in range(REWEIGHTED):
+        for _ in range(REVOLUTE_WEIGHT_ROUNDS):
             v = np.einsum("sc,bsli->bcli", of_group, vectors[..., 0])
             noise = dot(v, (covariance @ v[..., None])[..., 0])
             vectors = least_along(1 / np.maximum(noise, 1e-300))[1]
@@ -171,7 +171,7 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     total = np.einsum("kc,bcli->bkli", member, u)
     info = None
     if count.max(initial=0) > 1 or axes.information is not None:
-        info = across(axes.u) if axes.information is None else axes.information
+        info = across_directions(axes.u) if axes.information is None else axes.information
         info = np.where(axes.seen[..., None, None], back @ info @ rot, 0.0)
         info = np.einsum("kc,bclij->bklij", member, info)
         joined = np.linalg.eigh(info)[1][..., 0]

@@ -11,7 +11,7 @@ from pkmcal.geometry.rigid import skew
 from pkmcal.identify.gauge import centre_index, default_gauge
 from pkmcal.mechanisms import Machine
 
-UP = np.array([0.0, 0.0, 1.0])
+PLANAR_REVOLUTE_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class DrawnLegs:
     @property
     def directions(self) -> Array:
         """Directions on the base that photographs show, (D, 3): revolute axes, or the normal."""
-        return UP[None] if self.planar else self.base_axes[self.base_revolute]
+        return PLANAR_REVOLUTE_AXIS[None] if self.planar else self.base_axes[self.base_revolute]
 
     @property
     def framed(self) -> bool:
@@ -50,7 +50,7 @@ class DrawnLegs:
         return self.motion.shape[1] == 6 and bool(self.closing.all())
 
 
-def legs_of(machine: Machine) -> DrawnLegs:
+def legs_as_drawn(machine: Machine) -> DrawnLegs:
     """The machine's joints as its drawing has them."""
     layout, drawing = machine.layout, machine.parameters.drawing
     base, platform = (drawing[index] for index in centre_index(layout))

@@ -20,15 +20,17 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
-Method = Literal["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
+RegressionMethod = Literal[
+    "plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"
+]
 
-TRIPLES = 500
+RANDOM_EDGE_TRIPLES = 500
 """Random triples: with 35 % wrong edges a clean one is among them but for 1 case in 10^69."""
-RESIDUALS = 2**22
+RESIDUALS_SORTED_TOGETHER = 2**22
 """Residuals that are sorted together, 32 MB."""
-HUBER, TUKEY = 1.345, 4.685
+HUBER_TUNING, TUKEY_TUNING = 1.345, 4.685
 """95 % efficiency for normal residuals."""
-KEPT = 0.05
+COUNTED_TUKEY_WEIGHT = 0.05
 """Tukey's weight from which an edge counts fully afterwards: a clean one may lose most of its own.
 """
 POORLY_FIXED = 1e-7
@@ -48,7 +50,7 @@ class LinearCentres:
     weights: Array
 
 
-def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
+def weighted_solution(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
     """Weighted least squares of [B] 14: A (..., 3) and inverse normal matrix (..., 3, 3).
 
     n : (..., n, 3). radius, weight : (..., n). NaN where A is not fixed.
@@ -69,7 +71,7 @@ def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
     )
 
 
-def residuals(n: Array, radius: Array, a: Array) -> Array:
+def edge_plane_residuals(n: Array, radius: Array, a: Array) -> Array:
     """N . A + R, (..., n) m: how far A lies from each edge's plane moved in by the radius."""
     return (n @ a[..., None])[..., 0] + radius
 
@@ -85,12 +87,12 @@ def scale_of(r: Array, present: Array) -> Array:
 
 def huber_weights(x: Array) -> Array:
     """Huber's weights of residuals in standard deviations."""
-    return HUBER / np.maximum(np.abs(x), HUBER)
+    return HUBER_TUNING / np.maximum(np.abs(x), HUBER_TUNING)
 
 
 def tukey_weights(x: Array) -> Array:
     """Tukey's biweight of residuals in standard deviations; 0 from 4.685."""
-    return np.where(np.abs(x) < TUKEY, (1 - (x / TUKEY) ** 2) ** 2, 0.0)
+    return np.where(np.abs(x) < TUKEY_TUNING, (1 - (x / TUKEY_TUNING) ** 2) ** 2, 0.0)
 
 
 def reweighted(
@@ -103,10 +105,10 @@ def reweighted(
     """
     weights_of = huber_weights if kind == "huber" else tukey_weights
     a, inverse, w = start, np.zeros((*start.shape, 3)), present
-    sigma = scale_of(residuals(n, radius, start), present)[..., None]
+    sigma = scale_of(edge_plane_residuals(n, radius, start), present)[..., None]
     for _ in range(30):
-        w = present * weights_of(residuals(n, radius, a) / sigma)
-        new, inverse = weighted(n, radius, w)
+        w = present * weights_of(edge_plane_residuals(n, radius, a) / sigma)
+        new, inverse = weighted_solution(n, radius, w)
         step = np.max(np.abs(np.nan_to_num(new - a)), initial=0.0)
         a = new
         if step < 1e-10:
@@ -128,7 +130,7 @@ def least_median(
     of its tube: in metres half of all edges are outliers to the other half. And A = 0, where wrong
     edges drive a solution, has residuals without bound.
     """
-    shape = (*present.shape[:-1], TRIPLES, 3)
+    shape = (*present.shape[:-1], RANDOM_EDGE_TRIPLES, 3)
     count = np.sum(present > 0, axis=-1)[..., None, None]
     order = np.argsort(present <= 0, axis=-1, kind="stable")
     draw = np.minimum((rng.random(shape) * count).astype(int), np.maximum(count - 1, 0))
@@ -143,11 +145,11 @@ def least_median(
     half = np.minimum((count[..., 0] + 3) // 2, present.shape[-1] - 1)
     cost = np.empty(a.shape[:-1])
     # a residual of every edge for every triple: of thousands of photographs, leg after leg
-    each = max(RESIDUALS // (TRIPLES * max(present.shape[-1], 1)), 1)
+    each = max(RESIDUALS_SORTED_TOGETHER // (RANDOM_EDGE_TRIPLES * max(present.shape[-1], 1)), 1)
     every = a, n, np.broadcast_to(radius, present.shape), present
     a_of, n_of, radius_of, present_of = (x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every)
     half_of = half.reshape(-1, 1)
-    flat = cost.reshape(-1, TRIPLES)
+    flat = cost.reshape(-1, RANDOM_EDGE_TRIPLES)
     for first in range(0, len(flat), each):
         some = slice(first, first + each)
         r = np.abs(a_of[some] @ n_of[some].mT + radius_of[some, None])
@@ -175,10 +177,10 @@ def errors_in_variables(
     for _ in range(8):
         spread = (covariance @ a[..., None, :, None])[..., 0]
         sigma = np.sqrt(np.maximum(dot(a[..., None, :], spread), 1e-300))
-        r = residuals(n, radius, a) / sigma
+        r = edge_plane_residuals(n, radius, a) / sigma
         jac = (n - (r / sigma)[..., None] * spread) / sigma[..., None]
         # the step solves jac . da = -r, which is [B] 14 with other rows
-        step, inverse = weighted(jac, r, weight)
+        step, inverse = weighted_solution(jac, r, weight)
         a = a + step
     return a, inverse
 
@@ -186,7 +188,7 @@ def errors_in_variables(
 def centres(
     machine: Machine,
     measurements: Measurements,
-    method: Method = "robust",
+    method: RegressionMethod = "robust",
     rng: np.random.Generator | None = None,
 ) -> LinearCentres:
     """All base centres seen by all stations, [B] 14, with the machine's present radii.
@@ -213,23 +215,23 @@ def centres(
     n, present, radius = (padded(x) for x in (edges.normal, np.ones(len(edges)), radii))
     noise = padded(edges.basis @ edges.covariance @ edges.basis.mT)
     rng = np.random.default_rng(0) if rng is None else rng
-    a, weight, covariance = solve(n, radius, present, noise, method, rng)
+    a, weight, covariance = solve_regressions(n, radius, present, noise, method, rng)
     shape = (measurements.n_stations, machine.n_legs)
     return LinearCentres(
         a.reshape(*shape, 3), covariance.reshape(*shape, 3, 3), weight[group, place]
     )
 
 
-def solve(
+def solve_regressions(
     n: Array,
     radius: Array,
     present: Array,
     noise: Array,
-    method: Method,
+    method: RegressionMethod,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
     """One method on many systems: A, weights, covariance (see :func:`centres`)."""
-    a, inverse = weighted(n, radius, present)
+    a, inverse = weighted_solution(n, radius, present)
     w = present
     if method in ("least-median", "robust"):
         told = noise if method == "robust" else None
@@ -246,10 +248,10 @@ def solve(
         a, w, inverse = reweighted(n, radius, present, a, method)
     if method in ("errors-in-variables", "robust"):
         # a clean edge may lose most of its Tukey weight; count it fully, a wrong one not at all
-        w = np.where(w > KEPT, 1.0, 0.0) * present
+        w = np.where(w > COUNTED_TUKEY_WEIGHT, 1.0, 0.0) * present
         a, covariance = errors_in_variables(n, radius, noise, w, a)
         return a, w, covariance
-    sigma = scale_of(residuals(n, radius, a), present)
+    sigma = scale_of(edge_plane_residuals(n, radius, a), present)
     return a, w, inverse * sigma[..., None, None] ** 2
 
 

@@ -27,22 +27,25 @@ from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.assembly import SHIFT_SIGMA
 from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE, common_shading
 from pkmcal.identify.gauge import centre_index
-from pkmcal.identify.robust import TAIL, clean_norm
+from pkmcal.identify.robust import CLEAN_TAIL_SHARE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear
-from pkmcal.solver.search import FULL, NONE, final_weights
+from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
 
-STEPS, ROUNDS = 30, 30
+MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
 """Most Gauss-Newton steps with given variances, and most rounds of variances."""
-SETTLED = 1e-6
+PREDICTED_MOVE_SETTLED = 1e-6
 """The last step moves what the rows predict by no more than this part of what they miss."""
-FEW = 5.0
+FEW_FREEDOMS_FOR_NOISE = 5.0
 """Degrees of freedom, without more of which nothing is said of the noise."""
-BUNDLE = "Use the joint method (bundle), which is the default"
-ONE = FULL / float(clean_norm(TAIL, np.ones((), dtype=int)))
-"""Factor on one residual's size, so that as many clean ones lie beyond FULL as of pairs."""
+USE_DEFAULT_METHOD = "Use the joint method (bundle), which is the default"
+ONE_RESIDUAL_FACTOR = FULL_WEIGHT_DISTANCE / float(
+    clean_norm(CLEAN_TAIL_SHARE, np.ones((), dtype=int))
+)
+"""Factor on one residual's size, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE as of
+pairs."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +81,18 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     """
     system = _system(machine, measurements)
     now = system.start
-    weight, scale = final_weights(_distance(system, now) * ONE) * system.used, LEAST_SCALE
+    weight, scale = (
+        final_weights(_distance(system, now) * ONE_RESIDUAL_FACTOR) * system.used,
+        LEAST_SCALE,
+    )
     shading = np.full(system.unknowns.n_lines, SHIFT_SIGMA)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_VARIANCE_ROUNDS):
         now, half = _solved(system, now, weight, scale, shading)
         residual, jac = _rows(system, now)
         # the noise scale makes chi2 equal its degrees of freedom, as in the joint estimate
         freedom = np.sum(weight) - np.sum(weight[:, None] * (jac @ half) ** 2) / scale**2
         before = weight, scale, shading
-        if freedom > FEW:
+        if freedom > FEW_FREEDOMS_FOR_NOISE:
             scale = float(np.sqrt(np.sum(weight * residual**2) / freedom))
             scale = max(scale, LEAST_SCALE)
         if shading.size:
@@ -94,7 +100,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             told = np.sum(half[lines] ** 2, axis=1) / shading**2
             shift = now.shifts[system.unknowns.n_cameras :]
             shading = common_shading(shift[None], told[None], shading[None], SHADING_SIGMA)[0]
-        weight = final_weights(np.abs(residual) / scale * ONE) * system.used
+        weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)
         if max(change, abs(scale / before[1] - 1) / 1e-3) < 1:
@@ -173,7 +179,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
         raise ResultError(
             "[B]'s linear method is for legs that turn about points of the base",
             found=f"mechanism {machine.name!r} with joints on cranks or slides",
-            next_step=BUNDLE,
+            next_step=USE_DEFAULT_METHOD,
         )
     edges = measurements.edges
     alone = linear.centres(machine, measurements, "robust")
@@ -182,7 +188,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
         raise ResultError(
             "[B]'s linear method needs three legs, each in two directions, at every station",
             found=f"{known.sum(axis=1).min()} legs at one of them",
-            next_step=BUNDLE,
+            next_step=USE_DEFAULT_METHOD,
         )
     n_cameras = measurements.n_cameras
     camera = np.asarray(measurements.camera_of_station)[edges.station]
@@ -233,7 +239,9 @@ def _registered(system: _System, centres: Array, known: Booleans) -> _System:
             trial = start.T_camera_base.copy()
             trial[s] = register(drawing[there], a[there])
             far = _distance(system, start._replace(T_camera_base=trial))
-            cost = np.sum(np.minimum(far, NONE)[system.used & (edges.station == s)] ** 2)
+            cost = np.sum(
+                np.minimum(far, NO_WEIGHT_DISTANCE)[system.used & (edges.station == s)] ** 2
+            )
             if cost < least[s]:
                 best[s], least[s] = trial[s], cost
     start = start._replace(T_camera_base=best)
@@ -291,7 +299,7 @@ def _solved(
     beliefs = np.zeros((len(prior), u.count))
     beliefs[np.arange(len(prior)), system.believed] = 1 / prior
     root = np.sqrt(weight)[:, None] / scale
-    for _ in range(STEPS):
+    for _ in range(MOST_GAUSS_NEWTON_STEPS):
         value, by = _rows(system, state)
         rows = np.concatenate([by * root, beliefs])
         right = np.concatenate([value * root[:, 0], np.append(state.z, state.shifts) / prior])
@@ -300,10 +308,10 @@ def _solved(
         half = np.linalg.inv(r) / size[:, None]
         step = -half @ (q.T @ right)
         state = state.moved(step, u)
-        if np.linalg.norm(q.T @ right) < SETTLED * max(1.0, np.linalg.norm(right)):
+        if np.linalg.norm(q.T @ right) < PREDICTED_MOVE_SETTLED * max(1.0, np.linalg.norm(right)):
             return state, half
     raise ResultError(
         "[B]'s equations of all legs together found no solution",
-        found=f"steps that had not settled after {STEPS}",
-        next_step=BUNDLE,
+        found=f"steps that had not settled after {MOST_GAUSS_NEWTON_STEPS}",
+        next_step=USE_DEFAULT_METHOD,
     )

@@ -23,21 +23,25 @@ from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.papers import Method
+from pkmcal.papers import PaperMethod
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import inverse_kinematic
 from pkmcal.papers.linear_together import base_together
-from pkmcal.solver.search import NONE
+from pkmcal.solver.search import NO_WEIGHT_DISTANCE
 
 Repeated = Literal["four-step", "inverse-kinematic"]
-REPETITIONS = 60
+SIGMA_REPETITIONS = 60
 """Repetitions for the standard deviations: they are then known to 9 %."""
 
 
 def by_paper(
-    method: Method, machine: Machine, measurements: Measurements, joint: Estimate, seed: int = 0
+    method: PaperMethod,
+    machine: Machine,
+    measurements: Measurements,
+    joint: Estimate,
+    seed: int = 0,
 ) -> Estimate:
     """An estimate by one of the papers' methods on the same edges.
 
@@ -51,7 +55,7 @@ def by_paper(
     rng = np.random.default_rng(seed)
     repeats: list[State] = []
     failed: list[ResultError] = []
-    for _ in range(REPETITIONS):
+    for _ in range(SIGMA_REPETITIONS):
         try:
             repeats.append(_solve(method, machine, _noisy(measurements, rng), guess))
         except ResultError as error:
@@ -144,7 +148,7 @@ def _estimate(
     distance = np.sqrt(np.sum(edges**2, axis=-1))
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
-    weight = (distance < NONE * scale).astype(float)
+    weight = (distance < NO_WEIGHT_DISTANCE * scale).astype(float)
     if trust is not None:
         weight, scale = trust
     poses = assembled.places.poses.taken(unweighted.poses[0])

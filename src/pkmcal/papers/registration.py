@@ -22,16 +22,17 @@ from pkmcal.geometry.rigid import dot, nearest_rotation, perturb, pose, register
 from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Solution, Values, minimise
 
-SCALE = 1e-4
+REGISTRATION_UNIT_SIGMA = 1e-4
 """Metres that count as one standard deviation; it only sets where the search stops."""
-LOOSE = 1e-4
+LOOSE_ITEMS_EIGENVALUE = 1e-4
 """Eigenvalue below which a body's items count as loose, of 1 for an item that one frame holds:
 a shape error is then seen a hundredth of its size."""
 ANY_MOTION = np.eye(6)
-"""Motion (6, d) of a free body; columns as in :data:`pkmcal.mechanisms.document.MOTIONS`."""
+"""Motion (6, d) of a free body; columns as in
+:data:`pkmcal.mechanisms.document.MOTION_DIRECTIONS`."""
 
 
-class Body(NamedTuple):
+class RegisteredBody(NamedTuple):
     """Items (B, n, 3) and the poses (B, K, 4, 4) that map them to the frames they are seen in."""
 
     points: Array
@@ -53,22 +54,22 @@ class BodyProblem:
     shifts: Array
     motion: Array
 
-    def residuals(self, state: Body) -> Values:
+    def residuals(self, state: RegisteredBody) -> Values:
         """Weighted differences, (B, K, 3 n), and the gauge's rows."""
         rot, shift = state.poses[..., None, :3, :3], state.poses[..., None, :3, 3]
         turned = (rot @ state.points[:, None, :, :, None])[..., 0]
-        w = np.sqrt(self.weight)[..., None] / SCALE
+        w = np.sqrt(self.weight)[..., None] / REGISTRATION_UNIT_SIGMA
         value = (turned + self.shifts[:, None] * shift - self.measured) * w
         value = np.where(w > 0, value, 0.0).reshape(*value.shape[:2], -1)
         held = (state.points - self.drawing).reshape(len(value), -1) @ self.gauge.T
-        return Values(value, held / SCALE)
+        return Values(value, held / REGISTRATION_UNIT_SIGMA)
 
-    def linearize(self, state: Body) -> Linear:
+    def linearize(self, state: RegisteredBody) -> Linear:
         """Residuals and exact Jacobian."""
         shape, n = self.measured.shape, self.measured.shape[2]
         rot = state.poses[..., None, :3, :3]
         turned = (rot @ state.points[:, None, :, :, None])[..., 0]
-        w = np.sqrt(self.weight)[..., None] / SCALE
+        w = np.sqrt(self.weight)[..., None] / REGISTRATION_UNIT_SIGMA
         by_shared = np.zeros((*shape, n, 3))
         j = np.arange(n)
         by_shared[:, :, j, :, j, :] = np.moveaxis(
@@ -85,13 +86,13 @@ class BodyProblem:
             by_own.reshape(*rows, 6) @ self.motion,
             np.ones(rows, dtype=bool),
             values.shared_value,
-            self.gauge / SCALE,
+            self.gauge / REGISTRATION_UNIT_SIGMA,
         )
 
-    def moved(self, state: Body, shared: Array, own: Array) -> Body:
+    def moved(self, state: RegisteredBody, shared: Array, own: Array) -> RegisteredBody:
         """The body after a step."""
         poses = perturb(state.poses, own @ self.motion.T)
-        return Body(state.points + shared.reshape(state.points.shape), poses)
+        return RegisteredBody(state.points + shared.reshape(state.points.shape), poses)
 
     def select(self, runs: Integers) -> BodyProblem:
         """Some runs only."""
@@ -106,7 +107,7 @@ def fit_body(
     *,
     directions: int = 0,
     motion: Array = ANY_MOTION,
-) -> Body:
+) -> RegisteredBody:
     """The body and its poses from what was seen; [A] 9 and 16 corrected.
 
     measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not seen; a frame that leaves its
@@ -117,11 +118,13 @@ def fit_body(
     measured = np.where(weight[..., None] > 0, measured, 0.0)
     points = np.broadcast_to(drawing, (measured.shape[0], *drawing.shape)).copy()
     shifts = (np.arange(len(drawing)) < len(drawing) - directions).astype(float)
-    start = Body(points, laid(points[:, None], measured, weight, directions, motion))
+    start = RegisteredBody(
+        points, poses_laying_items(points[:, None], measured, weight, directions, motion)
+    )
     return minimise(BodyProblem(measured, weight, gauge, drawing, shifts, motion), start).state
 
 
-def laid(
+def poses_laying_items(
     items: Array, measured: Array, weight: Array, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Array:
     """Poses (..., 4, 4) within ``motion`` that lay items (..., n, 3) on what was seen.
@@ -169,11 +172,11 @@ def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY
     mask = np.repeat(seen, 3, axis=1)[:, :, None]
     # an orthonormal basis of each frame's motions; those that it does not see count as nothing
     u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
-    u = u * (s > LOOSE * np.sqrt(len(items)))[:, None, :]
+    u = u * (s > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items)))[:, None, :]
     normal = np.sum(np.eye(len(own)) * mask - u @ u.mT, axis=0)
     rigid = np.linalg.qr(own)[0]
     values, vectors = np.linalg.eigh(normal + rigid @ rigid.T)
-    return vectors[:, values < LOOSE].reshape(len(items), 3, -1)
+    return vectors[:, values < LOOSE_ITEMS_EIGENVALUE].reshape(len(items), 3, -1)
 
 
 def parts_of(
@@ -190,7 +193,7 @@ def parts_of(
     stay = []
     for frame in seen:
         mask = np.repeat(frame, 3)
-        held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE)[0]
+        held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE_ITEMS_EIGENVALUE)[0]
         rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
         stay.append(rate < 0.05 * rate.max())
     first = next((s for s in stay if not s.all()), np.zeros(len(items), dtype=bool))
@@ -206,7 +209,7 @@ def fixes_pose(
     """Frames (K,) whose own items, seen (K, n), fix their pose of the body."""
     own = _own_motions(items, directions, motion)
     s = np.linalg.svd(own * np.repeat(seen, 3, axis=1)[:, :, None], compute_uv=False)
-    return s[:, -1] > LOOSE * np.sqrt(len(items))
+    return s[:, -1] > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items))
 
 
 def _own_motions(items: Array, directions: int, motion: Array) -> Array:
@@ -279,7 +282,9 @@ def points_by(
         held = (x - drawing.ravel()) @ gauge.T
         by_gauge = np.broadcast_to(gauge, (len(x), *gauge.shape))
         jac = np.concatenate([jac.reshape(*value.shape, drawing.size), by_gauge], axis=1)
-        return np.concatenate([value, held], axis=1) / SCALE, jac / SCALE
+        return np.concatenate(
+            [value, held], axis=1
+        ) / REGISTRATION_UNIT_SIGMA, jac / REGISTRATION_UNIT_SIGMA
 
     start = np.broadcast_to(drawing.ravel(), (n_runs, drawing.size)).copy()
     return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)

@@ -24,21 +24,21 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.rows import turn_jacobian
 from pkmcal.measurements import PoseSet
-from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 from pkmcal.papers.measured_platform import taken
 
 Turning = Literal["none", "one axis", "any"]
-TURNS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
+TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
 """By how many turns a machine's motion has."""
-LEAST_TURN = np.radians(10.0)
+LEAST_PAIR_TURN = np.radians(10.0)
 """Turns (rad) between two poses below which their axis is left out: noise grows as 1 / turn."""
-DOUBT = 1e-3
+DROPPED_HYPOTHESIS_CHANCE = 1e-3
 """Probability below which a hypothesis is dropped: one honest session in a thousand."""
-SLACK = 2.0
+KEPT_CHI2_A_FREEDOM = 2.0
 """chi2 per degree of freedom up to which a hypothesis is kept all the same: the noise of a pose out
 of a photograph is itself known to some 40 % only (lens, print, shading)."""
-STEPS = 10
-MOST_PAIRS = 200_000
+ROTATION_AXIS_STEPS = 10
+MOST_TURN_PAIRS = 200_000
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ class RotationAxis:
     @property
     def tenable(self) -> bool:
         """Whether noise, or noise a little larger than stated, explains what is off."""
-        return self.p_value >= DOUBT or self.chi2 <= SLACK * self.dof
+        return (
+            self.p_value >= DROPPED_HYPOTHESIS_CHANCE or self.chi2 <= KEPT_CHI2_A_FREEDOM * self.dof
+        )
 
     @property
     def sentence(self) -> str:
@@ -93,7 +95,7 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
     """
     from scipy.special import chdtrc
 
-    hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
+    hypothesis = TURNING_BY_FREEDOMS[int(MOTION_DIRECTIONS[motion][:3].any(axis=1).sum())]
     rot = poses.T_station_target[:, :3, :3]
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)[:, :3, :3]
     if hypothesis == "any":
@@ -148,7 +150,7 @@ def facing(direction: Array) -> Array:
 def _about_one(rot: Array, noise: Array) -> tuple[Array, Array]:
     """Tilts (N, 2) from one axis and their covariance, by maximum likelihood."""
     frames = axis_frames(rot)
-    for _ in range(STEPS):
+    for _ in range(ROTATION_AXIS_STEPS):
         off, by, own, covariance = _tilts(rot, noise, frames)
         # camera turns by its own x, y; the board by the axis' x, y: what they do to the tilts
         jac = np.concatenate([-by[..., :2], -(by @ own)[..., :2]], axis=-1)
@@ -167,7 +169,7 @@ def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Arra
     """
     back = frames.camera.mT
     own = back @ rot @ frames.board.mT
-    found = taken(MOTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
+    found = taken(MOTION_DIRECTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
     by = found.off_by[..., :3]
     return found.off, by, own, by @ back @ noise @ frames.camera @ by.mT
 
@@ -176,7 +178,7 @@ def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
     """Turns (N, 3) from the weighted mean orientation, and their covariance."""
     mean = nearest_rotation(rot.mean(axis=0))
     weight = np.linalg.inv(noise)
-    for _ in range(STEPS):
+    for _ in range(ROTATION_AXIS_STEPS):
         off = rotation_vector(rot @ mean.T)
         total = np.sum(weight @ off[..., None], axis=0)
         mean = rotation(np.linalg.solve(weight.sum(axis=0), total)[:, 0]) @ mean
@@ -194,7 +196,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     i, j = _pairs(len(rot))
     turn = rotation_vector(rot[j] @ rot[i].mT)
     angle = np.sqrt(dot(turn, turn))
-    used = angle > LEAST_TURN
+    used = angle > LEAST_PAIR_TURN
     if used.sum() < 2:
         return np.nan, np.nan
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]
@@ -220,8 +222,8 @@ def _pairs(n: int) -> tuple[Integers, Integers]:
     """
     first, total = np.arange(n), n * (n - 1) // 2
     before = first * (2 * n - first - 1) // 2
-    if total > MOST_PAIRS:
-        number = np.linspace(0, total - 1, MOST_PAIRS).astype(int)
+    if total > MOST_TURN_PAIRS:
+        number = np.linspace(0, total - 1, MOST_TURN_PAIRS).astype(int)
     else:
         number = np.arange(total)
     i = np.searchsorted(before, number, side="right") - 1

@@ -12,11 +12,11 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.session.schema import Body
+from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.placement import (
-    INSIDE,
-    PANORAMIC,
+    PANORAMIC_HALF_VIEW,
+    READING_RANGE_SHARES,
     StationPlace,
     draw_configurations,
     fitting_distance,
@@ -24,15 +24,15 @@ from pkmcal.simulation.placement import (
     view_angle,
 )
 
-AROUND = 12
+CAMERA_PLACES_A_RING = 12
 """Places of a camera on a ring round the machine."""
-RINGS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
+CAMERA_RING_HEIGHTS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
 """Heights of the rings, of the line of sight above the ground."""
-NEAR = 0.12
+NEIGHBOUR_RANGE_SHARE = 0.12
 """Part of a motor's range by which a configuration is moved when it is bettered."""
-NEIGHBOURS = 6
+NEIGHBOURS_TRIED_EACH = 6
 """Configurations that are tried about each chosen one."""
-DRAWN = 3
+DRAWN_FOR_EACH_WANTED = 3
 """Configurations drawn for each one wanted: others are singular, folded, or legs touch."""
 
 
@@ -62,18 +62,21 @@ def neighbours(
     machine: Machine, chosen: Configurations, rng: np.random.Generator
 ) -> Configurations:
     """Configurations about chosen ones, as many as the machine can take of some about each."""
-    joints = np.repeat(chosen.joints, NEIGHBOURS, axis=0)
-    poses = np.repeat(chosen.T_base_platform, NEIGHBOURS, axis=0)
+    joints = np.repeat(chosen.joints, NEIGHBOURS_TRIED_EACH, axis=0)
+    poses = np.repeat(chosen.T_base_platform, NEIGHBOURS_TRIED_EACH, axis=0)
     low, high = machine.joint_ranges.T
     if np.isfinite(machine.joint_ranges).all():
-        step = NEAR * (high - low)
-        ends = low + INSIDE[0] * (high - low), low + INSIDE[1] * (high - low)
+        step = NEIGHBOUR_RANGE_SHARE * (high - low)
+        ends = (
+            low + READING_RANGE_SHARES[0] * (high - low),
+            low + READING_RANGE_SHARES[1] * (high - low),
+        )
         wanted = np.clip(joints + rng.uniform(-1, 1, joints.shape) * step, *ends)
         found = machine.forward_result(wanted, poses)
         poses = found.T_base_platform[found.converged]
     else:
         size = float(np.ptp(chosen.T_base_platform[:, :3, 3], axis=0).max())
-        unit = np.array([NEAR] * 3 + [NEAR * size] * 3)
+        unit = np.array([NEIGHBOUR_RANGE_SHARE] * 3 + [NEIGHBOUR_RANGE_SHARE * size] * 3)
         motion = machine.layout.motion
         delta = rng.uniform(-1, 1, (len(poses), 6)) * unit @ motion @ motion.T
         moved = on_manifold(machine.layout, machine.values, perturb(poses, delta))
@@ -85,13 +88,15 @@ def neighbours(
     return Configurations(joints[good], poses[good])
 
 
-def places(machine: Machine, camera: Camera, board: Body | None = None) -> tuple[StationPlace, ...]:
+def camera_ring_places(
+    machine: Machine, camera: Camera, board: BoardBody | None = None
+) -> tuple[StationPlace, ...]:
     """Places of a camera on a sphere about the machine, from which it just fills the picture.
 
     board : whether there has to be room for one. Raises InputError for a camera that looks all
     round: it sees the legs best from their middle.
     """
-    if view_angle(camera) > PANORAMIC:
+    if view_angle(camera) > PANORAMIC_HALF_VIEW:
         raise InputError(
             what="a camera that looks all round sees the legs best from their middle, so no place"
             " round the machine is looked for",
@@ -101,8 +106,10 @@ def places(machine: Machine, camera: Camera, board: Body | None = None) -> tuple
     centre, radius = ball_of(legs_space(machine))
     away = fitting_distance(machine, camera, board) * radius
     out: list[StationPlace] = []
-    for k, height in enumerate(RINGS):
-        for azimuth in 2 * np.pi * (np.arange(AROUND) + 0.5 * (k % 2)) / AROUND:
+    for k, height in enumerate(CAMERA_RING_HEIGHTS):
+        for azimuth in (
+            2 * np.pi * (np.arange(CAMERA_PLACES_A_RING) + 0.5 * (k % 2)) / CAMERA_PLACES_A_RING
+        ):
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             way = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
             out.append(StationPlace(_tuple(centre + away * way), _tuple(centre)))

@@ -25,22 +25,22 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.planning.information import CandidateRows
 
-TRIED = 24
+CANDIDATES_TRIED_EXACTLY = 24
 """Candidates that are tried exactly; the others are farther by what the index' slope promises."""
-PASSES = 12
+EXCHANGE_ROUNDS = 12
 """Rounds of exchanges; they end before, as a rule after three."""
-SAME = 0.1
+LEAST_READING_DIFFERENCE = 0.1
 """Part of its range by which some motor's reading differs at least between two configurations that
 one group measures. A photograph taken twice shows the same shading before the same background: its
 errors are the same, however often it is counted.
 """
-GAIN = 1e-6
+EXCHANGE_GAIN_ROUNDING = 1e-6
 """Relative gain below which an exchange is rounding."""
-UNSEEN = 1e-6
+LEAST_DIRECTION_INFORMATION = 1e-6
 """CandidateRows, in tolerances^-2, that a direction has at least for the logarithm of O1: a drawing
 knows it a million times better."""
 
-Told = Callable[[float], None]
+ToldShare = Callable[[float], None]
 
 
 class Index(Protocol):
@@ -119,7 +119,7 @@ class O1Index:
     def value(self, covariance: Array) -> Array:
         """-log of the geometric mean of the singular values."""
         told = np.linalg.eigvalsh(np.linalg.inv(covariance)) - 1.0
-        return -0.5 * np.log(np.maximum(told, UNSEEN)).mean(axis=-1)
+        return -0.5 * np.log(np.maximum(told, LEAST_DIRECTION_INFORMATION)).mean(axis=-1)
 
     def size(self, value: float, _p: int, /) -> float:
         """In tolerances."""
@@ -128,7 +128,7 @@ class O1Index:
     def slope(self, covariance: Array) -> Array:
         """By C, through its inverse."""
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance))
-        told = np.maximum(values - 1.0, UNSEEN)
+        told = np.maximum(values - 1.0, LEAST_DIRECTION_INFORMATION)
         return vectors * (values / np.sqrt(2 * len(values) * told))
 
 
@@ -137,7 +137,7 @@ def _tool(info: CandidateRows) -> Index:
     return ToolIndex(np.einsum("kap,kaq->pq", shift, shift, optimize=True) / len(shift))
 
 
-INDICES: Mapping[str, Callable[[CandidateRows], Index]] = {
+PLAN_INDICES: Mapping[str, Callable[[CandidateRows], Index]] = {
     "tool": _tool,
     "D": lambda _: DIndex(),
     "E": lambda _: EIndex(),
@@ -161,7 +161,7 @@ class Greedy(NamedTuple):
     path: Array
 
 
-def greedy(info: CandidateRows, count: int, index: Index, told: Told | None = None) -> Greedy:
+def greedy(info: CandidateRows, count: int, index: Index, told: ToldShare | None = None) -> Greedy:
     """``count`` candidates of each group, the best next one of each group in turn.
 
     Each group has ``count`` candidates or more. told : called with the share done.
@@ -184,14 +184,14 @@ def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
     work, now = _Work(info, index), [int(c) for c in chosen]
     work.begin(now)
     value = float(index.value(work.machine))
-    for _ in range(PASSES):
+    for _ in range(EXCHANGE_ROUNDS):
         for k, old in enumerate(now):
             work.add(old, -1.0)
             now[k] = work.best(int(info.group[old]), now[:k] + now[k + 1 :])
             work.add(now[k], 1.0)
         work.begin(now)  # without the rounding of so many steps
         before, value = value, float(index.value(work.machine))
-        if before - value <= GAIN * abs(value):
+        if before - value <= EXCHANGE_GAIN_ROUNDING * abs(value):
             break
     return np.array(now)
 
@@ -241,12 +241,12 @@ class _Work:
         free = np.ones(end - begin, dtype=bool)
         free[own - begin] = False
         apart = np.abs(self._where[begin:end, None] - self._where[own]).max(axis=-1)
-        new = free & (apart >= SAME).all(axis=1)
+        new = free & (apart >= LEAST_READING_DIFFERENCE).all(axis=1)
         free = new if new.any() else free
         rows = self._rows[begin:end]  # a view: copies of all would cost more than the sums
         first = (rows.reshape(-1, rows.shape[-1]) @ to_slope).reshape(len(rows), -1)
         gain = np.where(free, np.einsum("nk,nk->n", first, first), -1.0)
-        top = np.argsort(-gain, kind="stable")[: min(TRIED, int(free.sum()))]
+        top = np.argsort(-gain, kind="stable")[: min(CANDIDATES_TRIED_EXACTLY, int(free.sum()))]
         rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT
@@ -254,6 +254,6 @@ class _Work:
         after = now - moved.mT @ np.linalg.solve(inner, moved)
         value = self._index.value(after)
         # while some direction is told nothing, the largest eigenvalue is the same whatever comes
-        alike = value <= value.min() + GAIN * np.abs(value.min())
+        alike = value <= value.min() + EXCHANGE_GAIN_ROUNDING * np.abs(value.min())
         spread = np.where(alike, after.trace(axis1=1, axis2=2), np.inf)
         return int(begin + top[np.argmin(spread)])

@@ -25,23 +25,23 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 
-FIRST = 3
+FIRST_PHOTOGRAPHS_A_STATION = 3
 """Photographs of a station that are looked at closely: what people take before the long capture."""
-MEASURED = 6
+FIRST_PHOTOGRAPHS_MEASURED = 6
 """Photographs of all stations together whose edges are measured: a hexapod shows forty edges of
 each kind in them, enough for their scatter to be known to a tenth."""
-FEWEST_EDGES = 24
+FEWEST_FIRST_EDGES = 24
 """Edges without which nothing is told: one photograph of a hexapod shows as many."""
-OWN = 2.0
+SHARED_EDGES_WEIGHT = 2.0
 """Edges that all of a kind at a station count for beside the leg's own, so that chance among three
 photographs does not make a leg."""
-MOSTLY = 0.5
+EXPECTED_EDGE_FREE_SHARE = 0.5
 """Part of an edge that has to be free for it to be expected: its place is fitted to as much."""
-EXACT = EdgeNoise(1e-3, 1e-3)
+EXACT_EDGE_NOISE = EdgeNoise(1e-3, 1e-3)
 """px; errors of edges that are simulated for where they lie, and how they turn by a pixel."""
 SAME_LENGTH = 0.01
 """Part of its length by which an edge may differ, and be as long: where all are."""
-SEED = 7
+FIRST_EDGES_SEED = 7
 
 
 class EdgePool(NamedTuple):
@@ -101,12 +101,16 @@ class FirstEdges:
     edges: tuple[EdgesOf, ...]
 
 
-def spread_over(configuration: Integers, n_stations: int = 1, most: int = FIRST) -> Integers:
+def spread_over(
+    configuration: Integers, n_stations: int = 1, most: int = FIRST_PHOTOGRAPHS_A_STATION
+) -> Integers:
     """Numbers of the few of a station's photographs that are measured, of different configurations
     and spread over all. configuration : (n,) of its photographs. most : of each station, and of all
-    together as many times more as MEASURED is of FIRST.
+    together as many times more as FIRST_PHOTOGRAPHS_MEASURED is of FIRST_PHOTOGRAPHS_A_STATION.
     """
-    most = min(most, -(-most * MEASURED // (FIRST * n_stations)))
+    most = min(
+        most, -(-most * FIRST_PHOTOGRAPHS_MEASURED // (FIRST_PHOTOGRAPHS_A_STATION * n_stations))
+    )
     first = np.sort(np.unique(configuration, return_index=True)[1])
     return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
 
@@ -132,7 +136,7 @@ def first_edges(
     ]
 
     def measurements(edges: EdgeSet) -> Measurements:
-        if len(edges) < FEWEST_EDGES:
+        if len(edges) < FEWEST_FIRST_EDGES:
             raise ResultError("too few edges to tell what others will give", found=len(edges))
         return Measurements(
             edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
@@ -176,8 +180,8 @@ def _told(
         state.T_camera_base,
         tuple(p.camera for p in few),
         state.T_base_platform,
-        EXACT,
-        np.random.default_rng(SEED),
+        EXACT_EDGE_NOISE,
+        np.random.default_rng(FIRST_EDGES_SEED),
         photographs=pairs,
     )
 
@@ -192,7 +196,7 @@ def _told(
     length = np.ptp(ideal.span, axis=1)
     longest = np.zeros(n_edges)
     np.maximum.at(longest, place(ideal)[2], length)
-    whole[place(ideal)] = length > MOSTLY * longest[place(ideal)[2]]
+    whole[place(ideal)] = length > EXPECTED_EDGE_FREE_SHARE * longest[place(ideal)[2]]
     kept[place(edges.select(estimate.edge_weights > 0.5))] = True
     kept &= expected
     unit = np.zeros((*shape, 2, 2))
@@ -234,7 +238,7 @@ def _pools(told: Array, length: Array, expected: Booleans, kind: Integers, shadi
         alike = np.all(kind == kind[e], axis=1)
         mine, like = expected[:, e], expected[:, alike]
         weight = np.concatenate(
-            [np.ones(mine.sum()), np.full(like.sum(), OWN / max(like.sum(), 1))]
+            [np.ones(mine.sum()), np.full(like.sum(), SHARED_EDGES_WEIGHT / max(like.sum(), 1))]
         )
         out.append(
             EdgePool(
@@ -250,8 +254,9 @@ def _pools(told: Array, length: Array, expected: Booleans, kind: Integers, shadi
 def drawn_edges(
     machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
 ) -> EdgeSet:
-    """Edges with :data:`EXACT` errors that tell as much as such edges did, drawn at random; those
-    that tell nothing go. Without ``rng`` each tells what such an edge does on average.
+    """Edges with :data:`EXACT_EDGE_NOISE` errors that tell as much as such edges did, drawn at
+    random; those that tell nothing go. Without ``rng`` each tells what such an edge does on
+    average.
     """
     tubes = tubes_of(machine)
     own, length = np.zeros((len(edges), 2, 2)), pixel_lengths(edges)
@@ -281,7 +286,7 @@ def pixel_turns(edges: EdgeSet) -> Array:
 
     The Cholesky factor of their covariance: their bases have the shift first.
     """
-    return np.linalg.cholesky(edges.covariance) / EXACT.shift
+    return np.linalg.cholesky(edges.covariance) / EXACT_EDGE_NOISE.shift
 
 
 def pixel_lengths(edges: EdgeSet) -> Array:

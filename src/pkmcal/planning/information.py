@@ -33,14 +33,14 @@ from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
-from pkmcal.planning.route import spans
+from pkmcal.planning.route import motor_spans
 from pkmcal.solver.elimination import eliminate
 from pkmcal.wording import listed
 
-PLACE = 1.0
+UNMEASURED_PLACE_SIGMA = 1.0
 """m and rad; how well the place of a station, or a board, is known at least: before any
 measurement, so that every choice has a covariance. A photograph tells a thousand times more."""
-FLOOR = 1e-12
+DIRECTION_VARIANCE_FLOOR = 1e-12
 """Variance, in tolerances squared, of what a calibration holds exactly: an axis' own length."""
 
 
@@ -151,7 +151,7 @@ def information_of(
     share = 1.0 if wanted is None or each < 2 else min((wanted - 1) / (each - 1), 1.0)
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
-    way, u = directions(machine, problem), problem.unknowns
+    way, u = machine_directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
     rows[assembled.seen] = reduced  # of what shows nothing, nothing is told
@@ -160,7 +160,7 @@ def information_of(
         prior = prior[~prior[:, u.machine].any(axis=1)]
     total = prior.T @ prior
     for part in (u.stations, u.mounts):
-        total[part, part] += np.eye(part.stop - part.start) / PLACE**2
+        total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_PLACE_SIGMA**2
     if known is not None:
         at, told = _told_by(known, machine, problem, rig.T_station_base, way)
         total[np.ix_(at, at)] += told
@@ -169,7 +169,7 @@ def information_of(
     return CandidateRows(
         rows=rows,
         group=candidates.group,
-        where=joints / spans(joints, machine.joint_ranges),
+        where=joints / motor_spans(joints, machine.joint_ranges),
         known=total,
         machine=directed,
         work=tool_by_free(rig, problem, machine.inverse(work), work) @ way.to_z,
@@ -193,7 +193,7 @@ def _check_seen(rig: Rig, candidates: Candidates, measurements: Measurements) ->
     )
 
 
-def directions(machine: Machine, problem: Problem) -> Directions:
+def machine_directions(machine: Machine, problem: Problem) -> Directions:
     """The machine's directions at its present values."""
     tolerance = machine.parameters.tolerances_free()
     moves = move_generators(machine.layout, machine.values) @ conventions(machine)
@@ -226,7 +226,7 @@ def _told_by(
     moved = moved / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
     spread = to_free @ known.covariance @ to_free.T + moved @ moved.T
     values, vectors = np.linalg.eigh(spread / np.outer(size, size))
-    half = vectors / np.sqrt(np.maximum(values, FLOOR)) / size[:, None]
+    half = vectors / np.sqrt(np.maximum(values, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
     columns = u.stations.start + 6 * kept[:, None] + np.arange(6)
     at = np.concatenate([np.arange(u.n_free), columns.ravel()])
     return at, half @ half.T

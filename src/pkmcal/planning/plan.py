@@ -19,42 +19,47 @@ from pkmcal.calibration.saved import Known
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
-from pkmcal.planning.candidates import Configurations, configurations, neighbours, places
-from pkmcal.planning.exchange import INDICES, Told, exchanged, greedy
+from pkmcal.planning.candidates import (
+    Configurations,
+    camera_ring_places,
+    configurations,
+    neighbours,
+)
+from pkmcal.planning.exchange import PLAN_INDICES, ToldShare, exchanged, greedy
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
-from pkmcal.planning.route import distances, length, shortest_way
+from pkmcal.planning.route import length, motor_distances, shortest_way
 from pkmcal.planning.subject import Subject
 from pkmcal.simulation.placement import StationPlace, usable
 
-CAPTURE = 15
+CONFIGURATIONS_A_CAPTURE = 15
 """Configurations from each place, unless told."""
-CANDIDATES = 400
+PLAN_CANDIDATES = 400
 """Configurations among which is chosen."""
-WIDER = 4
+CANDIDATES_FOR_EACH_WANTED = 4
 """Of these for each one wanted, at least."""
 AT_WORK = 60
 """Poses of the workspace at which the tool counts."""
-BETTERED = 8
+BETTERING_ROUNDS = 8
 """Rounds, at most, in which the chosen configurations are moved."""
-GAINING = 0.01
+LEAST_ROUND_GAIN = 0.01
 """Part of the deviation that a round has to gain for another one."""
 FOR_PLACES = 24
 """Configurations by which places of a camera are compared."""
-RANDOM = 10
+RANDOM_PLANS_COMPARED = 10
 """Choices by chance that a plan is compared with."""
-TIMES = (2, 4)
+CAPTURE_MULTIPLES_TOLD = (2, 4)
 """How many times as many photographs are told as well."""
-PAYS = 0.01
+WORTHWHILE_ACCURACY_GAIN = 0.01
 """Part of its standard deviation by which one more configuration from each place has to better the
 tool to be worth it: the hundredth that a hundred others would add up to."""
-BETWEEN = 8
+POSES_BETWEEN_CONFIGURATIONS = 8
 """Poses looked at on the way from one configuration to the next."""
-REROUTED = 5
+REROUTING_ATTEMPTS = 5
 """Times that another way is looked for where one is blocked."""
-LETTERS = "abcdefghijklmnopqrstuvwxyz"
+CONFIGURATION_NAME_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 """First letters of new configurations' names, one a group of stations."""
-SEED = 0
+PLAN_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -119,31 +124,31 @@ class MeasurementPlan:
     @property
     def pays_until(self) -> float | None:
         """Configurations from each place after which one more betters the tool by less than
-        :data:`PAYS`; None where all of those planned pay.
+        :data:`WORTHWHILE_ACCURACY_GAIN`; None where all of those planned pay.
         """
         for before, after in pairwise(self.curve):
             each = 1 - (after.position / before.position) ** (1 / (after.count - before.count))
-            if each < PAYS and after.count <= self.promised.count:
+            if each < WORTHWHILE_ACCURACY_GAIN and after.count <= self.promised.count:
                 return before.count
         return None
 
 
-def plan(
+def plan_measurements(
     subject: Subject,
     *,
-    count: int = CAPTURE,
+    count: int = CONFIGURATIONS_A_CAPTURE,
     index: str = "tool",
     region: Region | None = None,
     together: bool | None = None,
     free_places: int | None = None,
     best_of: int | None = None,
-    seed: int = SEED,
-    told: Told | None = None,
+    seed: int = PLAN_SEED,
+    told: ToldShare | None = None,
 ) -> MeasurementPlan:
     """The plan.
 
     count : configurations from each place; of all stations, where these measure together. index :
-    one of :data:`~pkmcal.planning.exchange.INDICES`. region : where the tool counts; the whole
+    one of :data:`~pkmcal.planning.exchange.PLAN_INDICES`. region : where the tool counts; the whole
     reach if absent. together : whether all stations measure every configuration; by default where
     they have cameras or trackers of their own. free_places : how many places of the camera to
     choose on a sphere about the machine. best_of : how many of the rig's stations to choose.
@@ -155,7 +160,9 @@ def plan(
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
-    drawn = configurations(rig.machine, max(CANDIDATES, WIDER * count), rng)
+    drawn = configurations(
+        rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
+    )
     told(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
@@ -173,9 +180,9 @@ def plan(
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
-    if index not in INDICES:
+    if index not in PLAN_INDICES:
         raise InputError(
-            "there is no such index", where="--index", found=index, expected=", ".join(INDICES)
+            "there is no such index", where="--index", found=index, expected=", ".join(PLAN_INDICES)
         )
     if count < 2:
         raise InputError(
@@ -232,20 +239,20 @@ class _Making:
         rig, work, known = self.rig, self.work, self.known
         return _Pool(candidates, information_of(rig, candidates, work, known, rng, self.count))
 
-    def chosen(self, pool: _Pool, rng: np.random.Generator, told: Told) -> Candidates:
+    def chosen(self, pool: _Pool, rng: np.random.Generator, told: ToldShare) -> Candidates:
         """The best of a pool, bettered about where they are."""
-        index = INDICES[self.index](pool.info)
+        index = PLAN_INDICES[self.index](pool.info)
         first = greedy(pool.info, self.count, index, lambda x: told(0.4 * x)).chosen
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
         size = np.inf
-        for k in range(BETTERED):
-            told(0.5 + 0.5 * k / BETTERED)
+        for k in range(BETTERING_ROUNDS):
+            told(0.5 + 0.5 * k / BETTERING_ROUNDS)
             pool, start = self._about(best, rng)
             chosen = np.sort(exchanged(pool.info, start, index))
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
             before, size = size, index.size(float(index.value(covariance)), len(covariance))
-            if size > (1 - GAINING) * before:
+            if size > (1 - LEAST_ROUND_GAIN) * before:
                 break
         return best
 
@@ -283,13 +290,15 @@ def _ordered(
     """The plan of what was chosen: in the order of the shortest way, with what it promises."""
     machine, count, groups = subject.rig.machine, made.count, made.groups
     # as good as such photographs turn out, one by one, not as they are on average
-    own = made.pool(found, np.random.default_rng(SEED)).info
-    index, every = INDICES[made.index](own), np.arange(len(found.group))
+    own = made.pool(found, np.random.default_rng(PLAN_SEED)).info
+    index, every = PLAN_INDICES[made.index](own), np.arange(len(found.group))
     nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
-    more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in TIMES]
+    more = [
+        _accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES_TOLD
+    ]
     by_chance, at_random = _by_chance(made, drawn, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
@@ -322,7 +331,9 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
     out: list[str] = []
     used = set(taken)
     for g in group.tolist():
-        letter = LETTERS[g % len(LETTERS)] * (1 + g // len(LETTERS))
+        letter = CONFIGURATION_NAME_LETTERS[g % len(CONFIGURATION_NAME_LETTERS)] * (
+            1 + g // len(CONFIGURATION_NAME_LETTERS)
+        )
         name = next(f"{letter}{n:02d}" for n in count_from(1) if f"{letter}{n:02d}" not in used)
         used.add(name)
         out.append(name)
@@ -331,12 +342,12 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
 
 def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
     """What configurations drawn evenly over the joints' ranges would give, mean of a few draws."""
-    index, n_groups = INDICES[made.index](drawn.info), len(made.groups)
+    index, n_groups = PLAN_INDICES[made.index](drawn.info), len(made.groups)
     n = len(drawn.info.group) // n_groups
     evenly = np.arange(n // 2, n)  # the first half are at the ends of the ranges
     count = min(made.count, len(evenly))
     found: list[tuple[float, float, float]] = []
-    for _ in range(RANDOM):
+    for _ in range(RANDOM_PLANS_COMPARED):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
         covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
         found.append((*drawn.info.tool(covariance), float(index.value(covariance))))
@@ -360,7 +371,7 @@ def _route(
     for g in range(len(found.groups)):
         rows = np.flatnonzero(found.group == g)
         joints, poses = found.joints[rows], found.T_base_platform[rows]
-        apart = distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
+        apart = motor_distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
         way, blocked = _free_way(machine, joints, poses, home, apart)
         order.append(rows[way])
         barred.append(blocked)
@@ -379,7 +390,7 @@ def _free_way(
     first = apart[-1, :-1].copy()
     way = shortest_way(apart[:-1, :-1], first, bars)
     blocked = _blocked(machine, joints[way], poses[way], home)
-    for _ in range(REROUTED):
+    for _ in range(REROUTING_ATTEMPTS):
         steps = np.flatnonzero(blocked[1:])
         if not len(steps) and not blocked[0]:
             break
@@ -394,13 +405,15 @@ def _free_way(
 def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
     """(n,) whether on the way to each, motors moving evenly, the machine is lost or legs touch."""
     before = np.concatenate([home[None], joints[:-1]])
-    share = (np.arange(BETWEEN) + 0.5)[:, None, None] / BETWEEN
+    share = (np.arange(POSES_BETWEEN_CONFIGURATIONS) + 0.5)[
+        :, None, None
+    ] / POSES_BETWEEN_CONFIGURATIONS
     between = (before + share * (joints - before)).reshape(-1, joints.shape[1])
-    found = machine.forward_result(between, np.tile(poses, (BETWEEN, 1, 1)))
+    found = machine.forward_result(between, np.tile(poses, (POSES_BETWEEN_CONFIGURATIONS, 1, 1)))
     good = found.converged.copy()
     at = np.flatnonzero(good)
     good[at] = usable(machine, found.T_base_platform[at], between[at])
-    return np.asarray(~good.reshape(BETWEEN, -1).all(axis=0))
+    return np.asarray(~good.reshape(POSES_BETWEEN_CONFIGURATIONS, -1).all(axis=0))
 
 
 # ------------------------------------------------------------------ places of the camera
@@ -449,7 +462,7 @@ def _with_places(
     same = np.zeros(len(roots), dtype=int)
     number = np.arange(len(roots), dtype=float)[:, None]  # no two places are the same
     whole = CandidateRows(roots, same, number, start, np.eye(len(start)), first.work)
-    rule = INDICES[index](whole)
+    rule = PLAN_INDICES[index](whole)
     wanted = free_places or best_of or 1
     best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
     tried = tuple(
@@ -485,7 +498,7 @@ def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
     """The rig's first camera at every place of a sphere, with what it sees there."""
     one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
     board = "platform" if isinstance(one, BoardFrom) else None
-    spots = places(rig.machine, one.camera, board)
+    spots = camera_ring_places(rig.machine, one.camera, board)
     T = np.stack([spot.T_camera_base() for spot in spots])
     mine = [other for other in rig.instruments if other.station == one.station]
     instruments = tuple(

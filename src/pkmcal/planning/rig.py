@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.boards.poses import LEAST_CORNERS, pose_set
+from pkmcal.boards.poses import LEAST_CORNERS_WEIGHED, pose_set
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
@@ -31,15 +31,15 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
-from pkmcal.planning.first import EXACT, SEED, EdgePool, Pools, drawn_edges
+from pkmcal.planning.first import EXACT_EDGE_NOISE, FIRST_EDGES_SEED, EdgePool, Pools, drawn_edges
 from pkmcal.simulation.edges import EdgeNoise, hidden, pixel_angle, simulate_edges
 
-EDGE = EdgeNoise().shift
+NOMINAL_EDGE_SIGMA = EdgeNoise().shift
 """px; how far an edge is off across, and its ends when it turns, before any photograph was looked
 at: what shading leaves on painted legs and bare rods. Polished ones are worse."""
-CORNER = 0.05
+NOMINAL_CORNER_SIGMA = 0.05
 """px; the same of a board's corner."""
-FLATTEST = np.cos(np.deg2rad(70))
+FLATTEST_BOARD_COSINE = np.cos(np.deg2rad(70))
 """Cosine of the angle between a board's normal and the line of sight below which it is not read."""
 
 
@@ -51,7 +51,7 @@ class At(NamedTuple):
     T_base_platform: Array
 
 
-def nominal_pools(machine: Machine, sigma: float = EDGE) -> Pools:
+def nominal_pools(machine: Machine, sigma: float = NOMINAL_EDGE_SIGMA) -> Pools:
     """Edges that are all found, sigma (px) off across and as much by turning."""
     one = EdgePool(np.eye(2)[None] / sigma**2, np.ones(1), np.ones(1))
     return (one,) * len(tubes_of(machine))
@@ -76,8 +76,8 @@ class LegsFrom:
             self.T_camera_base[None],
             self.camera,
             at.T_base_platform,
-            EXACT,
-            np.random.default_rng(SEED),
+            EXACT_EDGE_NOISE,
+            np.random.default_rng(FIRST_EDGES_SEED),
             photographs=pairs,
         )
         edges = drawn_edges(at.machine, edges, [self.pools], rng)
@@ -97,7 +97,7 @@ class BoardFrom:
     T_camera_base: Array
     points: Array
     T_platform_board: Array
-    sigma: float = CORNER
+    sigma: float = NOMINAL_CORNER_SIGMA
     mount: int = 0
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
@@ -109,7 +109,7 @@ class BoardFrom:
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
         by_pose = np.where(seen[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
-        enough = seen.sum(axis=1) >= LEAST_CORNERS
+        enough = seen.sum(axis=1) >= LEAST_CORNERS_WEIGHED
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 
@@ -119,7 +119,7 @@ class BoardFrom:
             seen = np.asarray(self.camera.in_image(self.camera.project(there)))
         # the print is on the side of the board's -z
         eye = inverse(T)[:, :3, 3] - self.points.mean(axis=0)
-        seen &= (-eye[:, 2] / np.linalg.norm(eye, axis=-1) > FLATTEST)[:, None]
+        seen &= (-eye[:, 2] / np.linalg.norm(eye, axis=-1) > FLATTEST_BOARD_COSINE)[:, None]
         machine, tubes = at.machine, tubes_of(at.machine)
         if not len(tubes):
             return seen

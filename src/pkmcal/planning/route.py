@@ -6,21 +6,21 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-MOST = 50
+ROUTE_CHANGES_A_POINT = 50
 """Changes a point at most; they end before, when none shortens the way."""
-LEAST = 1e-12
-LONGEST = 3
+ROUTE_GAIN_ROUNDING = 1e-12
+MOST_POINTS_MOVED_TOGETHER = 3
 """Points that are moved together."""
 
 
-def distances(joints: Array, ranges: Array) -> Array:
+def motor_distances(joints: Array, ranges: Array) -> Array:
     """(n, n) how long the slowest motor needs from each of the readings (n, m) to each, in parts of
     its range (m, 2).
     """
-    return np.abs((joints[:, None] - joints) / spans(joints, ranges)).max(axis=-1)
+    return np.abs((joints[:, None] - joints) / motor_spans(joints, ranges)).max(axis=-1)
 
 
-def spans(joints: Array, ranges: Array) -> Array:
+def motor_spans(joints: Array, ranges: Array) -> Array:
     """(m,) lengths of the motors' ranges (m, 2), or of what the readings (n, m) span where the file
     gives none.
     """
@@ -50,9 +50,9 @@ def shortest_way(
         order.append(int(rest[np.argmin(cost[order[-1], rest])]))
         left[order[-1]] = False
     way = np.array([*order, n])
-    for _ in range(MOST * n):
+    for _ in range(ROUTE_CHANGES_A_POINT * n):
         gain, better = max((_turned(way, cost), _moved(way, cost)), key=lambda found: found[0])
-        if gain < LEAST * cost.max():
+        if gain < ROUTE_GAIN_ROUNDING * cost.max():
             break
         way = better
     return way[1:-1]
@@ -79,7 +79,7 @@ def _moved(way: Integers, cost: Array) -> tuple[float, Integers]:
     """The best gain by moving a stretch of up to three points between two others."""
     found: list[tuple[float, int, int, int]] = []
     step = cost[way[:-1], way[1:]]
-    for size in range(1, min(LONGEST, len(way) - 3) + 1):
+    for size in range(1, min(MOST_POINTS_MOVED_TOGETHER, len(way) - 3) + 1):
         i = np.arange(1, len(way) - size)
         first, last = way[i], way[i + size - 1]
         without = step[i - 1] + step[i + size - 1] - cost[way[i - 1], way[i + size]]

@@ -19,8 +19,8 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
-from pkmcal.calibration.results import EVERYTHING
-from pkmcal.calibration.same_machine import read
+from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE
+from pkmcal.calibration.same_machine import read_same_machine
 from pkmcal.calibration.saved import Known, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
@@ -31,8 +31,8 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import Pools, first_edges, spread_over
 from pkmcal.planning.rig import (
-    CORNER,
-    EDGE,
+    NOMINAL_CORNER_SIGMA,
+    NOMINAL_EDGE_SIGMA,
     BoardFrom,
     Instrument,
     LegsFrom,
@@ -45,13 +45,13 @@ from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
-PHOTOGRAPHS = 12
+PLAN_PHOTOGRAPHS_A_STATION = 12
 """Of a station, whose edges are measured, and twice as many of all together: a plan is made once,
 and a few edges tell shading badly."""
-READING = 3e-6
+UNTOLD_READING_NOISE = 3e-6
 """m or rad; noise of a reading where nobody tells: of a good encoder."""
-BOARD = "board"
-LAST = "calibration"
+BOARD_MOUNT_NAME = "board"
+LAST_CALIBRATION_FOLDER = "calibration"
 """Where calibrate writes, inside a session."""
 
 
@@ -81,22 +81,26 @@ def as_it_stands(
     from_drawing: bool = False,
     same_place: bool = False,
     anywhere: bool = False,
-    edge: float = EDGE,
-    corner: float = CORNER,
+    edge: float = NOMINAL_EDGE_SIGMA,
+    corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
     """A session to be planned for, as far as it was measured.
 
     after : what is known already, the usable calibration in its folder unless given or
-    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.of_session`.
+    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.subject_of_session`.
     """
     saved: SavedCalibration | None = None
-    if after is None and not from_drawing and (session.folder / LAST / EVERYTHING).is_file():
-        after = load(session.folder / LAST)
+    if (
+        after is None
+        and not from_drawing
+        and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
+    ):
+        after = load(session.folder / LAST_CALIBRATION_FOLDER)
         if not after.verdict.usable:  # it says of itself not to be used
             after = None
     if after is not None:
-        saved, session = read(after, session)
+        saved, session = read_same_machine(after, session)
         if not saved.verdict.usable:
             raise InputError(
                 "this calibration should not be used, so no plan is made from it",
@@ -110,7 +114,7 @@ def as_it_stands(
             where="--same-place",
             expected="--after CALIBRATION, or a session with its calibration",
         )
-    return of_session(
+    return subject_of_session(
         session,
         saved,
         same_place=same_place,
@@ -128,9 +132,9 @@ def of_machine(
     *,
     board: Board | None = None,
     tracker: tuple[float, float | None] | None = None,
-    joint_noise: float = READING,
-    edge: float = EDGE,
-    corner: float = CORNER,
+    joint_noise: float = UNTOLD_READING_NOISE,
+    edge: float = NOMINAL_EDGE_SIGMA,
+    corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
     """Of a machine and the camera, or tracker, that somebody thinks of.
@@ -160,7 +164,7 @@ def of_machine(
         instruments = tuple(
             BoardFrom(s, camera, T, board.points, place, corner) for s, (camera, T) in placed
         )
-        mounts, T_mount = (Mount(BOARD, "platform", board.tolerance),), place[None]
+        mounts, T_mount = (Mount(BOARD_MOUNT_NAME, "platform", board.tolerance),), place[None]
         what = f"corners of the board to {corner:g} px, and its size to be exact"
     rig = Rig(
         machine,
@@ -211,14 +215,14 @@ def _tracked(machine: Machine, noise: tuple[float, float | None], joint_noise: f
 # ------------------------------------------------------------------ of a session
 
 
-def of_session(
+def subject_of_session(
     session: Session,
     saved: SavedCalibration | None = None,
     *,
     same_place: bool = False,
     anywhere: bool = False,
-    edge: float = EDGE,
-    corner: float = CORNER,
+    edge: float = NOMINAL_EDGE_SIGMA,
+    corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
     """Of a session: from its drawing, its first photographs, or an earlier calibration.
@@ -266,7 +270,7 @@ def _rig(
     seed: int,
 ) -> tuple[Rig, Board | None, list[str]]:
     """What a session's stations and trackers measure with, the board on the platform, and where the
-    noise is known from, in words. As :func:`of_session`; T_camera_base : (S, 4, 4).
+    noise is known from, in words. As :func:`subject_of_session`; T_camera_base : (S, 4, 4).
     """
     words: list[str] = []
     instruments: list[Instrument] = []
@@ -276,7 +280,7 @@ def _rig(
     board: Board | None = None
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
-        mounts.append(Mount(BOARD, "platform", board.tolerance))
+        mounts.append(Mount(BOARD_MOUNT_NAME, "platform", board.tolerance))
         T_mount.append(_board_place(session, board, saved, seen, T_camera_base, seed))
         sigma, told = _corner_noise(seen.boards, corner)
         words.append(told)
@@ -396,7 +400,10 @@ def _edge_noise(
     """What each station's edges tell, the shading, and where that comes from."""
     why = "no photograph tells it yet"
     if len(seen.photographs) == len(legs):
-        rows = [spread_over(p.configuration, len(legs), PHOTOGRAPHS) for p in seen.photographs]
+        rows = [
+            spread_over(p.configuration, len(legs), PLAN_PHOTOGRAPHS_A_STATION)
+            for p in seen.photographs
+        ]
         try:
             poses = platform_poses(session)
             first = first_edges(session, seen.photographs, rows, T_camera_base[legs], poses)
@@ -442,7 +449,7 @@ def _board_place(
     seed: int,
 ) -> Array:
     """T_platform_board (4, 4): as calibrated, as photographed, or where it would be seen best."""
-    known = _saved_target(saved, BOARD)
+    known = _saved_target(saved, BOARD_MOUNT_NAME)
     if known is not None:
         return known
     if seen.boards.stations:

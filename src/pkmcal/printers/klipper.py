@@ -20,15 +20,20 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.klipper import LINEAR, STEPPERS, homed, linear_motors
+from pkmcal.export.klipper import (
+    KLIPPER_LINEAR_FREEDOMS,
+    KLIPPER_STEPPERS,
+    homed,
+    klipper_carriage_heights,
+)
 from pkmcal.files import shown
-from pkmcal.printers.printer import LARGEST, STEP, Printer, Touches
+from pkmcal.printers.printer import CARRIAGE_STEP, LARGEST_PRINTER_VALUE, Printer, Touches
 
-SAVED = "#*#"
+SAVED_LINE_MARK = "#*#"
 _HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 FULL_STEPS = 200.0
 """Steps a turn of a motor whose section says nothing else, as in Klipper."""
-MOST_STEPS = 1e9
+MOST_CARRIAGE_STEPS = 1e9
 """From an end switch: kilometres of a carriage's way."""
 _SECTION = re.compile(r"\[\s*([^\]]+?)\s*\]")
 _ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=]\s*(.*)")
@@ -61,7 +66,7 @@ def printer(text: str, label: str) -> Printer:
     }
     each["angle"] = [
         _number(found, label, f"stepper_{s}", "angle", default)
-        for s, default in zip(STEPPERS, LINEAR.nominal, strict=True)
+        for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
     ]
     config = ConfigParser()
     config.read_dict(
@@ -69,7 +74,7 @@ def printer(text: str, label: str) -> Printer:
             "printer": {"kinematics": "delta", "delta_radius": repr(radius)},
             **{
                 f"stepper_{s}": {name: repr(values[k]) for name, values in each.items()}
-                for k, s in enumerate(STEPPERS)
+                for k, s in enumerate(KLIPPER_STEPPERS)
             },
         }
     )
@@ -85,10 +90,12 @@ def printer(text: str, label: str) -> Printer:
         rod=np.array(each["arm_length"]),
         homed=ends,
         reach=_number(found, label, "printer", "print_radius", radius),
-        carriages=partial(linear_motors, config),
+        carriages=partial(klipper_carriage_heights, config),
         offset=_probe(found, label),
         touches=_touches(found, label, ends),
-        step=max(_step(found, label, f"stepper_{s}") for s in STEPPERS) if stepped else STEP,
+        step=max(_step(found, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
+        if stepped
+        else CARRIAGE_STEP,
     )
 
 
@@ -97,7 +104,7 @@ def _check_saved(text: str, label: str) -> None:
     lines = [line.rstrip("\r") for line in text.rstrip().splitlines()]
     header = next((n for n, line in enumerate(lines) if _HEADER.match(line)), len(lines))
     for n, line in enumerate(lines):
-        marked = line == SAVED or line.startswith(SAVED + " ")
+        marked = line == SAVED_LINE_MARK or line.startswith(SAVED_LINE_MARK + " ")
         if marked == (n >= header):
             continue
         raise InputError(
@@ -107,10 +114,12 @@ def _check_saved(text: str, label: str) -> None:
             ),
             where=f"{label}, line {n + 1}",
             found=shown(line),
-            expected=f"'{SAVED} ' before each line below SAVE_CONFIG's header, and no other",
+            expected=f"'{SAVED_LINE_MARK} ' before each line below SAVE_CONFIG's header, and no"
+            f" other",
             next_step="Put the header back"
             if marked
-            else f"Put '{SAVED} ' before it, remove it if it is empty, or move it above the header;"
+            else f"Put '{SAVED_LINE_MARK} ' before it, remove it if it is empty, or move it"
+            f" above the header;"
             " then restart Klipper",
         )
 
@@ -118,8 +127,12 @@ def _check_saved(text: str, label: str) -> None:
 def sections(text: str, label: str) -> Sections:
     """What a configuration says; where SAVE_CONFIG wrote what stands above as well, that above."""
     lines = [(n, line.rstrip()) for n, line in enumerate(text.splitlines(), 1)]
-    own = [(n, line) for n, line in lines if not line.startswith(SAVED)]
-    saved = [(n, line.removeprefix(SAVED).strip()) for n, line in lines if line.startswith(SAVED)]
+    own = [(n, line) for n, line in lines if not line.startswith(SAVED_LINE_MARK)]
+    saved = [
+        (n, line.removeprefix(SAVED_LINE_MARK).strip())
+        for n, line in lines
+        if line.startswith(SAVED_LINE_MARK)
+    ]
     out: Sections = {}
     section = ""
     for n, line in (*saved, *own):
@@ -135,7 +148,7 @@ def sections(text: str, label: str) -> Sections:
 def _of_tower(found: Sections, label: str, k: int, name: str) -> float:
     """A tower's value; the second and the third have the first's unless they say otherwise."""
     first = _number(found, label, "stepper_a", name)
-    return _number(found, label, f"stepper_{STEPPERS[k]}", name, first)
+    return _number(found, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
 
 
 def _number(
@@ -156,7 +169,7 @@ def _number(
         value = float(text)
     except ValueError:
         value = np.nan
-    if not abs(value) <= LARGEST:
+    if not abs(value) <= LARGEST_PRINTER_VALUE:
         raise InputError(
             f"{name} is no number that a printer can have",
             where=where,
@@ -186,7 +199,7 @@ def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
     ]
     if not names:
         return None
-    way = np.array([_step(found, label, f"stepper_{s}") for s in STEPPERS])
+    way = np.array([_step(found, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
     heights = [_number(found, label, section, name) for name in names]
     steps = [_three(entries, label, f"{name}_pos") for name in names]
     origin = f"{label}, [{section}]"
@@ -225,7 +238,7 @@ def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[f
         values = [float(x) for x in text.split(",")]
     except ValueError:
         values = list[float]()
-    if len(values) != 3 or not all(abs(x) <= MOST_STEPS for x in values):
+    if len(values) != 3 or not all(abs(x) <= MOST_CARRIAGE_STEPS for x in values):
         raise InputError(
             f"{name} does not tell where the three motors were",
             where=where,

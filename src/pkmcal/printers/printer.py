@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from pkmcal.arrays import Array, short_repr
 
-STEP = 1 / 80
+CARRIAGE_STEP = 1 / 80
 """mm of a carriage a step: 200 full steps of 16, belts of 2 mm on 20 teeth, as on most printers."""
-LARGEST = 1e6
+LARGEST_PRINTER_VALUE = 1e6
 """mm, or degrees: what is larger is no printer's, and would overflow where it is squared."""
 
 
@@ -48,6 +48,6 @@ class Printer:
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
-    step: float = STEP
+    step: float = CARRIAGE_STEP
 
     __repr__ = short_repr

@@ -17,15 +17,15 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
+from pkmcal.export.delta import MM_A_METRE
 from pkmcal.files import read_csv, read_text
-from pkmcal.printers.printer import LARGEST, Printer, Touches
+from pkmcal.printers.printer import LARGEST_PRINTER_VALUE, Printer, Touches
 from pkmcal.wording import listed
 
-FEWEST = 7
+FEWEST_BED_POINTS = 7
 """Points that leave something to be known besides the bed's own height and tilt; DELTA_CALIBRATE
 probes as many."""
-MAP = "RepRapFirmware height map file"
-MM = 1e3
+HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _TRIGGERED = re.compile(rf"probe at {_NUMBER},{_NUMBER} is z={_NUMBER}")
 _CONTACT = re.compile(rf"probe: at {_NUMBER},{_NUMBER} bed will contact at z={_NUMBER}")
@@ -45,7 +45,7 @@ def read_touches(path: Path, printer: Printer) -> Touches:
     dx, dy, dz = printer.offset
     if text.startswith("configuration,"):
         points, heights = _table(path, label), 0.0
-    elif text.startswith(MAP):
+    elif text.startswith(HEIGHT_MAP_TITLE):
         points, heights = _map(text, label), 0.0
     elif found := _TRIGGERED.findall(text):
         points, heights = _together(np.array(found, dtype=float)), dz
@@ -63,7 +63,7 @@ def read_touches(path: Path, printer: Printer) -> Touches:
         )
     with np.errstate(all="ignore"):
         carriages = printer.carriages(points)
-    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST_PRINTER_VALUE).all(axis=1))
     if bad.size:
         x, y, z = points[bad[0]]
         raise InputError(
@@ -79,7 +79,7 @@ def _table(path: Path, label: str) -> Array:
     """A table's points, mm; heads without a unit are metres, as in every table."""
     table = read_csv(path, label=label, columns=("x", "y", "z"))
     table.check_kinds(["m", "m", "m"])
-    return MM * table.values[:, [table.columns.index(c) for c in "xyz"]]
+    return MM_A_METRE * table.values[:, [table.columns.index(c) for c in "xyz"]]
 
 
 def _together(points: Array) -> Array:

@@ -12,7 +12,7 @@ from pkmcal.printers import klipper, reprap
 from pkmcal.printers.printer import Printer
 
 
-def checked(printer: Printer) -> Printer:
+def buildable_delta(printer: Printer) -> Printer:
     """The printer; raises InputError where no such delta can be built."""
     if not 0 < printer.radius < printer.rod.min():
         raise InputError(
@@ -41,9 +41,9 @@ def read_printer(path: Path) -> Printer:
     label = path.name
     text = read_text(path)
     if klipper.is_one(text):
-        return checked(klipper.printer(text, label))
+        return buildable_delta(klipper.printer(text, label))
     if reprap.is_one(text):
-        return checked(reprap.printer(text, label))
+        return buildable_delta(reprap.printer(text, label))
     first = next((line.strip() for line in text.splitlines() if line.strip()), "an empty file")
     raise InputError(
         "this is neither a Klipper nor a RepRapFirmware configuration of a delta",

@@ -12,9 +12,14 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.reprap import NOMINAL, homed_carriages, linear_motors, read_words
+from pkmcal.export.reprap import (
+    REPRAP_TOWER_ANGLES,
+    homed_carriages,
+    read_words,
+    reprap_carriage_heights,
+)
 from pkmcal.files import shown
-from pkmcal.printers.printer import LARGEST, Printer
+from pkmcal.printers.printer import LARGEST_PRINTER_VALUE, Printer
 
 _M665 = re.compile(r"^\s*M665\b", re.MULTILINE)
 _OURS = re.compile(r"\s*M66[56]\b")
@@ -45,11 +50,11 @@ def printer(text: str, label: str) -> Printer:
         label=label,
         motors=("X", "Y", "Z"),
         radius=float(radius[0]),
-        angle=np.array(NOMINAL) + corrections,
+        angle=np.array(REPRAP_TOWER_ANGLES) + corrections,
         rod=rod,
         homed=ends,
         reach=float(reach[0]),
-        carriages=partial(linear_motors, filled),
+        carriages=partial(reprap_carriage_heights, filled),
     )
 
 
@@ -62,7 +67,7 @@ def _numbers(text: str, label: str) -> dict[str, Array]:
             found = read_words(line)
         except ValueError:
             found = {"": np.array([np.inf])}
-        if any(np.abs(values).max() > LARGEST for values in found.values()):
+        if any(np.abs(values).max() > LARGEST_PRINTER_VALUE for values in found.values()):
             raise InputError(
                 "a value of this line is no number that a printer can have",
                 where=f"{label}, line {n}",

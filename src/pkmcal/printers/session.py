@@ -10,18 +10,23 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import csv_text, parse_yaml, validate
+from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.mechanisms import MechanismDocument, checked_machine
-from pkmcal.printers.printer import STEP, Printer, Touches
-from pkmcal.printers.probed import FEWEST, read_touches
+from pkmcal.printers.printer import CARRIAGE_STEP, Printer, Touches
+from pkmcal.printers.probed import FEWEST_BED_POINTS, read_touches
 from pkmcal.printers.read import read_printer
-from pkmcal.session.starter import SQUARES, board_text, example_readings, session_texts, write_texts
+from pkmcal.session.starter import (
+    STARTER_SQUARE_CHOICES,
+    board_text,
+    example_readings,
+    session_texts,
+    write_texts,
+)
 from pkmcal.wording import count
 
-MM = 1e3
-MARGIN = 5.0
+CARRIAGE_MARGIN_BELOW = 5.0
 """mm that carriages may go below what the bed's edge needs: for beds that hang lower than said."""
-DRAWING = """\
+PRINTER_DRAWING_TEXT = """\
 # {name}, a linear delta, by the values in {label}. A firmware knows only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
 # nozzle. Readings are the carriages' heights by these values, their range ends at the end switches.
@@ -34,7 +39,7 @@ home: {{position: [0, 0, {home} mm]}}
 # Rods measured to 0.1 mm, hole to hole, tell the more of sizes along x and y.
 tolerance: {{center: 1 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
 """
-LEG = """\
+PRINTER_LEG_TEXT = """\
   - base:
       joint: slider
       center: [{x} mm, {y} mm, 0]
@@ -42,7 +47,7 @@ LEG = """\
       range: [{low} mm, {high} mm]
     platform: {{joint: spherical, center: [0, 0, 0]}}
     length: {{actuated: false, constant: {rod} mm}}"""
-CARRIED = """\
+CARRIED_BOARD_SESSION_TEXT = """\
 # A calibration session of a delta printer, by a camera and a board that its tool carries.
 #
 # What to do, in this order:
@@ -68,18 +73,18 @@ joints:
 #   New belts.
 
 """
-WHERE = {
+WHERE_CARRIAGES_STAND = {
     "Klipper": "what Klipper's\n#                          GET_POSITION tells behind stepper:",
     "RepRapFirmware": "what M114\n#                          tells behind Count, divided by M92",
 }
-FIRMWARE = """\
+FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that go as far as it says.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
 """
-HELD = """\
+PLATFORM_FIXED_TEXT = """\
 fixed: ["legs[*].platform.center"]
 """
-SESSION = """\
+PROBED_SESSION_TEXT = """\
 # The bed of a delta printer, felt at {n} points; where they come from: {origin}.
 # pkmcal calibrate, and then pkmcal export --to {to}.
 pkmcal: 1
@@ -125,26 +130,30 @@ def write_printer_session(
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     """The files of a session with a board on the tool, to fill in."""
     texts = session_texts("linear-delta", "board", places)
-    drawing = drawing_text(printer) + HELD
+    drawing = drawing_text(printer) + PLATFORM_FIXED_TEXT
     document = parse_yaml(drawing, Path("mechanism.yaml"))
-    machine = checked_machine(validate(document, MechanismDocument), document)
+    machine = checked_machine(validated_document(document, MechanismDocument), document)
     heads = [f"{motor} [mm]" for motor in printer.motors]
     # corners stay within the print radius where the tool goes half as far: room is beside no tower
     square = int(printer.reach / np.hypot(7, 5))
-    head = CARRIED.format(
-        where=WHERE[printer.program], reach=_mm(printer.reach), **_resolution(printer)
+    head = CARRIED_BOARD_SESSION_TEXT.format(
+        where=WHERE_CARRIAGES_STAND[printer.program],
+        reach=_mm(printer.reach),
+        **_resolution(printer),
     )
     session = texts["session.yaml"]
     texts["session.yaml"] = head + session[session.index("# One entry") :]
     texts["mechanism.yaml"] = drawing
     texts["joints.csv"] = example_readings(machine, heads)
-    texts["board.yaml"] = board_text(min(max(square, SQUARES[0]), SQUARES[-1]))
+    texts["board.yaml"] = board_text(
+        min(max(square, STARTER_SQUARE_CHOICES[0]), STARTER_SQUARE_CHOICES[-1])
+    )
     return texts
 
 
 def _resolution(printer: Printer) -> dict[str, str]:
     """How well a carriage is known, in words: no finer than motors hold their steps."""
-    step = max(printer.step, STEP)
+    step = max(printer.step, CARRIAGE_STEP)
     return {
         "noise": f"{step / np.sqrt(12):.1g}",
         "steps": f"a step of {step:.3g} mm, of which a carriage is anywhere",
@@ -162,12 +171,12 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
             next_step="Name what the printer's console said while it probed with --probed FILE; or"
             " --board, for a session with a camera",
         )
-    if len(touches.heights) < FEWEST:
+    if len(touches.heights) < FEWEST_BED_POINTS:
         raise InputError(
             "too few points of the bed",
             where=touches.origin,
             found=count(len(touches.heights), "point"),
-            expected=f"{FEWEST} or more, spread to the edge of the bed",
+            expected=f"{FEWEST_BED_POINTS} or more, spread to the edge of the bed",
         )
     above = touches.carriages.max(axis=0) - printer.homed
     if above.max() > 0:
@@ -187,10 +196,10 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
     to = "klipper" if printer.program == "Klipper" else "reprap"
     heads = [f"{motor} [mm]" for motor in printer.motors]
     return {
-        "session.yaml": SESSION.format(
+        "session.yaml": PROBED_SESSION_TEXT.format(
             n=len(names), origin=touches.origin, to=to, **_resolution(printer)
         ),
-        "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE,
+        "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE_FIXED_TEXT,
         "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
         "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),
     }
@@ -205,10 +214,10 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
         lowest = _lowest([printer.carriages(s * edge) for s in (-1.0, 1.0)], touches)
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())
     legs = [
-        LEG.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))
+        PRINTER_LEG_TEXT.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))
         for (x, y), high, rod in zip(towers, printer.homed, printer.rod, strict=True)
     ]
-    return DRAWING.format(
+    return PRINTER_DRAWING_TEXT.format(
         name=printer.program.lower() + "-delta",
         label=printer.label,
         legs="\n".join(legs),
@@ -219,7 +228,7 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
 def _lowest(at_edge: Sequence[Array], touches: Touches | None) -> float:
     """Where carriages go down to, mm: for the bed's edge, and for what was felt."""
     reached = [*at_edge] if touches is None else [*at_edge, touches.carriages]
-    return float(np.nanmin(np.concatenate(reached))) - MARGIN
+    return float(np.nanmin(np.concatenate(reached))) - CARRIAGE_MARGIN_BELOW
 
 
 def _mm(value: float) -> str:

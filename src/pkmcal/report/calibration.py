@@ -12,7 +12,12 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.kept import keep_earlier
-from pkmcal.calibration.results import REPORT, check_output, document_of, texts_of
+from pkmcal.calibration.results import (
+    CALIBRATION_REPORT_FILE,
+    calibration_document,
+    check_output,
+    texts_of,
+)
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
 from pkmcal.files import write_folder
@@ -22,7 +27,7 @@ from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
-from pkmcal.pages.drawn import KEPT
+from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.report import (
     field,
     identifiability,
@@ -54,7 +59,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, document_of(c, open_, predicted, over, seen)),
+        texts=texts_of(c, calibration_document(c, open_, predicted, over, seen)),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
@@ -91,7 +96,11 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
     over = check_output(folder, force=force)
     found = outcome_of(calibration)
     kept = None if force else keep_earlier(Path(folder), found.texts)
-    write_folder(Path(folder), {REPORT: page.page_html(found, datetime.now()), **found.texts}, over)
+    write_folder(
+        Path(folder),
+        {CALIBRATION_REPORT_FILE: page.page_html(found, datetime.now()), **found.texts},
+        over,
+    )
     return kept
 
 
@@ -111,20 +120,20 @@ def report_of(
     shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
     held = None
     if holdout:
-        from pkmcal.report.validation import held_out
+        from pkmcal.report.validation import held_out_part
 
-        held = held_out(holdout, session)
+        held = held_out_part(holdout, session)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
     links = album.links
-    space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
+    space = photographed.plot(session, estimate, links, poses.target_places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
         provenance.stations(session, observation, estimate, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
-        parameters.together(estimate),
+        parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         held,
@@ -142,17 +151,17 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(c, centres, tool),
+        figures=calibration_cards(c, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(doubtful(text) for text in session.warnings),
-        summary={"figures": numbers(observation, estimate, centres, tool)},
+        summary={"figures": calibration_numbers(observation, estimate, centres, tool)},
     )
 
 
 # ------------------------------------------------------------------ the main numbers
 
 
-def cards(
+def calibration_cards(
     calibration: Calibration, centres: tuple[Centres, ...], tool: ToolError
 ) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
@@ -186,7 +195,7 @@ def cards(
     return tuple(card for card in found if card)
 
 
-def numbers(
+def calibration_numbers(
     observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolError
 ) -> dict[str, Any]:
     """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
@@ -278,7 +287,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             " measured",
         )
     if not taken:
-        quiet, n = int(np.sum(estimate.pose_weights < KEPT)), len(observation.poses)
+        quiet, n = int(np.sum(estimate.pose_weights < KEPT_EDGE_WEIGHT)), len(observation.poses)
         kinds = sorted({table.kind for table in session.trackers})
         return Figure(
             "What is it based on?",
@@ -287,7 +296,8 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
         )
     used = sum(provenance.used_photographs(session, observation))
     parts = [
-        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT))} of them given less "
+        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT_EDGE_WEIGHT))} of"
+        f" them given less "
         "than half their weight"
         for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
         if len(weights)

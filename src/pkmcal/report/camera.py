@@ -10,33 +10,33 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
+from pkmcal.boards.camera import COVERAGE_CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
 from pkmcal.pages.drawn import Arrow, Picture
-from pkmcal.pages.jpegs import THREADS, jpeg
+from pkmcal.pages.jpegs import JPEG_THREADS, jpeg
 from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
-ARROW = 0.05
+CAMERA_ARROW_LENGTH = 0.05
 """Length of a large residual's arrow as a share of the picture's width."""
 ANGLE_STEP = 5.0
 """degrees of the angle from the axis that one bar of the histogram holds."""
 FIELD_CELLS = (16, 12)
-UNITS = {"focal": "px", "center": "px"}
-WORDS = {
+INTRINSIC_UNITS = {"focal": "px", "center": "px"}
+INTRINSIC_WORDS = {
     "focal.x": "focal length x",
     "focal.y": "focal length y",
     "center.x": "centre x",
     "center.y": "centre y",
 }
-COMPARED = (
+CAMERA_MODELS_TEXT = (
     "Every model with more and more distortion terms. What counts is the error on views left out of"
     " the fit; a term is taken only where they gain from it, and the model with the fewest"
     " parameters among equals."
 )
-SIGMA = (
+CAMERA_SIGMA_TEXT = (
     "The standard deviations say how much the intrinsics would scatter if other photographs of this"
     " kind were taken. They hold the noise of the corners and the views' disagreement beyond it."
     " They know nothing of what all photographs share: a board whose squares are not as long as its"
@@ -56,7 +56,7 @@ def outcome_of(
     and forms.
     """
     c = calibration
-    wanted = ARROW * c.camera.image_size[0]
+    wanted = CAMERA_ARROW_LENGTH * c.camera.image_size[0]
     factor = charts.enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
@@ -65,7 +65,7 @@ def outcome_of(
     return Outcome(
         command="camera",
         title=f"Calibration of a {c.camera.model} camera",
-        verdict=Verdict(True, headline(c), warnings=c.warnings),
+        verdict=Verdict(True, camera_headline(c), warnings=c.warnings),
         figures=_cards(c),
         parts=(
             Part(
@@ -74,7 +74,13 @@ def outcome_of(
                 tables=(_intrinsics(c),),
                 notes=(hardly,) if together else (),
             ),
-            Part("models", "Models compared", (COMPARED,), tables=(_compared(c),), menu="Models"),
+            Part(
+                "models",
+                "Models compared",
+                (CAMERA_MODELS_TEXT,),
+                tables=(_compared(c),),
+                menu="Models",
+            ),
             Part(
                 "field",
                 "Field",
@@ -83,14 +89,14 @@ def outcome_of(
             Part(
                 "photographs",
                 "Photographs",
-                html=page.render(
+                html=page.filled_template(
                     "corners.html.j2",
                     pictures=_photographs(c, [Path(path) for path in paths], factor),
                     factor=factor,
                     missed=[d for d in c.detections if not d.found],
                 ),
             ),
-            Part("how", "What σ means", (SIGMA,)),
+            Part("how", "What σ means", (CAMERA_SIGMA_TEXT,)),
         ),
         document=c.document(),
         texts={
@@ -100,7 +106,7 @@ def outcome_of(
     )
 
 
-def headline(c: CameraCalibration) -> str:
+def camera_headline(c: CameraCalibration) -> str:
     """The result in one sentence."""
     focal, sigma = c.camera.parameters[:2].mean(), c.sigma[:2].mean()
     kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
@@ -117,14 +123,14 @@ def _intrinsics(c: CameraCalibration) -> Table:
         c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
     )
     for name, value, sigma in values:
-        unit = UNITS.get(name.partition(".")[0], "")
+        unit = INTRINSIC_UNITS.get(name.partition(".")[0], "")
         places = decimals(sigma)
         shown = (
             (number(value, places), number(sigma, places))
             if sigma > 0
             else (f"{value:g}", "not estimated")
         )
-        rows.append(Row(WORDS.get(name, name), (*shown, unit)))
+        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*shown, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
 
 
@@ -187,7 +193,8 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How much of the picture was tested?",
             ((f"{covered:.0f}", "%"),),
-            f"of {CELLS[0]}×{CELLS[1]} cells hold corners; elsewhere the lens is extrapolated",
+            f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners; elsewhere the lens"
+            f" is extrapolated",
         ),
     )
 
@@ -196,7 +203,7 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
     """All views, each by its file's name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(JPEG_THREADS) as pool:
         jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
         return tuple(_photograph(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
@@ -251,13 +258,13 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = charts.enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
+    factor = charts.enlargement(np.linalg.norm(means, axis=-1), CAMERA_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     drawn = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
         tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
-    return page.render("field.html.j2", field=drawn, cells=cells, factor=factor)
+    return page.filled_template("field.html.j2", field=drawn, cells=cells, factor=factor)
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:

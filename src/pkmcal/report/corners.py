@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.boards.views import MOUNT, Boards
+from pkmcal.boards.views import ONLY_BOARD_MOUNT, Boards
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.estimate import Estimate
 from pkmcal.session.load import Session
@@ -57,7 +57,7 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Board
             if not found.found or not estimate.configurations[k]:
                 continue
             body = state.T_base_platform[k] if moves else np.eye(4)
-            T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[MOUNT]
+            T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[ONLY_BOARD_MOUNT]
             points = apply(T_camera_board, size * seen.board.points[found.ids])
             off = found.pixels - session.stations[s].camera.project(points)
             n = len(off)

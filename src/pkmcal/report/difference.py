@@ -11,13 +11,13 @@ from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
-from pkmcal.pages.plots import AXIS, LOOKS, coloured, space_layout
+from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT, coloured, space_layout
 from pkmcal.report.watch import chance_text
 from pkmcal.report.workspace import middle_and_worst
-from pkmcal.wording import SCALES, brief, count, decimals, number
+from pkmcal.wording import SHOWN_UNITS, brief, count, decimals, number
 
-NONE = "–"
-BRIEF = 8
+NO_DIFFERENCE_SIGN = "–"
+CHANGES_ON_TERMINAL = 8
 """Changes that a terminal shows."""
 
 
@@ -107,7 +107,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
     for name, off, sigma in kinds:
         known = np.isfinite(off)
         if known.any():
-            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NONE
+            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NO_DIFFERENCE_SIGN
             rows.append(Row(name, (*middle_and_worst(off), by_chance)))
     columns = ("At the same readings", "median", "worst", "by chance, 1σ")
     note = (
@@ -144,9 +144,9 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
     out: list[Table] = []
     if d.significant:
         rows = tuple(_row(d, k) for k in d.significant)
-        more = len(rows) - BRIEF
+        more = len(rows) - CHANGES_ON_TERMINAL
         legend = (f"and {count(more, 'more number')}",) if more > 0 else ()
-        out.append(Table("What changed", columns, rows[:BRIEF], legend=legend))
+        out.append(Table("What changed", columns, rows[:CHANGES_ON_TERMINAL], legend=legend))
     names = range(len(d.a.machine.parameters))
     note = (
         "1σ: of the change by chance. Chance: of as large a change of this number in a machine that"
@@ -161,7 +161,7 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
 
 def _row(d: MachineDifference, k: int) -> Row:
     table = d.a.machine.parameters
-    factor, unit = SCALES.get(table.units[k], (1.0, ""))
+    factor, unit = SHOWN_UNITS.get(table.units[k], (1.0, ""))
     value = float(table.unit_axes(d.a.machine.values)[k]) * factor
     change, sigma = float(d.found.change[k]) * factor, float(d.found.sigma[k]) * factor
     size = sigma if sigma > 0 else abs(change)
@@ -174,7 +174,7 @@ def _row(d: MachineDifference, k: int) -> Row:
             number(value, places),
             number(value + change, places),
             number(change, places, signed=True),
-            brief(sigma) if sigma > 0 else NONE,
+            brief(sigma) if sigma > 0 else NO_DIFFERENCE_SIGN,
             chance,
         ),
         mark=Level.DOUBTFUL if k in d.significant else None,
@@ -208,11 +208,11 @@ def _joints(d: MachineDifference) -> Plot:
             }
         )
     layout = {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "barmode": "group",
         "margin": {"l": 56, "r": 12, "t": 10, "b": 36},
-        "xaxis": {**AXIS},
-        "yaxis": {**AXIS, "title": {"text": "moved, mm"}, "rangemode": "tozero"},
+        "xaxis": {**COMMON_AXIS_LAYOUT},
+        "yaxis": {**COMMON_AXIS_LAYOUT, "title": {"text": "moved, mm"}, "rangemode": "tozero"},
         "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
     }
     return Plot(

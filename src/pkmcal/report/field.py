@@ -20,26 +20,32 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
-from pkmcal.pages.drawn import KEPT, Arrow, across, measured_curves, own_edges
+from pkmcal.pages.drawn import (
+    KEPT_EDGE_WEIGHT,
+    Arrow,
+    measured_curves,
+    offsets_across_curves,
+    own_edges,
+)
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
-ALONG = np.linspace(0.05, 0.95, 10)
+FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
 """Places on an edge, in parts of its span: an edge crosses several cells."""
-COLUMNS = 14
+FIELD_CELLS_ACROSS = 14
 """Cells across the picture."""
-FEWEST = 5
+FEWEST_IN_A_CELL = 5
 """Edges and corners' coordinates from which a cell is shown."""
-PARALLEL = np.sin(np.deg2rad(15.0)) ** 2
+LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
 """Part of a cell's weight that must lie across a direction for it to be shown: of edges within 15
 degrees of one another, what is left along them is their noise, enlarged four times."""
-CHANCE = 0.01
+CELL_BY_CHANCE_SHARE = 0.01
 """Share of cells that stand out by chance alone, where edges err independently."""
-ARROW = 0.06
+FIELD_ARROW_LENGTH = 0.06
 """Length of a large mean shift as drawn, in picture widths."""
-HOW = (
+FIELD_READING_TEXT = (
     "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
     " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
     " grow with the distance from the middle, or go round it, are a lens that the file does not"
@@ -87,22 +93,27 @@ def section(
     links: Links,
 ) -> Part | None:
     """The section; None without anything seen."""
-    found = fields(session, offsets(session, observation.edges, estimate, corners), links)
+    found = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
     if not found:
         return None
     shown, factor, longest = found
-    text = f"{HOW} Drawn {factor:g} times as long as they are; the longest is {brief(longest)} px."
-    html = page.render("fields.html.j2", fields=shown)
+    text = (
+        f"{FIELD_READING_TEXT} Drawn {factor:g} times as long as they are; the longest is"
+        f" {brief(longest)} px."
+    )
+    html = page.filled_template("fields.html.j2", fields=shown)
     return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
 
 
-def offsets(session: Session, edges: EdgeSet, estimate: Estimate, corners: BoardCorners) -> Offsets:
+def field_offsets(
+    session: Session, edges: EdgeSet, estimate: Estimate, corners: BoardCorners
+) -> Offsets:
     """Of the edges in use, at several places of each, the camera's constant shift taken out, and of
     the corners in use, in x and y.
     """
     parts = [
         _of_edges(session, edges, estimate, s)
-        for s in np.unique(edges.station[estimate.edge_weights >= KEPT]).tolist()
+        for s in np.unique(edges.station[estimate.edge_weights >= KEPT_EDGE_WEIGHT]).tolist()
     ]
     used, n = np.flatnonzero(corners.used), len(edges)
     parts += [
@@ -126,7 +137,7 @@ def offsets(session: Session, edges: EdgeSet, estimate: Estimate, corners: Board
 def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
     """Of one station's edges."""
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
-    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= KEPT))
+    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= KEPT_EDGE_WEIGHT))
     some = edges.select(mine)
     rows, photograph = np.unique(some.configuration, return_inverse=True)
     legs = legs_in_camera(
@@ -138,10 +149,11 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     normal /= np.sqrt(dot(normal, normal))[..., None]
     shifted = replace(own, normal=normal)
     measured, expected = (
-        measured_curves(machine, camera, legs, photograph, part, ALONG) for part in (some, shifted)
+        measured_curves(machine, camera, legs, photograph, part, FIELD_EDGE_FRACTIONS)
+        for part in (some, shifted)
     )
-    direction, value = across(expected, measured)
-    n = len(ALONG)
+    direction, value = offsets_across_curves(expected, measured)
+    n = len(FIELD_EDGE_FRACTIONS)
     return Offsets(
         np.full(len(mine) * n, s),
         np.repeat(some.configuration, n),
@@ -171,7 +183,7 @@ def fields(
         return None
     lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in shown for cell in cells])
     width = max(session.stations[s].camera.image_size[0] for _, s, _ in shown)
-    factor = enlargement(lengths, ARROW * width)
+    factor = enlargement(lengths, FIELD_ARROW_LENGTH * width)
     return (
         tuple(_field(session, entry, s, cells, factor) for entry, s, cells in shown),
         factor,
@@ -196,13 +208,13 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     """The mean shifts of the cells of one picture that hold enough, px."""
     from scipy.special import fdtrc
 
-    side = size[0] / COLUMNS
+    side = size[0] / FIELD_CELLS_ACROSS
     inside = np.all((found.pixel > -0.5) & (found.pixel < np.array(size) - 0.5), axis=1)
     some = found.select(np.asarray(inside))
     at = np.floor((some.pixel + 0.5) / side).astype(int)
     # an edge counts once in a cell: its places there are one measurement; a corner twice
     steep = np.abs(some.direction).argmax(axis=1)
-    keys = np.column_stack([at[:, 1] * COLUMNS + at[:, 0], some.thing, steep])
+    keys = np.column_stack([at[:, 1] * FIELD_CELLS_ACROSS + at[:, 0], some.thing, steep])
     each, first, one = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     one, direction = one.reshape(-1), some.direction[first]
     same = np.sign(dot(some.direction, direction[one]))
@@ -217,17 +229,19 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
 
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
-    known = strength > PARALLEL * strength.sum(axis=1, keepdims=True)
+    known = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
     along = np.einsum("cij,ci->cj", axes, total(direction * value[:, None]))
     shift = np.einsum("cij,cj->ci", axes, np.where(known, along / np.maximum(strength, 1e-12), 0.0))
     explained = np.einsum("ci,cij,cj->c", shift, information, shift)
     rank = known.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
     left = np.maximum(total(value**2) - explained, 1e-300)
-    loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CHANCE
-    places = (np.stack([cells % COLUMNS, cells // COLUMNS], axis=-1) + 0.5) * side - 0.5
+    loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CELL_BY_CHANCE_SHARE
+    places = (
+        np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
+    ) * side - 0.5
     out: list[Arrow] = []
-    for c in np.flatnonzero(n >= FEWEST).tolist():
+    for c in np.flatnonzero(n >= FEWEST_IN_A_CELL).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
         tip = (

@@ -14,18 +14,18 @@ from pkmcal.pages.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
 
-FLOOR = 1e-3
+LEAST_BAR_INFORMATION = 1e-3
 """Information below which a bar is a stub only: the drawing knows a thousand times more."""
-STUB = 0.06
+STUB_BAR_HEIGHT = 0.06
 """Height of such a bar, in decades: seen, and not mistaken for a value."""
-MOST_NAMES = 6
+MOST_NAMES_LISTED = 6
 
 
 def section(findings: Findings, table: ParameterTable) -> Part:
     """The section of the findings of a machine with these parameters."""
-    html = page.render(
+    html = page.filled_template(
         "identifiability.html.j2",
-        headline=headline(findings),
+        headline=directions_headline(findings),
         told=findings,
         fixed=held(findings, table),
         tied=tied(table),
@@ -34,7 +34,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
     return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
 
 
-def headline(findings: Findings) -> str:
+def directions_headline(findings: Findings) -> str:
     """How many of the directions that exist the data fix."""
     told = findings.told
     possible = told.n_parameters - told.n_frames
@@ -52,12 +52,16 @@ def headline(findings: Findings) -> str:
 
 
 def spectrum(findings: Findings) -> BarChart | None:
-    """Bars of all directions, best known first, on a logarithmic scale from ``FLOOR``."""
+    """Bars of all directions, best known first, on a logarithmic scale from
+    ``LEAST_BAR_INFORMATION``.
+    """
     values = np.asarray(findings.told.singular_values, dtype=float)
     if values.size == 0:
         return None
-    decades = math.log10(1 / FLOOR)
-    heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, STUB)
+    decades = math.log10(1 / LEAST_BAR_INFORMATION)
+    heights = np.maximum(
+        np.log10(np.maximum(values, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
+    )
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
         UprightBar(str(k + 1), f"Direction {k + 1}: {known}", float(height), quiet=bool(value >= 1))
@@ -142,9 +146,9 @@ def tied(table: ParameterTable) -> str:
     order = [tuple(name for name in table.names if name in names) for names in groups]
     said = [
         joined(grouped(table, names)) + (" (by opposite amounts)" if against & set(names) else "")
-        for names in order[:MOST_NAMES]
+        for names in order[:MOST_NAMES_LISTED]
     ]
-    more = f" and {len(order) - MOST_NAMES} more" if len(order) > MOST_NAMES else ""
+    more = f" and {len(order) - MOST_NAMES_LISTED} more" if len(order) > MOST_NAMES_LISTED else ""
     return f"Changes together, as one value: {'; '.join(said)}{more}."
 
 
@@ -160,7 +164,7 @@ def _together(table: ParameterTable) -> list[set[str]]:
 
 def _listed(table: ParameterTable, names: tuple[str, ...]) -> str:
     groups = grouped(table, names)
-    words = groups[:MOST_NAMES]
-    if len(groups) > MOST_NAMES:
-        words.append(f"{len(groups) - MOST_NAMES} more")
+    words = groups[:MOST_NAMES_LISTED]
+    if len(groups) > MOST_NAMES_LISTED:
+        words.append(f"{len(groups) - MOST_NAMES_LISTED} more")
     return capital(joined(words))

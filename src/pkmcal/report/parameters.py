@@ -14,17 +14,26 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.found import EXACT, FoundParameter, FoundParameters, found_parameters
+from pkmcal.identify.found import ROUNDING_SIGMA, FoundParameter, FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
-from pkmcal.pages.plots import AXIS, LOOKS
-from pkmcal.wording import SCALES, capital, decimals, joined, named, number, percent, split_name
+from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT
+from pkmcal.wording import (
+    SHOWN_UNITS,
+    capital,
+    decimals,
+    joined,
+    named,
+    number,
+    percent,
+    split_name,
+)
 
-TIGHT = 0.95
+TIGHT_CORRELATION = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
-MOST_PAIRS = 6
+MOST_TIGHT_PAIRS = 6
 MOST_SHOWN = 250
 """Parameters up to which they are shown: of more, a cell would be less than three pixels."""
 RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
@@ -34,12 +43,12 @@ HOW_TOGETHER = (
     " frames that the parameters are told in; what a frame or the file holds is left out, and of"
     " values that are tied one stands for all."
 )
-TEX = {
+LATEX_SIGNS = {
     "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
     "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
 }  # fmt: skip
 """Signs that LaTeX reads as something else, or not."""
-SOURCES = {
+PARAMETER_SOURCES = {
     "data": "the photographs decide",
     "drawing": "the drawing decides more than the photographs",
     "frame": "defines the frame",
@@ -51,8 +60,8 @@ SOURCES = {
 class ParameterRow:
     """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
 
-    leg : from 1, None for a parameter of no leg. source : a key of ``SOURCES``. share : of what
-    is known, from the data; NaN where that means nothing. note : ties, for people.
+    leg : from 1, None for a parameter of no leg. source : a key of ``PARAMETER_SOURCES``. share :
+    of what is known, from the data; NaN where that means nothing. note : ties, for people.
     """
 
     name: str
@@ -71,7 +80,7 @@ class ParameterRow:
     @property
     def source_text(self) -> str:
         """The source in words."""
-        return SOURCES[self.source]
+        return PARAMETER_SOURCES[self.source]
 
     @property
     def share_text(self) -> str:
@@ -94,7 +103,7 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
         drawing.values, estimate.machine, estimate.covariance, estimate.data_share
     )
     groups = parameter_groups(found)
-    html = page.render(
+    html = page.filled_template(
         "parameters.html.j2",
         groups=groups,
         downloads={
@@ -132,7 +141,7 @@ def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
 
 
 def _for_tex(text: str) -> str:
-    for sign, command in TEX.items():
+    for sign, command in LATEX_SIGNS.items():
         text = text.replace(sign, command)
     return text
 
@@ -151,8 +160,8 @@ def parameter_groups(found: FoundParameters) -> tuple[ParameterGroup, ...]:
 
 
 def _row(table: ParameterTable, k: int, one: FoundParameter) -> ParameterRow:
-    factor, unit = SCALES.get(one.unit, (1.0, one.unit.replace("1", "")))
-    sigma = one.sigma if one.sigma > EXACT else 0.0
+    factor, unit = SHOWN_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
+    sigma = one.sigma if one.sigma > ROUNDING_SIGMA else 0.0
     numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
     places = decimals(numbers[3])
     others = [n for group in table.tied if one.name in group for n in group if n != one.name]
@@ -189,7 +198,7 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
         for i, j, rho in tight_pairs(estimate)
         if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in said)
     ]
-    return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_PAIRS])
+    return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_TIGHT_PAIRS])
 
 
 def _whole_axis(name: str) -> str:
@@ -234,21 +243,21 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
     table, sigma = estimate.machine.parameters, np.sqrt(np.diag(estimate.covariance).clip(0))
     again = {name for group in table.tied for name in group[1:]}
     own = np.array([name not in again for name in table.names], dtype=bool)
-    free = np.flatnonzero((sigma > EXACT) & own)
+    free = np.flatnonzero((sigma > ROUNDING_SIGMA) & own)
     rho = estimate.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     whole = np.array([_whole_axis(table.names[k]) for k in free])
     return free, rho, np.triu(whole[:, None] != whole, 1)
 
 
 def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
-    """Pairs of parameters (i, j, correlation) beyond ``TIGHT``, the tightest first."""
+    """Pairs of parameters (i, j, correlation) beyond ``TIGHT_CORRELATION``, the tightest first."""
     free, rho, pairs = correlations(estimate)
-    i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT))
+    i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT_CORRELATION))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]
 
 
-def together(estimate: Estimate) -> Part | None:
+def correlations_part(estimate: Estimate) -> Part | None:
     """What is known together; None where nothing was estimated, or too much to be drawn."""
     table = estimate.machine.parameters
     shown, rho, pairs = correlations(estimate)
@@ -286,8 +295,8 @@ def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
     """The heat map."""
     # where the first of a leg's, or of a kind, stands
     common = {
-        **AXIS, "showgrid": False, "zeroline": False, "ticks": "", "tickfont": {"size": 9},
-        "automargin": True, "constrain": "domain",
+        **COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "ticks": "",
+        "tickfont": {"size": 9}, "automargin": True, "constrain": "domain",
     }  # fmt: skip
     data = [
         {
@@ -306,7 +315,7 @@ def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
         }
     ]  # fmt: skip
     layout = {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "margin": {"l": 20, "r": 10, "t": 8, "b": 20},
         "xaxis": {**common, "tickangle": -90},
         "yaxis": {**common, "autorange": "reversed", "scaleanchor": "x"},

@@ -16,19 +16,19 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Plot
 from pkmcal.pages.page import N_COLOURS
-from pkmcal.pages.plots import beside, frustum, line, markers, ring, seen_whole
+from pkmcal.pages.plots import frustum, line, markers, ring, seen_whole, way_between_cameras
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count
 
-MOST = 90
+MOST_SLIDER_POSES = 90
 """Poses of the slider; more would make the page large and the slider too fine for a finger."""
-AROUND = 10
+TUBE_RING_CORNERS = 10
 """Corners of a tube's cross-section as drawn."""
-DEPTH, LEAST_DEPTH = 0.18, 0.1
+FRUSTUM_DEPTH_SHARE, LEAST_FRUSTUM_DEPTH = 0.18, 0.1
 """Depth of a camera's frustum, in distances of the camera from the machine's middle, and at least,
 in sizes of the machine."""
-NAMED = 12
+MOST_CAMERAS_NAMED = 12
 """Cameras up to which each has its name beside it."""
 
 
@@ -42,7 +42,7 @@ class PosedLimbs(NamedTuple):
     arms: tuple[Array, ...]
 
 
-def limbs_of(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
+def posed_limbs(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
     """At readings (K, m) and poses (K, 4, 4)."""
     ends = machine.ends_at(joints, T_base_platform)
     arms, shape = machine.arms_at(joints), (len(joints), machine.n_legs, 3)
@@ -59,9 +59,11 @@ def plot(
     used = np.flatnonzero(estimate.configurations)
     if not len(used):
         return None
-    some = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST)).astype(int))]
+    some = used[
+        np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST_SLIDER_POSES)).astype(int))
+    ]
     machine, state = estimate.machine, estimate.state
-    limbs = limbs_of(machine, session.joints[some], state.T_base_platform[some])
+    limbs = posed_limbs(machine, session.joints[some], state.T_base_platform[some])
     names = [session.configurations[k] for k in some]
     cameras = np.array([inverse(T)[:3, 3] for T in state.T_camera_base[: len(session.stations)]])
     frames = _frames(machine, limbs, names)
@@ -105,7 +107,7 @@ def _moving(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any
     lines = (("axes of the legs", "--muted", 3), ("arms", "--ink", 7), ("platform", "--ink", 5))
     for n, trace in enumerate(first):
         if n < machine.n_legs:
-            many = len(trace["x"]) // (2 * AROUND)
+            many = len(trace["x"]) // (2 * TUBE_RING_CORNERS)
             faces = _faces(many)
             out.append(
                 {
@@ -127,8 +129,8 @@ def _moving(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any
 
 
 def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
-    """Rings of a leg's tubes in all poses, (K, 2 n AROUND, 3) m; those beyond the leg's end have
-    no length.
+    """Rings of a leg's tubes in all poses, (K, 2 n TUBE_RING_CORNERS, 3) m; those beyond the leg's
+    end have no length.
     """
     a, b = limbs.a[:, leg], limbs.b[:, leg]
     length = np.linalg.norm(b - a, axis=-1)
@@ -137,7 +139,7 @@ def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
     v = np.cross(u, other)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
     w = np.cross(u, v)
-    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    angle = 2 * np.pi * np.arange(TUBE_RING_CORNERS) / TUBE_RING_CORNERS
     across = np.cos(angle)[:, None] * v[:, None] + np.sin(angle)[:, None] * w[:, None]
     rings: list[Array] = []
     radii = machine.values[machine.layout.radius[leg]]
@@ -151,15 +153,15 @@ def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
 
 def _faces(tubes: int) -> Integers:
     """Triangles (n, 3) between the two rings of each tube."""
-    here = np.arange(AROUND)
-    there = (here + 1) % AROUND
+    here = np.arange(TUBE_RING_CORNERS)
+    there = (here + 1) % TUBE_RING_CORNERS
     one = np.concatenate(
         [
-            np.column_stack([here, there, here + AROUND]),
-            np.column_stack([there, there + AROUND, here + AROUND]),
+            np.column_stack([here, there, here + TUBE_RING_CORNERS]),
+            np.column_stack([there, there + TUBE_RING_CORNERS, here + TUBE_RING_CORNERS]),
         ]
     )
-    return (one + 2 * AROUND * np.arange(tubes)[:, None, None]).reshape(-1, 3)
+    return (one + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
 
 
 # ------------------------------------------------------------------ what stands still
@@ -176,13 +178,15 @@ def _still(
     carried = np.stack([arm[0, 0] for arm in limbs.arms])
     out = [line("base", "--muted", 4, [ring(carried)], showlegend=False)]
     ends = np.concatenate([limbs.a[0], limbs.b[0]])
-    middle, least = ends.mean(axis=0), LEAST_DEPTH * float(np.ptp(ends, axis=0).max())
+    middle, least = ends.mean(axis=0), LEAST_FRUSTUM_DEPTH * float(np.ptp(ends, axis=0).max())
     eyes = [inverse(T) for T in estimate.state.T_camera_base[: len(session.stations)]]
     if eyes:
         lines = [
             part
             for station, T in zip(session.stations, eyes, strict=True)
-            for depth in [max(DEPTH * float(np.linalg.norm(T[:3, 3] - middle)), least)]
+            for depth in [
+                max(FRUSTUM_DEPTH_SHARE * float(np.linalg.norm(T[:3, 3] - middle)), least)
+            ]
             for part in frustum(station.camera, T, depth)
         ]
         out.append(line("cameras", "--ink", 3, lines))
@@ -192,7 +196,7 @@ def _still(
                 "camera",
                 np.stack([T[:3, 3] for T in eyes]),
                 {"size": 4, "color": "--ink", "symbol": "square"},
-                mode="markers+text" if len(eyes) <= NAMED else "markers",
+                mode="markers+text" if len(eyes) <= MOST_CAMERAS_NAMED else "markers",
                 text=names,
                 textposition="top center",
                 textfont={"color": "--ink", "size": 12},
@@ -238,7 +242,7 @@ def _layout(
 ) -> dict[str, Any]:
     """Seen from between the cameras (S, 3), m, with all that is drawn in the picture."""
     middle = np.concatenate([limbs.a[0], limbs.b[0]]).mean(axis=0)
-    layout = seen_whole(data, beside(cameras - middle))
+    layout = seen_whole(data, way_between_cameras(cameras - middle))
     layout["legend"] = {"orientation": "h", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     layout["margin"]["b"] = 78
     if len(names) > 1:

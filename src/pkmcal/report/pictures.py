@@ -20,8 +20,8 @@ from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
 from pkmcal.pages.drawn import (
-    CURVE,
-    KEPT,
+    EDGE_CURVE_POINTS,
+    KEPT_EDGE_WEIGHT,
     Arrow,
     Drawn,
     Picture,
@@ -42,11 +42,11 @@ from pkmcal.wording import brief, count, number
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-MOST = 400
+MOST_PHOTOGRAPHS_SHOWN = 400
 """Photographs on a page: browsers take a second to lay out as many."""
-ROOM = 8_000_000
+JPEG_CHARACTERS_A_PAGE = 8_000_000
 """Characters of all their JPEGs."""
-ARROW = 0.03
+CORNER_ARROW_LENGTH = 0.03
 """Length of a large corner's residual as drawn, in picture widths."""
 
 
@@ -65,7 +65,7 @@ class Album:
 
 def section(session: Session, shown: Album) -> Part:
     """The section."""
-    html = page.render(
+    html = page.filled_template(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
         album=shown,
@@ -92,9 +92,10 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
         **calibration.photographs
     }
     files = [
-        (images[s], session.stations[s].photographs.index(photo)) for s, photo in ordered[:MOST]
+        (images[s], session.stations[s].photographs.index(photo))
+        for s, photo in ordered[:MOST_PHOTOGRAPHS_SHOWN]
     ]
-    shots = list(small_and_large(files, ROOM))
+    shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
     found = _Found(calibration, shifts, centres, chosen)
@@ -156,7 +157,9 @@ class _Found:
         self.reasons: dict[Place, list[str]] = defaultdict(list)
         self.corners = board_corners(session, calibration.boards, estimate)
         width = max((s.camera.image_size[0] for s in session.stations), default=0)
-        self.factor = enlargement(np.linalg.norm(self.corners.off, axis=1), ARROW * width)
+        self.factor = enlargement(
+            np.linalg.norm(self.corners.off, axis=1), CORNER_ARROW_LENGTH * width
+        )
         rejected: dict[int, list[Rejection]] = defaultdict(list)
         for one in calibration.observation.rejected:
             rejected[one.station].append(one)
@@ -228,7 +231,7 @@ class _Found:
                 f" {number(float(shifts[n]), 2, signed=True)} px outward;"
                 f" {residual_words(across, tilt, weight)}"
             )
-            drawn = polyline(leg, points, weight < KEPT, tip)
+            drawn = polyline(leg, points, weight < KEPT_EDGE_WEIGHT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
@@ -240,7 +243,7 @@ class _Found:
         if not some:
             return
         legs, tubes = _legs(self.calibration, s, configurations), tubes_of(machine)
-        pixel = edge_points(machine, camera, legs, tubes, CURVE).pixel
+        pixel = edge_points(machine, camera, legs, tubes, EDGE_CURVE_POINTS).pixel
         inside = np.where(camera.in_image(pixel)[..., None], pixel, np.nan)
         curves = [straightened(of_photograph) for of_photograph in inside]
         for one in some:
@@ -278,7 +281,7 @@ class _Found:
 
 
 def edge_curves(c: Calibration, mine: Integers, s: int) -> Array:
-    """Curves (n, CURVE, 2) px of the edges ``mine`` in the photographs of station s."""
+    """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` in the photographs of station s."""
     edges, camera = c.observation.edges.select(mine), c.session.stations[s].camera
     rows, photograph = np.unique(edges.configuration, return_inverse=True)
     return measured_curves(c.machine, camera, _legs(c, s, rows), photograph, edges)

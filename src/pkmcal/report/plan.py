@@ -10,18 +10,26 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.files import csv_text, plain, yaml_text
+from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, note
-from pkmcal.pages.plots import AXIS, LOOKS, beside, frustum, line, markers, seen_whole
-from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
+from pkmcal.pages.plots import (
+    COMMON_AXIS_LAYOUT,
+    COMMON_PLOT_LAYOUT,
+    frustum,
+    line,
+    markers,
+    seen_whole,
+    way_between_cameras,
+)
+from pkmcal.planning.plan import WORTHWHILE_ACCURACY_GAIN, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
 from pkmcal.simulation.placement import StationPlace
-from pkmcal.wording import SCALES, amount, brief, count, listed, number
+from pkmcal.wording import SHOWN_UNITS, amount, brief, count, listed, number
 
-TABLE, PLACES = "plan.csv", "stations.yaml"
-FORMAT = 1
-FINEST = 6
+PLAN_TABLE_FILE, PLAN_PLACES_FILE = "plan.csv", "stations.yaml"
+PLAN_FORMAT = 1
+PLAN_READING_DECIMALS = 6
 """Decimals of a reading in metres or radians."""
 INDEX_NAMES = {
     "tool": "the variance of the tool's position over the workspace",
@@ -29,9 +37,9 @@ INDEX_NAMES = {
     "E": "the largest eigenvalue of the machine's covariance (E)",
     "O1": "the noise amplification index O1",
 }
-FRUSTUM = 0.35
+FRUSTUM_LENGTH_SHARE = 0.35
 """Length of a drawn camera's view, in the distance from the camera to the machine."""
-HOW = (
+PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
     " Stations, edge shifts, shading and boards stay unknown, so what is promised is what calibrate"
@@ -47,15 +55,17 @@ HOW = (
 def outcome_of(found: MeasurementPlan) -> Outcome:
     """Everything that ``pkmcal plan`` tells and writes."""
     texts: dict[str, str | bytes] = {
-        TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))
+        PLAN_TABLE_FILE: csv_text(
+            found.subject.columns, found.names, found.joints.round(PLAN_READING_DECIMALS)
+        )
     }
     parts = [_order(found), _curve(found)]
     if found.tried:
-        texts[PLACES] = yaml_text(stations_document(found))
+        texts[PLAN_PLACES_FILE] = yaml_text(stations_document(found))
         parts.append(_places(found))
     if _cameras(found):
         parts.append(_where(found))
-    parts.append(Part("how", "How it was computed", (*HOW, *found.subject.words)))
+    parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *found.subject.words)))
     machine = found.subject.rig.machine
     gain = found.by_chance.position / found.promised.position
     return Outcome(
@@ -93,7 +103,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
         ),
         parts=tuple(parts),
         findings=tuple(note(text) for text in found.subject.words),
-        document=document_of(found),
+        document=plan_document(found),
         texts=texts,
     )
 
@@ -126,9 +136,12 @@ def _paying(found: MeasurementPlan) -> str:
     if until is not None:
         return (
             f"From {count(until, 'configuration')} a place on, one more betters it by less than"
-            f" {PAYS:.0%}; {more}."
+            f" {WORTHWHILE_ACCURACY_GAIN:.0%}; {more}."
         )
-    return f"All of them pay: each betters the tool by {PAYS:.0%} at least; {more}."
+    return (
+        f"All of them pay: each betters the tool by {WORTHWHILE_ACCURACY_GAIN:.0%} at least;"
+        f" {more}."
+    )
 
 
 def _carefully(found: MeasurementPlan) -> tuple[str, ...]:
@@ -146,7 +159,7 @@ def _order(found: MeasurementPlan) -> Part:
     """The configurations, in their order."""
     units = found.subject.rig.machine.joint_units
     columns = [
-        f"{name}, {SCALES[unit][1]}"
+        f"{name}, {SHOWN_UNITS[unit][1]}"
         for name, unit in zip(found.subject.columns, units, strict=True)
     ]
     rows = [
@@ -155,7 +168,7 @@ def _order(found: MeasurementPlan) -> Part:
             (
                 listed(who, 3),
                 str(int(rank)),
-                *(number(q * SCALES[u][0], 2) for q, u in zip(joints, units, strict=True)),
+                *(number(q * SHOWN_UNITS[u][0], 2) for q, u in zip(joints, units, strict=True)),
             ),
         )
         for name, who, rank, joints in zip(
@@ -167,7 +180,8 @@ def _order(found: MeasurementPlan) -> Part:
         ("Configuration", "from", "rank", *columns),
         tuple(rows),
         f"The way from home is the shortest that was found. Rank: if fewer are wanted, those up to"
-        f" a rank are the best so many from each place. {TABLE} holds the readings in metres and"
+        f" a rank are the best so many from each place. {PLAN_TABLE_FILE} holds the readings in"
+        f" metres and"
         " radians; measured readings replace them.",
         brief=False,
         words=(1,),
@@ -179,7 +193,7 @@ def _curve(found: MeasurementPlan) -> Part:
     """How the tool's deviation falls with the number of configurations."""
     x = [a.count for a in found.curve]
     y = [a.position * 1e3 for a in found.curve]
-    here, axis = found.promised, {**AXIS, "type": "log"}
+    here, axis = found.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
     figure = {
         "data": [
             {
@@ -203,7 +217,7 @@ def _curve(found: MeasurementPlan) -> Part:
             },
         ],
         "layout": {
-            **LOOKS,
+            **COMMON_PLOT_LAYOUT,
             "margin": {"l": 60, "r": 10, "t": 10, "b": 45},
             "xaxis": {**axis, **_ticks(x), "title": {"text": "configurations from each place"}},
             "yaxis": {**axis, **_ticks(y), "title": {"text": "σ of the tool's position (mm)"}},
@@ -282,7 +296,8 @@ def _places(found: MeasurementPlan) -> Part:
         ("position, m", "looks at, m", "tool from there alone"),
         tuple(rows),
         "Base frame. Chosen as a set: two places that see the same badly do not help each other."
-        f" {PLACES} holds them as session.yaml wants them; to a few centimetres is enough.",
+        f" {PLAN_PLACES_FILE} holds them as session.yaml wants them; to a few centimetres is"
+        f" enough.",
         words=(0, 1),
     )
     return Part("places", "Where to put the camera", tables=(table,))
@@ -308,7 +323,7 @@ def _where(found: MeasurementPlan) -> Part:
     for name, camera, T_camera_base in _cameras(found):
         T = inverse(T_camera_base)
         eye = T[:3, 3]
-        view = frustum(camera, T, FRUSTUM * float(np.linalg.norm(middle - eye)))
+        view = frustum(camera, T, FRUSTUM_LENGTH_SHARE * float(np.linalg.norm(middle - eye)))
         eyes.append(eye)
         look = {"size": 4, "color": "--ink", "symbol": "square"}
         data += [
@@ -321,7 +336,7 @@ def _where(found: MeasurementPlan) -> Part:
         ]  # fmt: skip
     if found.tried:
         data.append(_tried(found.tried))
-    layout = seen_whole(data, beside(np.reshape(eyes, (-1, 3)) - middle))
+    layout = seen_whole(data, way_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",
@@ -367,16 +382,16 @@ def stations_document(found: MeasurementPlan) -> dict[str, Any]:
     return {"stations": out}
 
 
-def document_of(found: MeasurementPlan) -> dict[str, Any]:
+def plan_document(found: MeasurementPlan) -> dict[str, Any]:
     """Plain data for JSON: m and rad."""
     rig = found.subject.rig
     joined = zip(
         found.names, found.stations, found.rank, found.joints, found.T_base_platform,
         found.blocked, strict=True,
     )  # fmt: skip
-    return plain(
+    return json_value(
         {
-            "pkmcal_plan": FORMAT,
+            "pkmcal_plan": PLAN_FORMAT,
             "machine": rig.machine.name,
             "index": {"name": found.index, "value": found.value, "by_chance": found.at_random},
             "workspace": {

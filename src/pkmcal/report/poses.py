@@ -11,17 +11,17 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import charts
-from pkmcal.pages.drawn import KEPT
+from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.report.links import Links
-from pkmcal.report.residuals import SIGMAS, level_bar
+from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
-OPEN = 0.3
+OPEN_POSE_SIGMA = 0.3
 """m or rad; a place that is known no better is not told by the data."""
-MOST = 12
+MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
-JUMPS = (
+POSE_JUMPS_TEXT = (
     "Bars by configuration: a jump that stays says that something was moved, a single tall bar"
     " that this one photograph, or its readings, are wrong."
 )
@@ -41,7 +41,7 @@ def section(
     return Part(
         "poses",
         "Board" if session.board else "Measured poses",
-        (f"{' '.join([*_summary(poses, estimate, error), *turns])} {JUMPS}",),
+        (f"{' '.join([*_summary(poses, estimate, error), *turns])} {POSE_JUMPS_TEXT}",),
         html=charts.panels(
             _by_configuration(session, poses, estimate, links),
             _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm", links),
@@ -60,7 +60,7 @@ def errors(poses: PoseSet, estimate: Estimate) -> Array:
 
 
 def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...]:
-    kept = estimate.pose_weights >= KEPT
+    kept = estimate.pose_weights >= KEPT_EDGE_WEIGHT
     s = estimate.statistics
     aside = "" if kept.all() else f", {int(np.sum(~kept))} put aside"
     seen = count(len(np.unique(poses.configuration)), "configuration")
@@ -114,7 +114,7 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
     for value, spread in zip(values.tolist(), sigma.tolist(), strict=True):
         text = number(value * factor, decimals(spread * factor))
         known = f"{text} ± {brief(spread * factor)}" if spread else text
-        out.append("open" if spread > OPEN else known)
+        out.append("open" if spread > OPEN_POSE_SIGMA else known)
     return out
 
 
@@ -137,7 +137,7 @@ def _by_configuration(
         if n
     ]
     alt = "Bars of the poses' residuals by configuration"
-    title, unit = "Poses, by configuration", f"configurations; root mean square, {SIGMAS}"
+    title, unit = "Poses, by configuration", f"configurations; root mean square, {SIGMAS_IN_WORDS}"
     return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
@@ -176,21 +176,21 @@ def axes(poses: PoseSet, estimate: Estimate) -> charts.RowChart | None:
     alt = "Boxes of the poses' residuals by their six numbers"
     title = "Poses, by the six numbers"
     note = "about and along the station's x, y and z"
-    return charts.row_chart(title, SIGMAS, boxes, charts.NORMAL_90, alt, note)
+    return charts.row_chart(title, SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt, note)
 
 
 def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:
     """The poses that are farthest off, in standard deviations."""
     level = np.sqrt(np.sum(estimate.pose_residuals**2, axis=1) / np.maximum(poses.rows, 1))
     rows: list[Row] = []
-    for k in np.argsort(-level, kind="stable")[:MOST].tolist():
+    for k in np.argsort(-level, kind="stable")[:MOST_WORST_POSES].tolist():
         turn = float(np.rad2deg(np.linalg.norm(error[k, :3])))
         cells = (
             session.configurations[poses.configuration[k]],
             brief(_length(error[k : k + 1, 3:]) * 1e3),
             brief(turn),
             number(float(level[k]), 1),
-            "put aside" if estimate.pose_weights[k] < KEPT else "used",
+            "put aside" if estimate.pose_weights[k] < KEPT_EDGE_WEIGHT else "used",
         )
         rows.append(Row(session.station_names[poses.station[k]], cells))
     columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")
@@ -198,7 +198,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
     return Table(title, columns, tuple(rows), brief=False, words=(1, 5))
 
 
-def places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:
+def target_places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:
     """Where the targets were (N, 3), base frame, by the estimate, and their configurations."""
     poses, state = observation.poses, estimate.state
     on = state.on_platform[poses.mount]

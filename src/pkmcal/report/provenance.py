@@ -16,21 +16,21 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
-from pkmcal.pages.drawn import SIDES
+from pkmcal.pages.drawn import EDGE_SIDE_NAMES
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
-OPEN = 1e3
+OPEN_PLACE_SIGMA = 1e3
 """mm; a place that is known no better is not told by the data."""
-MODEL_ERROR = Markup(
+SIGMA_MEANING_TEXT = Markup(
     "<strong>What σ means here.</strong> The standard deviations say how much the result would"
     " scatter if the same photographs and readings were taken again. They know the noise of the"
     " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
     " lens that its file does not describe. Photographs that the calibration has not seen are the"
     " test for those."
 )
-NORMAL = 50
+NORMAL_FROM_FREEDOMS = 50
 """Degrees of freedom from which on a Student distribution is told as the normal one."""
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
@@ -97,7 +97,7 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     sigma = np.sqrt(np.maximum(variance, 0.0)) * 1e3  # rounding may leave less than none
     turn = float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3)))
     x, y, z = (
-        f"{number(v, decimals(d))} ± {brief(d) if d < OPEN else 'open'}"
+        f"{number(v, decimals(d))} ± {brief(d) if d < OPEN_PLACE_SIGMA else 'open'}"
         for v, d in zip(place.tolist(), sigma.tolist(), strict=True)
     )
     return x, y, z, f"{brief(turn)}°" if turn < 90 else "open"
@@ -113,9 +113,9 @@ def _moved(rough: Array | None, found: Array) -> str:
 
 def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
     """How it was computed. timings : seconds by step."""
-    html = page.render(
+    html = page.filled_template(
         "how.html.j2",
-        model_error=MODEL_ERROR,
+        model_error=SIGMA_MEANING_TEXT,
         lists=(
             ("Settings and solver", _settings(session, estimate)),
             ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
@@ -171,7 +171,11 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             (
                 f"Edges of tube {k}",
                 f"{number(scale, 2)} times the stated noise, and {number(shading, 3)} px by shading"
-                + (f"; tails as of {tails:g} degrees of freedom" if tails < NORMAL else ""),
+                + (
+                    f"; tails as of {tails:g} degrees of freedom"
+                    if tails < NORMAL_FROM_FREEDOMS
+                    else ""
+                ),
             )
             for k, (scale, shading, tails) in enumerate(tubes, start=1)
             if s.n_edges
@@ -209,10 +213,10 @@ class Reason:
 
 def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estimate) -> Part:
     """What was rejected, and which values can hardly be told apart."""
-    html = page.render(
+    html = page.filled_template(
         "rejected.html.j2",
         reasons=reasons(session, rejected),
-        tight=parameters.TIGHT,
+        tight=parameters.TIGHT_CORRELATION,
         together=parameters.bound_together(estimate),
     )
     return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
@@ -253,5 +257,5 @@ def _what(item: Rejection) -> str:
     if item.tube >= 0:
         words.append(f"tube {item.tube + 1}")
     if item.side >= 0:
-        words.append(SIDES[item.side])
+        words.append(EDGE_SIDE_NAMES[item.side])
     return " ".join(words)

@@ -17,31 +17,31 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.images import decode
-from pkmcal.pages.drawn import KEPT, edge_name, laid_over, residual_words
+from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT, edge_name, machine_laid_over, residual_words
 from pkmcal.pages.jpegs import coded
 from pkmcal.report import poses
 from pkmcal.report.pictures import edge_curves
-from pkmcal.report.residuals import rms
+from pkmcal.report.residuals import weighted_edge_rms
 from pkmcal.session.photographs import label_of
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-Kind = Literal[
+LoggedKind = Literal[
     "world", "transform", "pinhole", "photograph", "lines2d", "lines3d", "points3d",
     "numbers", "text", "clear",
 ]  # fmt: skip
-CORNER = 0.5
+VIEWER_PIXEL_CORNER = 0.5
 """px: pixel centres are at integers here, and half a pixel further where a picture begins with its
 first pixel's corner, as in viewers."""
-QUALITY = 85
-LEGS = (
+RECORDING_JPEG_QUALITY = 85
+RECORDED_LEG_COLOURS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66),
     (0, 114, 178), (213, 94, 0), (204, 121, 167), (140, 140, 140),
 )  # fmt: skip
 """Colours that all eyes can tell apart (Okabe and Ito), by leg."""
-GREY, WHITE = (150, 150, 150), (255, 255, 255)
-THIN = 0.002
+RECORDED_GREY, RECORDED_WHITE = (150, 150, 150), (255, 255, 255)
+TUBELESS_LEG_RADIUS = 0.002
 """m, radius of a leg of which the drawing has no tube."""
 
 
@@ -53,7 +53,7 @@ class Logged(NamedTuple):
     """
 
     path: tuple[str, ...]
-    kind: Kind
+    kind: LoggedKind
     values: dict[str, Any]
     at: int | None = None
 
@@ -94,7 +94,9 @@ def _stations(c: Calibration) -> Iterator[Logged]:
         camera = station.camera
         if camera.model == "pinhole":
             fx, fy, cx, cy = camera.parameters[:4]
-            k = np.array([[fx, 0, cx + CORNER], [0, fy, cy + CORNER], [0, 0, 1]])
+            k = np.array(
+                [[fx, 0, cx + VIEWER_PIXEL_CORNER], [0, fy, cy + VIEWER_PIXEL_CORNER], [0, 0, 1]]
+            )
             yield Logged((*at, "image"), "pinhole", {"k": k, "size": camera.image_size})
 
 
@@ -133,7 +135,12 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     ):
         strips, radii, legs = _tubes(of, joints, T)
         strips = [apply(move, strip) for strip in strips]
-        colours = [LEGS[j % len(LEGS)] if name == "calibrated" else GREY for j in legs]
+        colours = [
+            RECORDED_LEG_COLOURS[j % len(RECORDED_LEG_COLOURS)]
+            if name == "calibrated"
+            else RECORDED_GREY
+            for j in legs
+        ]
         told = {"strips": strips, "radii": radii, "colours": colours}
         labels = [f"leg {j + 1}" for j in legs]
         yield Logged(("machine", name), "lines3d", {**told, "labels": labels}, at)
@@ -141,11 +148,13 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     points = np.concatenate([ends.a, ends.b])
     labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
     path = ("machine", "calibrated", "centres")
-    yield Logged(path, "points3d", {"points": points, "labels": labels, "colour": WHITE}, at)
+    yield Logged(
+        path, "points3d", {"points": points, "labels": labels, "colour": RECORDED_WHITE}, at
+    )
     if len(c.observation.poses):
-        points, configuration = poses.places(c.observation, c.estimate)
+        points, configuration = poses.target_places(c.observation, c.estimate)
         points = points[configuration == k]
-        told = {"points": points, "labels": list[str](), "colour": LEGS[0]}
+        told = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
         yield Logged(("machine", "measured"), "points3d", told, at)
 
 
@@ -165,7 +174,7 @@ def _tubes(
             legs.append(j)
         if not len(known):
             strips.append(np.stack([ends.a[j], ends.b[j]]))
-            radii.append(THIN)
+            radii.append(TUBELESS_LEG_RADIUS)
             legs.append(j)
     return strips, radii, legs
 
@@ -179,42 +188,51 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     if photo is None:
         # black: rerun's viewer goes on showing a coded picture that was cleared (its issue 12793)
         width, height = station.camera.image_size
-        black = coded(np.zeros((height, width)), QUALITY)
+        black = coded(np.zeros((height, width)), RECORDING_JPEG_QUALITY)
         yield Logged((*path, "photograph"), "photograph", {"jpeg": black}, at)
         for part in ("edges", "aside", "contour"):
             yield Logged((*path, part), "clear", {}, at)
         return
     label = label_of(session.folder, photo.path)
     grey = decode(photo.path, station.camera.image_size, label)
-    yield Logged((*path, "photograph"), "photograph", {"jpeg": coded(grey, QUALITY)}, at)
+    yield Logged(
+        (*path, "photograph"), "photograph", {"jpeg": coded(grey, RECORDING_JPEG_QUALITY)}, at
+    )
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
     curves = edge_curves(c, mine, s)
-    used = estimate.edge_weights[mine] >= KEPT
+    used = estimate.edge_weights[mine] >= KEPT_EDGE_WEIGHT
     for part, chosen in (("edges", used), ("aside", ~used)):
         rows = np.flatnonzero(chosen)
-        strips = [curves[n][np.isfinite(curves[n]).all(axis=-1)] + CORNER for n in rows]
+        strips = [
+            curves[n][np.isfinite(curves[n]).all(axis=-1)] + VIEWER_PIXEL_CORNER for n in rows
+        ]
         own = edges.select(mine[rows])
         told = {
             "strips": strips,
-            "colours": [LEGS[j % len(LEGS)] if part == "edges" else GREY for j in own.leg],
+            "colours": [
+                RECORDED_LEG_COLOURS[j % len(RECORDED_LEG_COLOURS)]
+                if part == "edges"
+                else RECORDED_GREY
+                for j in own.leg
+            ],
             "labels": [_tip(c, int(n)) for n in mine[rows]],
         }
         yield Logged((*path, part), "lines2d", told, at)
     if estimate.configurations[k]:
-        drawn, _ = laid_over(
+        drawn, _ = machine_laid_over(
             estimate.machine,
             station.camera,
             estimate.state.T_camera_base[s],
             session.joints[k],
             estimate.state.T_base_platform[k],
         )
-        strips = [np.array(edge.points) + CORNER for edge in drawn]
+        strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in drawn]
         labels = [edge.tip for edge in drawn]
-        told = {"strips": strips, "colours": [WHITE] * len(strips), "labels": labels}
+        told = {"strips": strips, "colours": [RECORDED_WHITE] * len(strips), "labels": labels}
         yield Logged((*path, "contour"), "lines2d", told, at)
     if len(mine):
-        level = rms(estimate.edge_residuals[mine], estimate.edge_weights[mine])
+        level = weighted_edge_rms(estimate.edge_residuals[mine], estimate.edge_weights[mine])
         yield Logged(("residuals", "edges", station.name), "numbers", {"value": level}, at)
 
 

@@ -14,19 +14,19 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import charts
-from pkmcal.pages.drawn import KEPT, SIDES
+from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
-STANDS_OUT = 1.5
+GROUP_STANDS_OUT_FACTOR = 1.5
 """A group whose residuals are this many times the middle group's is worth a sentence."""
-SHADED = 0.05
+SHADED_MEAN_SHIFT = 0.05
 """Mean outward shift (px) from which a sentence is due: shading moves edges by this and more."""
-SIGMAS = "standard deviations"
-HISTOGRAM = 5.0
+SIGMAS_IN_WORDS = "standard deviations"
+HISTOGRAM_HALF_SPAN = 5.0
 """Standard deviations that the histogram spans to either side."""
-READING = (
+RESIDUALS_READING_TEXT = (
     "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
     " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
     " Longer lines mean that something other than the stated noise is at work; a box off zero,"
@@ -57,7 +57,7 @@ def section(
         _outward(edges, shifts, links),
         remarks=remarks(session, edges, estimate, shifts),
     )
-    return Part("residuals", "Residuals", (READING,), html=shown)
+    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=shown)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:
@@ -82,7 +82,7 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     return dot(weighted, error) / dot(weighted, edges.shift)
 
 
-def rms(white: Array, weights: Array) -> float:
+def weighted_edge_rms(white: Array, weights: Array) -> float:
     """Root mean square of residuals (n, 2) with the edges' weights (n,); NaN without any."""
     total = 2 * float(np.sum(weights))
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
@@ -115,7 +115,7 @@ def _edge_boxes(
         lead = links.to_largest(edges.station[mine], edges.configuration[mine], size)
         boxes.append(charts.box(name, white[mine], "σ", 2, g + 1 if by == "leg" else None, lead))
     alt = f"Boxes of the whitened edge residuals by {by}"
-    return charts.row_chart(f"Edges, by {by}", SIGMAS, boxes, charts.NORMAL_90, alt)
+    return charts.row_chart(f"Edges, by {by}", SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt)
 
 
 def _configurations(
@@ -126,13 +126,13 @@ def _configurations(
     for k, name in enumerate(session.configurations):
         mine = edges.configuration == k
         weights = estimate.edge_weights[mine]
-        level = rms(estimate.edge_residuals[mine], weights)
+        level = weighted_edge_rms(estimate.edge_residuals[mine], weights)
         if not np.isfinite(level):
             continue
         of = f" over {count(len(weights), 'edge')}"
         lead = links.to_configuration(k)
         bars.append(level_bar(name, level, 2 * float(weights.sum()), of, lead))
-    title, unit = "Edges, by configuration", f"configurations; root mean square, {SIGMAS}"
+    title, unit = "Edges, by configuration", f"configurations; root mean square, {SIGMAS_IN_WORDS}"
     alt = "Bars of the residuals by configuration"
     return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
@@ -160,30 +160,34 @@ def histogram(white: Array) -> charts.BarChart | None:
     values = white[np.isfinite(white)]
     if not values.size:
         return None
-    borders = np.arange(-HISTOGRAM, HISTOGRAM + 0.25, 0.5)
-    counts = np.histogram(np.clip(values, -HISTOGRAM, HISTOGRAM), borders)[0]
+    borders = np.arange(-HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN + 0.25, 0.5)
+    counts = np.histogram(np.clip(values, -HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN), borders)[0]
     bars: list[charts.UprightBar] = []
     for low, high, n in zip(borders[:-1], borders[1:], counts.tolist(), strict=True):
         where = f"{number(low, 1)} to {number(high, 1)} σ"
-        if low == -HISTOGRAM or high == HISTOGRAM:
+        if low == -HISTOGRAM_HALF_SPAN or high == HISTOGRAM_HALF_SPAN:
             where += " or beyond"
         bars.append(
             charts.UprightBar(where, f"{where}: {count(n, 'residual')}", float(n), None, True)
         )
-    x = np.linspace(-HISTOGRAM, HISTOGRAM, 81)
+    x = np.linspace(-HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN, 81)
     density = np.exp(-x * x / 2) / np.sqrt(2 * np.pi) * values.size * 0.5
-    curve = tuple(zip(((x + HISTOGRAM) * 2).tolist(), density.tolist(), strict=True))
-    labels = tuple(((v + HISTOGRAM) * 2, number(v, 0)) for v in (-4.0, -2.0, 0.0, 2.0, 4.0))
+    curve = tuple(zip(((x + HISTOGRAM_HALF_SPAN) * 2).tolist(), density.tolist(), strict=True))
+    labels = tuple(
+        ((v + HISTOGRAM_HALF_SPAN) * 2, number(v, 0)) for v in (-4.0, -2.0, 0.0, 2.0, 4.0)
+    )
     alt = "Histogram of the residuals with the normal density over it"
     return charts.bar_chart(
-        "All edge residuals", f"{SIGMAS}; number of residuals", bars, labels, alt, curve
+        "All edge residuals", f"{SIGMAS_IN_WORDS}; number of residuals", bars, labels, alt, curve
     )
 
 
 def _outward(edges: EdgeSet, shifts: Array, links: Links) -> charts.RowChart | None:
     """Outward shift of every leg's edges: shading and wrong radii show here."""
     boxes = [
-        charts.box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1, lead)
+        charts.box(
+            f"leg {j + 1}, tube {t + 1}, {EDGE_SIDE_NAMES[s]}", shifts[mine], "px", 3, j + 1, lead
+        )
         for (j, t, s), mine in _edge_kinds(edges)
         for lead in [
             links.to_largest(edges.station[mine], edges.configuration[mine], np.abs(shifts[mine]))
@@ -221,7 +225,9 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowCha
     # readings that poses follow are near zero whatever their noise: few freedoms say so
     s = estimate.statistics
     note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
-    return charts.row_chart("Joint readings, by leg", SIGMAS, boxes, charts.NORMAL_90, alt, note)
+    return charts.row_chart(
+        "Joint readings, by leg", SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt, note
+    )
 
 
 def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:
@@ -246,12 +252,15 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
 def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[str]:
     """Groups whose residuals are far above the middle group's, edges put aside not counted."""
     white, weights = estimate.edge_residuals, estimate.edge_weights
-    level = {g: rms(white[group == g], weights[group == g]) for g in np.unique(group).tolist()}
+    level = {
+        g: weighted_edge_rms(white[group == g], weights[group == g])
+        for g in np.unique(group).tolist()
+    }
     level = {g: value for g, value in level.items() if np.isfinite(value)}
     if len(level) < 3:
         return []
     middle = float(np.median(list(level.values())))
-    found = [g for g, value in level.items() if value > STANDS_OUT * middle]
+    found = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
     found = sorted(found, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
@@ -264,11 +273,11 @@ def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
     """Legs' edges whose mean shift is large and sure, the largest first, in words."""
     found: list[tuple[float, str]] = []
     for (leg, tube, side), mine in _edge_kinds(edges):
-        values = shifts[mine & (estimate.edge_weights >= KEPT) & np.isfinite(shifts)]
+        values = shifts[mine & (estimate.edge_weights >= KEPT_EDGE_WEIGHT) & np.isfinite(shifts)]
         if len(values) < 4:
             continue
         mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
-        if abs(mean) > max(SHADED, 3 * error):
-            where = f"leg {leg + 1} tube {tube + 1} {SIDES[side]}"
+        if abs(mean) > max(SHADED_MEAN_SHIFT, 3 * error):
+            where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
             found.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
     return [text for _, text in sorted(found, reverse=True)[:4]]

@@ -17,17 +17,17 @@ from pkmcal.report.recording import Logged, recorded
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-APPLICATION = "pkmcal"
-TIMELINE = "configuration"
-ENDING = ".rrd"
-BESIDE = 4
+RERUN_APPLICATION = "pkmcal"
+RERUN_TIMELINE = "configuration"
+RERUN_FILE_ENDING = ".rrd"
+STATIONS_SIDE_BY_SIDE = 4
 """Stations whose photographs stand beside each other; those of more behind each other."""
 
 
 def check_rrd(path: Path | str) -> None:
     """Raise InputError where no recording could be written; call it before the work."""
     path = Path(path)
-    if path.suffix != ENDING:
+    if path.suffix != RERUN_FILE_ENDING:
         raise InputError(
             "a recording has another ending", where="--rrd", found=path.name, expected="NAME.rrd"
         )
@@ -51,14 +51,14 @@ def write_rrd(calibration: Calibration, path: Path | str) -> None:
     check_rrd(path)
     rr: Any = import_module("rerun")
     session = calibration.session
-    stream = rr.RecordingStream(APPLICATION)
+    stream = rr.RecordingStream(RERUN_APPLICATION)
     with staged_file(path) as part:
         stream.save(part, default_blueprint=_blueprint(session.station_names))
         stream.send_recording_name(session.folder.resolve().name)
         for one in recorded(calibration):
             what = _archetype(rr, one)
             if one.at is not None:
-                stream.set_time(TIMELINE, sequence=one.at)
+                stream.set_time(RERUN_TIMELINE, sequence=one.at)
             stream.log(list(one.path), what, static=one.at is None)
         stream.disconnect()  # which waits for the file
 
@@ -111,7 +111,7 @@ def _blueprint(stations: tuple[str, ...]) -> Any:
         )
         for name in stations
     ]
-    beside = rrb.Grid if len(stations) <= BESIDE else rrb.Tabs
+    beside = rrb.Grid if len(stations) <= STATIONS_SIDE_BY_SIDE else rrb.Tabs
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Spatial3DView(origin="/machine", name="Machine"),
@@ -126,6 +126,6 @@ def _blueprint(stations: tuple[str, ...]) -> Any:
                 ),
             ),
         ),
-        rrb.TimePanel(timeline=TIMELINE),
+        rrb.TimePanel(timeline=RERUN_TIMELINE),
         collapse_panels=True,
     )

@@ -19,19 +19,19 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
-from pkmcal.pages.charts import WIDTH, enlargement
+from pkmcal.pages.charts import CHART_WIDTH, enlargement
 from pkmcal.pages.plots import line, markers, ring, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
-ELLIPSE = 2.0
+ELLIPSE_SIGMAS = 2.0
 """Standard deviations that ellipses and ellipsoids reach."""
-SHARE = 0.22
+ENLARGED_ERROR_SHARE = 0.22
 """Part of the machine's radius that the large errors should span once enlarged."""
-MARGIN = 30.0
-NEAR = 9.0
+PLANE_VIEW_MARGIN = 30.0
+LABELS_MERGED_WITHIN = 9.0
 """SVG units within which two labels are written as one."""
-RING = 25
+ELLIPSOID_RING_POINTS = 25
 """Points of an ellipsoid's ring."""
 
 
@@ -71,7 +71,7 @@ class BeforeAfter:
 
 
 @dataclass(frozen=True)
-class Mark:
+class JointMark:
     """A joint in a plane view, SVG units. ellipse : rx, ry, angle in degrees."""
 
     leg: int
@@ -94,7 +94,7 @@ class Projection:
     width: float
     height: float
     axes: tuple[str, str]
-    marks: tuple[Mark, ...]
+    marks: tuple[JointMark, ...]
     limbs: tuple[tuple[tuple[float, float], ...], ...]
     grid: tuple[tuple[bool, float, str], ...]
     labels: tuple[tuple[float, float, str], ...]
@@ -110,7 +110,7 @@ def section(
     return Part(
         "geometry",
         "Geometry before and after",
-        (page.render("geometry.html.j2", scene=drawn),),
+        (page.filled_template("geometry.html.j2", scene=drawn),),
         plots=(
             Plot(
                 "space",
@@ -122,7 +122,7 @@ def section(
                 height=420,
             ),
         ),
-        html=page.render("views.html.j2", views=views(drawn)),
+        html=page.filled_template("views.html.j2", views=plane_projections(drawn)),
         menu="Geometry",
     )
 
@@ -137,8 +137,8 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
     sigma = np.concatenate([c.sigma for c in centres])
-    factor = enlargement(change, SHARE * size)
-    spread_factor = enlargement(ELLIPSE * sigma, SHARE / 3 * size)
+    factor = enlargement(change, ENLARGED_ERROR_SHARE * size)
+    spread_factor = enlargement(ELLIPSE_SIGMAS * sigma, ENLARGED_ERROR_SHARE / 3 * size)
     joints: list[Joint] = []
     before, after = (m.arms_at(m.middle_readings()) for m in (session.machine, estimate.machine))
     for side in centres:
@@ -160,7 +160,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
-def views(scene: BeforeAfter) -> tuple[Projection, Projection]:
+def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
     """From above, and from the side that parts the base joints best."""
     base = np.array([joint.drawing for joint in scene.of_side("base")])
     gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
@@ -179,17 +179,17 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
     corners = np.concatenate([drawn, shown, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    scale = (WIDTH - 2 * MARGIN) / (high - low).max()
-    width, height = WIDTH, float((high - low)[1] * scale + 2 * MARGIN)
+    scale = (CHART_WIDTH - 2 * PLANE_VIEW_MARGIN) / (high - low).max()
+    width, height = CHART_WIDTH, float((high - low)[1] * scale + 2 * PLANE_VIEW_MARGIN)
     left = (width - float((high - low)[0]) * scale) / 2
 
     def place(point: Array) -> tuple[float, float]:
         x, y = (point - low) * scale
-        return round(left + float(x), 1), round(height - MARGIN - float(y), 1)
+        return round(left + float(x), 1), round(height - PLANE_VIEW_MARGIN - float(y), 1)
 
     names = ("x", "y", "z")
     marks = tuple(
-        Mark(
+        JointMark(
             j.leg, j.side, place(d), place(s), _ellipse(j.spread[np.ix_(pick, pick)], scale), j.tip
         )
         for j, d, s in zip(scene.joints, drawn, shown, strict=True)
@@ -213,9 +213,9 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
 
 
 def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
-    """Half axes (SVG units) and turn (degrees, y downwards) of ``ELLIPSE`` sigma."""
+    """Half axes (SVG units) and turn (degrees, y downwards) of ``ELLIPSE_SIGMAS`` sigma."""
     values, vectors = np.linalg.eigh(spread)
-    ry, rx = ELLIPSE * scale * np.sqrt(np.maximum(values, 0))
+    ry, rx = ELLIPSE_SIGMAS * scale * np.sqrt(np.maximum(values, 0))
     angle = -np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
     return round(float(rx), 2), round(float(ry), 2), round(float(angle), 1)
 
@@ -236,7 +236,7 @@ def _grid(
 
 
 def _labels(
-    marks: tuple[Mark, ...], centre: tuple[float, float]
+    marks: tuple[JointMark, ...], centre: tuple[float, float]
 ) -> tuple[tuple[float, float, str], ...]:
     """Leg numbers beside their marks, away from the middle; those that would meet share one."""
     placed: list[tuple[float, float, list[int]]] = []
@@ -244,7 +244,7 @@ def _labels(
         dx, dy = mark.drawing[0] - centre[0], mark.drawing[1] - centre[1]
         away = max(math.hypot(dx, dy), 1e-6)
         x, y = mark.drawing[0] + 13 * dx / away, mark.drawing[1] + 13 * dy / away
-        near = [p for p in placed if math.hypot(p[0] - x, p[1] - y) < NEAR]
+        near = [p for p in placed if math.hypot(p[0] - x, p[1] - y) < LABELS_MERGED_WITHIN]
         if near and mark.leg not in near[0][2]:
             near[0][2].append(mark.leg)
         elif not near:
@@ -291,14 +291,14 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
 
 def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
     """Three rings of every centre's ellipsoid, along its principal planes."""
-    angle = np.linspace(0, 2 * np.pi, RING)
+    angle = np.linspace(0, 2 * np.pi, ELLIPSOID_RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     segments: list[Array] = []
     for joint in scene.joints:
         values, axes = np.linalg.eigh(joint.spread)
-        half = axes * (ELLIPSE * np.sqrt(np.maximum(values, 0)))
+        half = axes * (ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0)))
         segments += [joint.shown + circle @ half[:, list(p)].T for p in ((0, 1), (0, 2), (1, 2))]
-    return line(f"{ELLIPSE:g}σ, × {scene.spread_factor:g}", "--calibrated", 2, segments)
+    return line(f"{ELLIPSE_SIGMAS:g}σ, × {scene.spread_factor:g}", "--calibrated", 2, segments)
 
 
 def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:

@@ -18,17 +18,22 @@ from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
 """Choices of legs told of each number of them."""
-COLOURS = {"true": "--quiet", "identified": "--drawing", "cad": "--good", "hand": "--calibrated"}
-SHADES = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
-FRAMES = 60
+SERVO_ESTIMATE_COLOURS = {
+    "true": "--quiet",
+    "identified": "--drawing",
+    "cad": "--good",
+    "hand": "--calibrated",
+}
+SERVO_BAND_COLOURS = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
+ANIMATION_FRAMES = 60
 """Pictures of the animation; more only make the page heavy."""
-POINTS = 300
+SERVO_CURVE_POINTS = 300
 """Points of a curve."""
-LEAST = 1e-5
+LEAST_SERVO_ERROR_SHARE = 1e-5
 """Part of the error's start below which a curve tells nothing."""
-ALONG = 17
+SERVO_EDGE_PLACES = 17
 """Places along an edge that is drawn; edges are curves in a mirror."""
-HOW = (
+SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
     " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
     " legs' directions. The drives' rates are −gain · D N⁺ e, with the interaction matrix N and the"
@@ -44,7 +49,7 @@ HOW = (
 def outcome_of(found: Study) -> Outcome:
     """Everything that `pkmcal servo` tells and writes."""
     verdict, run = judgement(found), shown_run(found)
-    document = document_of(found, verdict)
+    document = servo_document(found, verdict)
     ends = ends_table(found)
     return Outcome(
         command="servo",
@@ -53,7 +58,7 @@ def outcome_of(found: Study) -> Outcome:
         kicker="visual servoing, simulated",
         subject=found.scene.origin,
         stamp="It works in simulation" if verdict.usable else "Not to be used",
-        figures=cards(found),
+        figures=servo_cards(found),
         parts=(
             Part(
                 "curves",
@@ -109,7 +114,7 @@ def outcome_of(found: Study) -> Outcome:
                 ),
             ),
             Part("legs", "Legs", tables=(choices_table(found),)),
-            Part("how", "How it was computed", HOW, tables=(settings_table(found),)),
+            Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(found),)),
         ),
         findings=tuple(doubtful(text) for text in found.scene.warnings),
         document=document,
@@ -131,7 +136,7 @@ def stillness(s: Study) -> str:
     )
 
 
-def document_of(s: Study, verdict: Verdict) -> dict[str, Any]:
+def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
     """Plain data for JSON: m, rad, s; legs count from 1."""
     return {
         "machine": s.scene.machine.name,
@@ -181,7 +186,7 @@ def shown_run(found: Study) -> int:
     return int(np.argmax(np.where(everywhere, found.outcome("hand").astray, -1.0)))
 
 
-def cards(s: Study) -> tuple[Figure, ...]:
+def servo_cards(s: Study) -> tuple[Figure, ...]:
     """The main numbers."""
     good, hand = s.outcome("identified"), s.outcome("hand")
     n = s.plan.runs
@@ -423,14 +428,16 @@ def curves(s: Study) -> dict[str, Any]:
     """Norm of the error against time, a line and a band for each estimate."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), POINTS)
+    rows = _every(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
-        values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST)
+        values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST_SERVO_ERROR_SHARE)
         name = o.estimate.name
-        if name in SHADES:
-            data.append(_band(time[rows], values, SHADES[name], name))
+        if name in SERVO_BAND_COLOURS:
+            data.append(_band(time[rows], values, SERVO_BAND_COLOURS[name], name))
     for o in s.outcomes:
-        values = np.maximum(np.median(shares(o, o.runs.error)[:, rows], axis=0), LEAST)
+        values = np.maximum(
+            np.median(shares(o, o.runs.error)[:, rows], axis=0), LEAST_SERVO_ERROR_SHARE
+        )
         data.append(_curve(o, time[rows], values, "%{y:.2g} after %{x:.2f} s"))
     layout = plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
@@ -441,7 +448,7 @@ def tail(s: Study) -> dict[str, Any]:
     """Distance from the goal, as a part of the way, enlarged near zero."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), POINTS)
+    rows = _every(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
         values = 100 * np.median(shares(o, o.runs.way)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
@@ -452,7 +459,7 @@ def tail(s: Study) -> dict[str, Any]:
 
 def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
     dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
-    look = {"color": COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
+    look = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
     told = {"hoverinfo": "all", "hovertemplate": hover}
     return _flat(o.estimate.title, _rounded(time), _rounded(values), look, **told)
 
@@ -511,7 +518,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     data.append(dashed)
     for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
         o = s.outcome(name)
-        poses = o.runs.T_base_platform[run][_every(len(o.runs.time), FRAMES)]
+        poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
         middle = _limbs(s, poses)[1].mean(axis=1)
         data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
     camera = markers(
@@ -537,7 +544,7 @@ def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
     """The pictures of :func:`space`'s animation."""
     runs = s.outcome("identified").runs
     out: list[dict[str, Any]] = []
-    for row in _every(int(runs.last[run]) + 1, FRAMES):
+    for row in _every(int(runs.last[run]) + 1, ANIMATION_FRAMES):
         moving = _moving(s, runs.T_base_platform[run, row])
         out.append(
             {
@@ -601,7 +608,7 @@ def _pixels(s: Study, poses: Array, places: int) -> Array:
 
 
 def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[dict[str, Any]]:
-    pixels = _pixels(s, pose, ALONG)[0]
+    pixels = _pixels(s, pose, SERVO_EDGE_PLACES)[0]
     return [
         _flat(
             f"edges {name}",
@@ -618,7 +625,7 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
 def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
     """Ways of both ends of each leg's first edge."""
     o = s.outcome(name)
-    poses = o.runs.T_base_platform[run][_every(len(o.runs.time), FRAMES)]
+    poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
     pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
     data: list[dict[str, Any]] = []
     for e in range(0, len(s.eye.tubes.leg), 2):
@@ -628,7 +635,7 @@ def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
                 f"way, {o.estimate.title.lower()}",
                 _pixel_list(ways[:, 0]),
                 _pixel_list(ways[:, 1]),
-                {"color": COLOURS[name], "width": 1.6, "dash": dash},
+                {"color": SERVO_ESTIMATE_COLOURS[name], "width": 1.6, "dash": dash},
                 legendgroup=f"way {name}",
                 showlegend=e == 0,
             )

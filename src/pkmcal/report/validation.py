@@ -13,9 +13,9 @@ from pkmcal.outcome import Figure, Outcome, Part, Row, Table, doubtful
 from pkmcal.pages import charts
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import SCALES, amount, brief, count, decimals, number
+from pkmcal.wording import SHOWN_UNITS, amount, brief, count, decimals, number
 
-HOW = (
+VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
     " platform are estimated from the photographs; a configuration's own readings have no part in"
     " its pose, and where photographs leave open where a camera or a board is, the readings of the"
@@ -45,7 +45,7 @@ def outcome_of(v: Validation) -> Outcome:
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
         if v.regions
         else None,
-        Part("how", "How it was computed", HOW, notes=notes),
+        Part("how", "How it was computed", VALIDATION_METHOD_TEXT, notes=notes),
     )
     return Outcome(
         command="validate",
@@ -80,7 +80,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
         Figure(
             "Where is the tool, by the readings?",
             tuple(
-                (_size(value, unit), SCALES[unit][1])
+                (_size(value, unit), SHOWN_UNITS[unit][1])
                 for value, unit in ((new.position, "m"), (new.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
@@ -190,7 +190,7 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
     )
 
 
-def held_out(item: HoldOut, session: Session) -> Part:
+def held_out_part(item: HoldOut, session: Session) -> Part:
     """What a calibration's report says of configurations held out of it."""
     out, used, unit = item.left_out, item.used, _unit(session)
     amounts = inside = ""
@@ -239,7 +239,7 @@ def held_out(item: HoldOut, session: Session) -> Part:
 def _joints(session: Session) -> list[tuple[str, str]]:
     """Name with unit for a table's row, and m or rad, of each reading."""
     names, units = session.document["joints"]["columns"], session.machine.joint_units
-    return [(f"{n}, {SCALES[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
+    return [(f"{n}, {SHOWN_UNITS[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
 
 
 def _unit(session: Session) -> str | None:
@@ -256,13 +256,13 @@ def _mean_rms(found: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
 
 def _signed(value: float, sigma: float, unit: str) -> str:
     """A number with the digits that ``sigma`` deserves."""
-    scale = SCALES[unit][0]
+    scale = SHOWN_UNITS[unit][0]
     return number(value * scale, decimals(sigma * scale), signed=True)
 
 
 def _size(value: float, unit: str) -> str:
     """A magnitude in the unit that people read, two significant digits."""
-    return brief(value * SCALES[unit][0])
+    return brief(value * SHOWN_UNITS[unit][0])
 
 
 def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
@@ -272,7 +272,7 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
     unit = _unit(session)
     if unit is None:
         return None
-    scale, name = SCALES[unit]
+    scale, name = SHOWN_UNITS[unit]
     bars = [
         charts.UprightBar(
             session.configurations[row],

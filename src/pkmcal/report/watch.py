@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.identify.score import Score
-from pkmcal.judge.changes import POWER, LegTest
+from pkmcal.judge.changes import DETECTION_POWER, LegTest
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, doubtful
 from pkmcal.pages import charts
-from pkmcal.wording import SCALES, amount, brief, count, listed, named, number
+from pkmcal.wording import SHOWN_UNITS, amount, brief, count, listed, named, number
 
-NONE = "–"
-LARGE = 2.0
+NOTHING_KNOWN_SIGN = "–"
+LARGE_RESIDUAL_SIGMAS = 2.0
 """Standard deviations from which on a configuration's residuals stand out."""
-HOW = (
+WATCH_METHOD_TEXT = (
     "Nothing is calibrated anew. The machine is held as the calibration left it; every pose of the"
     " platform, and where cameras and boards stand, are found from the new data. What is left over"
     " is weighed by the noise of these data and by the calibration's own covariance, as far as"
@@ -29,7 +29,7 @@ HOW = (
 )
 
 
-KEPT = (
+LEFT_IN_PLACE_TEXT = (
     "Where the calibration had a camera is known as well as its covariance with the machine tells,"
     " most of which the photographs of both share. Whether such a camera was moved is tested as"
     " well; a base that moved against its camera looks the same."
@@ -76,8 +76,8 @@ def _how(w: Watch) -> Part:
     )
     known = [n for n, k in zip(w.session.configurations, w.known, strict=True) if k]
     left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
-    stayed = f"Left in place: {listed(w.same_place, 8)}. {KEPT}"
-    said = (*HOW, stayed, allowed) if w.same_place else (*HOW, allowed)
+    stayed = f"Left in place: {listed(w.same_place, 8)}. {LEFT_IN_PLACE_TEXT}"
+    said = (*WATCH_METHOD_TEXT, stayed, allowed) if w.same_place else (*WATCH_METHOD_TEXT, allowed)
     return Part("how", "How it was computed", said, notes=(left_out,) if known else ())
 
 
@@ -110,7 +110,7 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
             Figure(
                 "What would have been found?",
                 (found_from(sizes),),
-                f"of the zero of a leg's reading, depending on the leg, with {POWER:.0%}"
+                f"of the zero of a leg's reading, depending on the leg, with {DETECTION_POWER:.0%}"
                 " probability",
             )
         )
@@ -134,7 +134,9 @@ def legs_table(w: Watch) -> Table:
                 _statistic(leg.zero),
                 chance_text(leg.chance),
                 _zero(leg),
-                amount(leg.detects_zero, leg.unit) if np.isfinite(leg.detects_zero) else NONE,
+                amount(leg.detects_zero, leg.unit)
+                if np.isfinite(leg.detects_zero)
+                else NOTHING_KNOWN_SIGN,
                 _span(leg.detects_base),
                 _span(leg.detects_platform),
             ),
@@ -152,7 +154,8 @@ def legs_table(w: Watch) -> Table:
         "χ² of all numbers of a leg, and of the zero of its reading alone. Chance: of as much in a"
         " machine that did not change, all tests allowed for. Zero off by: if nothing else"
         " changed. Found from: the smallest change of that zero, and of the joints in the direction"
-        f" seen best and worst, that has a {POWER:.0%} probability to be found. A leg that changed"
+        f" seen best and worst, that has a {DETECTION_POWER:.0%} probability to be found. A leg"
+        f" that changed"
         " moves the tests of the others, too.",
         first=6,
     )
@@ -162,7 +165,7 @@ def _others_table(w: Watch) -> Table:
     """Tests of all legs together."""
     j = w.judged
     scale = j.scale_change
-    text = NONE
+    text = NOTHING_KNOWN_SIGN
     if j.scale.dof:
         text = (
             f"{number(scale.value[0] * 1e6, 0, signed=True)} µm/m"
@@ -211,30 +214,42 @@ def _findings_table(w: Watch) -> Table | None:
 def chance_text(chance: float) -> str:
     """A probability with one or two digits, never zero."""
     if not np.isfinite(chance):
-        return NONE
+        return NOTHING_KNOWN_SIGN
     if chance < 1e-4:
         return "< 0.0001"
     return f"{chance:.2g}" if chance < 0.995 else "1"
 
 
 def _cells(test: Score) -> tuple[str, str, str]:
-    told = (number(test.chi2, 1), chance_text(test.adjusted)) if test.dof else (NONE, NONE)
+    told = (
+        (number(test.chi2, 1), chance_text(test.adjusted))
+        if test.dof
+        else (NOTHING_KNOWN_SIGN, NOTHING_KNOWN_SIGN)
+    )
     return told[0], str(test.dof), told[1]
 
 
 def _statistic(test: Score | None) -> str:
-    return f"{number(test.chi2, 1)} / {test.dof}" if test is not None and test.dof else NONE
+    return (
+        f"{number(test.chi2, 1)} / {test.dof}"
+        if test is not None and test.dof
+        else NOTHING_KNOWN_SIGN
+    )
 
 
 def _zero(leg: LegTest) -> str:
     if leg.change is None or leg.zero is None or not leg.zero.dof:
-        return NONE
+        return NOTHING_KNOWN_SIGN
     return signed(float(leg.change.value[0]), float(leg.change.sigma[0]), leg.unit)
 
 
 def _span(sizes: tuple[float, float]) -> str:
-    texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NONE for v in sizes]
-    return NONE if texts == [NONE, NONE] else " to ".join(texts)
+    texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NOTHING_KNOWN_SIGN for v in sizes]
+    return (
+        NOTHING_KNOWN_SIGN
+        if texts == [NOTHING_KNOWN_SIGN, NOTHING_KNOWN_SIGN]
+        else " to ".join(texts)
+    )
 
 
 def _statistics(w: Watch) -> charts.BarChart | None:
@@ -272,7 +287,7 @@ def _zeros(w: Watch) -> charts.RowChart | None:
     legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
     if not legs or len({leg.unit for leg in legs}) > 1:
         return None
-    factor, name = SCALES[legs[0].unit]
+    factor, name = SHOWN_UNITS[legs[0].unit]
     boxes: list[charts.Spread] = []
     for leg in legs:
         if leg.change is None or not np.isfinite(leg.change.sigma[0]):
@@ -300,7 +315,11 @@ def _by_configuration(w: Watch) -> charts.BarChart | None:
     names = [w.session.configurations[k] for k in rows]
     bars = [
         charts.UprightBar(
-            name, f"{name}: {number(value, 2)} standard deviations", value, None, value < LARGE
+            name,
+            f"{name}: {number(value, 2)} standard deviations",
+            value,
+            None,
+            value < LARGE_RESIDUAL_SIGMAS,
         )
         for name, value in zip(names, values, strict=True)
         if np.isfinite(value)

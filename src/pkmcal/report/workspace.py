@@ -12,34 +12,41 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN
 from pkmcal.outcome import Part, Plot, Row, Table
-from pkmcal.pages.plots import AXIS, COLOURS, LOOKS, coloured, markers, space_layout
+from pkmcal.pages.plots import (
+    COMMON_AXIS_LAYOUT,
+    COMMON_PLOT_LAYOUT,
+    MAGNITUDE_COLOUR_SCALE,
+    coloured,
+    markers,
+    space_layout,
+)
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 
-PANEL = 170
+SLICE_ROW_HEIGHT = 170
 """Height of a row of slices, px."""
-LEFT, RIGHT, TOP, BOTTOM = 92, 74, 26, 40
+SLICES_LEFT_MARGIN, SLICES_RIGHT_MARGIN, SLICES_TOP_MARGIN, SLICES_BOTTOM_MARGIN = 92, 74, 26, 40
 """Margins round the slices, px, in which their names, the legend and the axes' numbers stand."""
-GAP = 0.045
+SLICE_GAP_SHARE = 0.045
 """Between slices, as a part of the width."""
-DEEP = 0.2
+POSE_NEAR_SLICE_SHARE = 0.2
 """Of the poses' extent across a slice: how far from it a photographed pose is drawn in it."""
-THIN = 0.2
+THIN_EXTENT_SHARE = 0.2
 """Part of the widest extent below which a coordinate's own tells nothing."""
-LEAST_TURN = 1.0
+LEAST_TURN_DRAWN = 1.0
 """Degrees; what turns less is not drawn."""
-HOW = (
+SLICES_READING_TEXT = (
     "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
     " measured, near the slice. By the drawing: how sure the platform would be by the drawing's"
     " tolerances. Drawing's error: how far the drawing's pose is from the calibrated at the same"
     " readings, frames laid over each other. Calibrated: one standard deviation that is left, of"
     " the geometry; the noise of single readings and what the model leaves out come on top."
 )
-OUTSIDE = (
+NO_UNTURNED_SLICES_TEXT = (
     "The platform does not move aside without turning, so there are no slices of one orientation."
 )
-NARROW = "The workspace has an extent along one axis at most, so there are no slices."
+TOO_NARROW_TEXT = "The workspace has an extent along one axis at most, so there are no slices."
 
 
 def section(session: Session, estimate: Estimate, found: ToolMap | str, links: Links) -> Part:
@@ -48,7 +55,13 @@ def section(session: Session, estimate: Estimate, found: ToolMap | str, links: L
     if isinstance(found, str):
         return Part(name, title, (found,), menu=menu)
     slices = _slices(session, estimate, found, links)
-    how = HOW if slices else NARROW if _narrow(found) else OUTSIDE
+    how = (
+        SLICES_READING_TEXT
+        if slices
+        else TOO_NARROW_TEXT
+        if _narrow(found)
+        else NO_UNTURNED_SLICES_TEXT
+    )
     return Part(
         name,
         title,
@@ -130,7 +143,7 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
     across, down = (len(quantities), 1) if single else (len(found.slices), len(quantities))
     extent = _extent(found)
     data: list[dict[str, Any]] = []
-    layout: dict[str, Any] = {**LOOKS, "annotations": [], "showlegend": False}
+    layout: dict[str, Any] = {**COMMON_PLOT_LAYOUT, "annotations": [], "showlegend": False}
     for row, (name, values) in enumerate(quantities):
         for column, cut in enumerate(found.slices):
             place = (row, 0) if single else (column, row)
@@ -145,8 +158,15 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
             if not single and column == 0:
                 layout["annotations"].append(_label(name, panel, "left"))
     layout["coloraxis"] = _colours(np.concatenate([v for _, v in quantities]) * 1e3)
-    layout["margin"] = {"l": 46 if single else LEFT, "r": RIGHT, "t": TOP, "b": BOTTOM}
-    height = TOP + BOTTOM + PANEL * down + (60 if single else 0)
+    layout["margin"] = {
+        "l": 46 if single else SLICES_LEFT_MARGIN,
+        "r": SLICES_RIGHT_MARGIN,
+        "t": SLICES_TOP_MARGIN,
+        "b": SLICES_BOTTOM_MARGIN,
+    }
+    height = (
+        SLICES_TOP_MARGIN + SLICES_BOTTOM_MARGIN + SLICE_ROW_HEIGHT * down + (60 if single else 0)
+    )
     return Plot(
         "slices",
         "Before and after, slice by slice",
@@ -156,7 +176,7 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
         " has the figures over all of it.",
         {"data": data, "layout": layout, "config": {}},
         height=height,
-        width=640 if single else 150 * across + LEFT + RIGHT,
+        width=640 if single else 150 * across + SLICES_LEFT_MARGIN + SLICES_RIGHT_MARGIN,
     )
 
 
@@ -213,7 +233,7 @@ def _crosses(
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
     even = found.evenly[1].T_base_platform[:, cut.normal, 3]
-    near = np.abs(place[:, cut.normal] - cut.level) <= DEEP * np.ptp(even) + 1e-6
+    near = np.abs(place[:, cut.normal] - cut.level) <= POSE_NEAR_SLICE_SHARE * np.ptp(even) + 1e-6
     used, place = used[near], place[near]
     return {
         "type": "scatter",
@@ -242,11 +262,11 @@ def _place_axes(
 ) -> None:
     """The axes of one panel in a table of panels; extent : (3, 2) mm."""
     (column, row), (across, down) = place, shape
-    wide = (1 - GAP * (across - 1)) / across
-    gap = GAP if down > 1 else 0.0
+    wide = (1 - SLICE_GAP_SHARE * (across - 1)) / across
+    gap = SLICE_GAP_SHARE if down > 1 else 0.0
     tall = (1 - gap * (down - 1)) / down
-    left, top = column * (wide + GAP), 1 - row * (tall + gap)
-    common = {**AXIS, "showgrid": False, "zeroline": False, "tickfont": {"size": 10}}
+    left, top = column * (wide + SLICE_GAP_SHARE), 1 - row * (tall + gap)
+    common = {**COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "tickfont": {"size": 10}}
     common |= {"nticks": 4, "tickangle": 0}
     last = row == down - 1
     one, other = "xyz"[cut.across], "xyz"[cut.up]
@@ -281,7 +301,7 @@ def _label(text: str, panel: str, side: str) -> dict[str, Any]:
             "font": font,
         }  # fmt: skip
     return {
-        **at, "text": text, "xref": "paper", "x": 0, "xshift": -LEFT + 4, "y": 0.5,
+        **at, "text": text, "xref": "paper", "x": 0, "xshift": -SLICES_LEFT_MARGIN + 4, "y": 0.5,
         "textangle": -90, "xanchor": "left", "yanchor": "middle", "font": font,
     }  # fmt: skip
 
@@ -294,7 +314,7 @@ def _colours(values: Array) -> dict[str, Any]:
     steps = [m * 10.0**k for k in range(-5, 5) for m in (1, 2, 5)]
     ticks = [s for s in steps if low - 0.02 <= np.log10(s) <= high + 0.02]
     return {
-        "colorscale": COLOURS,
+        "colorscale": MAGNITUDE_COLOUR_SCALE,
         "cmin": round(float(low), 3),
         "cmax": round(float(high), 3),
         "colorbar": {
@@ -318,9 +338,9 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     three numbers change.
     """
     places = np.ptp(poses[:, :3, 3], axis=0)
-    thin = places <= THIN * places.max()
+    thin = places <= THIN_EXTENT_SHARE * places.max()
     turns = np.rad2deg(np.ptp(pose_difference(poses, poses[0])[:, :3], axis=0))
-    order = [int(k) for k in np.argsort(-turns) if turns[k] > LEAST_TURN]
+    order = [int(k) for k in np.argsort(-turns) if turns[k] > LEAST_TURN_DRAWN]
     if np.count_nonzero(thin) > len(order):
         return None
     instead = sorted(order[: np.count_nonzero(thin)])

@@ -14,11 +14,11 @@ from pkmcal.errors import InputError
 from pkmcal.files import read_exif
 from pkmcal.session.photographs import photograph_header
 
-EXIF = "exif"
+EXIF_CAMERA_WORD = "exif"
 """The word in place of a camera's file."""
-FILM = hypot(36.0, 24.0)
+FILM_DIAGONAL = hypot(36.0, 24.0)
 """Diagonal (mm) of the film that the focal length is told for."""
-HEAD = 1 << 17
+EXIF_HEAD_BYTES = 1 << 17
 """Bytes from a file's beginning that hold its EXIF: a segment has 64 kB at most."""
 FOCAL_SIGMA = 0.03
 """Standard deviation of that focal length, relative: it is a whole number, 2 % of a telephone's 26
@@ -43,7 +43,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
     for path, label in photographs:
         width, height = photograph_header(path, label)
         with path.open("rb") as stream:
-            focal = read_exif(stream.read(HEAD)).focal_35mm
+            focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
         if focal is None:
             raise InputError(
                 "the photograph does not tell the focal length it was taken with",
@@ -64,7 +64,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
             next_step="Give photographs by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # others were turned by a quarter
-    return _camera(next(iter(told))[0] / FILM * hypot(*size), size)
+    return _camera(next(iter(told))[0] / FILM_DIAGONAL * hypot(*size), size)
 
 
 def _described(focal: float, size: tuple[int, int]) -> str:

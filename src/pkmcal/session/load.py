@@ -20,7 +20,7 @@ from pkmcal.cameras import Camera
 from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files import (
-    TOO_LARGE,
+    LARGEST_UNITLESS_LENGTH,
     CsvTable,
     Document,
     Keys,
@@ -32,22 +32,22 @@ from pkmcal.files import (
     read_csv,
     read_yaml,
     shown,
-    validate,
+    validated_document,
     wanted_file,
-    with_unit,
+    written_unit,
 )
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region
-from pkmcal.session.exif import EXIF, camera_by_exif
+from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
-from pkmcal.session.schema import Body, SessionDocument, StationDocument, Vector
+from pkmcal.session.schema import BoardBody, SessionDocument, StationDocument, Vector
 from pkmcal.wording import count, listed
 
-FILE = "session.yaml"
-VERSION = 1
+SESSION_FILE_NAME = "session.yaml"
+SESSION_FILE_VERSION = 1
 SHORTEST_PATH = 3
 """Configurations without which nothing is straight or bent."""
 # A camera nearer to what it looks at than this has two equal points written, not a view.
@@ -107,7 +107,7 @@ class Session:
     board: Path | None
     document: dict[str, Any]
     warnings: tuple[str, ...] = ()
-    board_body: Body = "platform"
+    board_body: BoardBody = "platform"
     trackers: tuple[PoseTable, ...] = ()
     model: str | None = None
     mechanism: Path | str = ""
@@ -164,8 +164,8 @@ def session_folder(subject: str) -> Path | None:
     machine: a folder that is called like a built-in machine and holds no session is not meant.
     """
     path = Path(subject)
-    folder = path.parent if path.name == FILE else path
-    if (folder / FILE).is_file() or (folder.is_dir() and subject not in catalogue()):
+    folder = path.parent if path.name == SESSION_FILE_NAME else path
+    if (folder / SESSION_FILE_NAME).is_file() or (folder.is_dir() and subject not in catalogue()):
         return folder
     return None
 
@@ -177,7 +177,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     photographs, or poses, of two configurations at least; a plan is made before.
     """
     folder, document = _read(Path(folder))
-    schema = validate(document, SessionDocument)
+    schema = validated_document(document, SessionDocument)
     machine, source = _machine(folder, document, schema.mechanism, model)
     if not measured and not schema.stations:
         raise InputError(
@@ -190,7 +190,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     if measured or (folder / schema.joints.file).exists():
         path = _existing(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
-        written = with_unit(document.data["joints"]["noise"])
+        written = written_unit(document.data["joints"]["noise"])
         if written and written.kind not in machine.joint_units:
             raise InputError(
                 no_such(machine.joint_units[0], document.data["joints"]["noise"]),
@@ -279,31 +279,33 @@ def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
 
 def _read(folder: Path) -> tuple[Path, Document]:
     """The session's folder and file; its version is looked at before anything else in it."""
-    if folder.name == FILE and folder.is_file():
+    if folder.name == SESSION_FILE_NAME and folder.is_file():
         folder = folder.parent
     if not folder.is_dir():
-        beside = closest(folder.name, (p.parent.name for p in folder.parent.glob(f"*/{FILE}")))
+        beside = closest(
+            folder.name, (p.parent.name for p in folder.parent.glob(f"*/{SESSION_FILE_NAME}"))
+        )
         raise InputError(
             "there is no such session folder",
             where=str(folder),
             next_step=f"There is {folder.with_name(beside)}" if beside else None,
         )
-    if not (folder / FILE).exists():
-        below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
+    if not (folder / SESSION_FILE_NAME).exists():
+        below = sorted(path.parent.name for path in folder.glob(f"*/{SESSION_FILE_NAME}"))
         raise InputError(
-            f"the folder holds no {FILE}",
+            f"the folder holds no {SESSION_FILE_NAME}",
             where=str(folder),
             found=f"sessions in {listed(below)} below it" if below else None,
             next_step="Name the session's folder; pkmcal new DIR makes one to fill in",
         )
-    document = read_yaml(folder / FILE)
-    version = document.data.get("pkmcal", VERSION)
-    if type(version) is not int or version != VERSION:
+    document = read_yaml(folder / SESSION_FILE_NAME)
+    version = document.data.get("pkmcal", SESSION_FILE_VERSION)
+    if type(version) is not int or version != SESSION_FILE_VERSION:
         raise InputError(
             "this version of the session's format is not known",
             where=document.where("pkmcal"),
             found=shown(version),
-            expected=str(VERSION),
+            expected=str(SESSION_FILE_VERSION),
             next_step="Use the pkmcal that wrote it, or a newer one",
         )
     return folder, document
@@ -428,7 +430,7 @@ def _stations(
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
     photographs = find_photographs(folder, station.images, names, where, needed=measured)
-    from_exif = station.camera == EXIF
+    from_exif = station.camera == EXIF_CAMERA_WORD
     if from_exif:
         label = document.where(*keys, "camera")
         camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in photographs], label)
@@ -443,12 +445,12 @@ def _stations(
         _check_handheld(document, name, station)
     if station.pose is not None:
         away = max(map(abs, station.pose.position))
-        if away > TOO_LARGE and not any_unit(document.data):
+        if away > LARGEST_UNITLESS_LENGTH and not any_unit(document.data):
             raise InputError(
                 "the camera's place looks like millimetres",
                 where=document.where(*keys, "pose", "position"),
                 found=f"{away:g} m",
-                expected=f"metres, at most {TOO_LARGE:g} where no value has a unit",
+                expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",
                 next_step="Write it with its unit, such as 1250 mm, or divide by 1000",
             )
         try:

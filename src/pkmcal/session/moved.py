@@ -10,13 +10,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.measurements import Departure, Effect
 from pkmcal.wording import amount
 
-FEWEST = 3
+FEWEST_BESIDE_MOVEMENT = 3
 """Configurations on either side of a movement: fewer are outliers."""
-MOMENTS = 12
+MOVEMENT_MOMENTS_TRIED = 12
 """Times at most, spread over a station's configurations, at which it may have moved."""
 
 
-def departures(
+def movement_departures(
     station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
 ) -> Iterator[Departure]:
     """That a station stands elsewhere from some configuration on.
@@ -24,8 +24,12 @@ def departures(
     station, name : its number and name. used : configurations of which it measured something, in
     their order. what : stands there.
     """
-    times = min(MOMENTS, len(used) - 2 * FEWEST + 1)
-    for k in np.unique(np.linspace(FEWEST, len(used) - FEWEST, max(times, 0)).astype(int)).tolist():
+    times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * FEWEST_BESIDE_MOVEMENT + 1)
+    for k in np.unique(
+        np.linspace(
+            FEWEST_BESIDE_MOVEMENT, len(used) - FEWEST_BESIDE_MOVEMENT, max(times, 0)
+        ).astype(int)
+    ).tolist():
         before, after = (configurations[int(used[k + d])] for d in (-1, 0))
 
         def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:

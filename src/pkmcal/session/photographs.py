@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Formatter
 
 from pkmcal.errors import InputError
-from pkmcal.files import ENDINGS, check_regular, closest, shown, stated_size
+from pkmcal.files import IMAGE_FILE_ENDINGS, check_regular, closest, shown, stated_size
 from pkmcal.wording import listed
 
 _FIELDS = ("configuration", "repeat")
@@ -190,7 +190,7 @@ def _endings(folder: Path, wildcard: str) -> list[str]:
         names = glob.glob(f"{wildcard}.*", root_dir=folder)
     except (OSError, ValueError):  # such as a name that no folder can have
         return []
-    return [ending for name in names if (ending := Path(name).suffix).lower() in ENDINGS]
+    return [ending for name in names if (ending := Path(name).suffix).lower() in IMAGE_FILE_ENDINGS]
 
 
 def _stranger(

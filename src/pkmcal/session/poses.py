@@ -21,20 +21,24 @@ from pkmcal.geometry.rigid import from_quaternion, pose, register, rotation
 from pkmcal.measurements import PoseSet
 from pkmcal.wording import listed
 
-Kind = Literal["poses", "points", "heights"]
-POINT, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
-HEADERS: dict[tuple[str, ...], Kind] = {
-    (*POINT, *QUATERNION): "poses",
-    (*POINT, *VECTOR): "poses",
-    POINT: "points",
+PoseTableKind = Literal["poses", "points", "heights"]
+POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
+    ("x", "y", "z"),
+    ("qw", "qx", "qy", "qz"),
+    ("rx", "ry", "rz"),
+)
+POSE_TABLE_KINDS: dict[tuple[str, ...], PoseTableKind] = {
+    (*POINT_COLUMNS, *QUATERNION_COLUMNS): "poses",
+    (*POINT_COLUMNS, *TURN_VECTOR_COLUMNS): "poses",
+    POINT_COLUMNS: "points",
     ("z",): "heights",
 }
 """Columns of each kind of table, in any order."""
-FEWEST = {"poses": 3, "points": 4, "heights": 7}
+FEWEST_POSE_TABLE_ROWS = {"poses": 3, "points": 4, "heights": 7}
 """Rows that fix the tracker's place, and leave something that is known."""
-UNIT = 1e-3
+UNIT_QUATERNION_TOLERANCE = 1e-3
 """By which a quaternion may be longer or shorter than one: three written digits leave as much."""
-TOO_LARGE = 30.0
+OTHER_UNIT_SPREAD_FACTOR = 30.0
 """Times the machine's own motion from which a table's lengths are in another unit."""
 
 
@@ -49,7 +53,7 @@ class PoseTable:
 
     name: str
     label: str
-    kind: Kind
+    kind: PoseTableKind
     configuration: Integers
     T: Array
     position: float
@@ -61,7 +65,7 @@ class PoseTable:
     @classmethod
     def to_come(cls, name: str, label: str, position: float, rotation: float | None) -> PoseTable:
         """Of a tracker that has not measured yet: poses, or points where it tells no turn."""
-        kind: Kind = "points" if rotation is None else "poses"
+        kind: PoseTableKind = "points" if rotation is None else "poses"
         none = np.zeros(0, dtype=int)
         return cls(name, label, kind, none, np.zeros((0, 4, 4)), position, rotation)
 
@@ -118,7 +122,7 @@ def read_poses(
     """
     table = read_csv(path, label=label)
     kind = _kind(table)
-    lengths, turns = dict.fromkeys(POINT, "m"), dict.fromkeys(VECTOR, "rad")
+    lengths, turns = dict.fromkeys(POINT_COLUMNS, "m"), dict.fromkeys(TURN_VECTOR_COLUMNS, "rad")
     table.check_kinds([(lengths | turns).get(name, "") for name in table.columns])
     if kind == "poses" and rotation_noise is None:
         raise InputError(
@@ -129,16 +133,16 @@ def read_poses(
             next_step="Leave the columns of the turn out, if only points were measured",
         )
     rows = _rows(table, names)
-    if len(rows) < FEWEST[kind]:
+    if len(rows) < FEWEST_POSE_TABLE_ROWS[kind]:
         raise InputError(
             f"too few {kind} to say where the tracker stands",
             where=label,
             found=f"{len(rows)} rows",
-            expected=f"{FEWEST[kind]} at least",
+            expected=f"{FEWEST_POSE_TABLE_ROWS[kind]} at least",
         )
     column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
     nothing = np.zeros(len(rows))
-    t = np.stack([column.get(axis, nothing) for axis in POINT], axis=-1)
+    t = np.stack([column.get(axis, nothing) for axis in POINT_COLUMNS], axis=-1)
     T = pose(_turn(table, column), t)
     if level and kind != "heights":
         raise InputError(
@@ -151,20 +155,21 @@ def read_poses(
     return PoseTable(name, label, kind, rows, T, position, rotation_noise, level)
 
 
-def _kind(table: CsvTable) -> Kind:
+def _kind(table: CsvTable) -> PoseTableKind:
     """Which table it is, by its header."""
     found = set(table.columns)
-    for columns, kind in HEADERS.items():
+    for columns, kind in POSE_TABLE_KINDS.items():
         if found == set(columns):
             return kind
-    known = sorted({name for columns in HEADERS for name in columns})
+    known = sorted({name for columns in POSE_TABLE_KINDS for name in columns})
     strange = [name for name in table.columns if name not in known]
     guess = closest(strange[0], known) if strange else None
     raise InputError(
         "this column is not known" if strange else "these columns together mean nothing",
         where=f"{table.label}, line 1",
         found=strange[0] if strange else listed(table.columns, 12),
-        expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in HEADERS),
+        expected=guess
+        or "configuration and " + "; or ".join(", ".join(c) for c in POSE_TABLE_KINDS),
     )
 
 
@@ -189,25 +194,25 @@ def _rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
 def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
     """Rotations (N, 3, 3); none for points."""
     if "qw" in column:
-        q = np.stack([column[name] for name in QUATERNION], axis=-1)
+        q = np.stack([column[name] for name in QUATERNION_COLUMNS], axis=-1)
         length = np.linalg.norm(q, axis=1)
-        bad = np.flatnonzero(np.abs(length - 1) > UNIT)
+        bad = np.flatnonzero(np.abs(length - 1) > UNIT_QUATERNION_TOLERANCE)
         if bad.size:
             raise InputError(
                 "the quaternion is not of length one",
-                where=f"{table.where(int(bad[0]))}, columns {', '.join(QUATERNION)}",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(QUATERNION_COLUMNS)}",
                 found=f"{length[bad[0]]:.4g}",
                 expected="1; the scalar part is qw",
             )
         return from_quaternion(q)
     if "rx" in column:
-        vector = np.stack([column[name] for name in VECTOR], axis=-1)
+        vector = np.stack([column[name] for name in TURN_VECTOR_COLUMNS], axis=-1)
         size = np.linalg.norm(vector, axis=1)
         bad = np.flatnonzero(size > 2 * np.pi)
         if bad.size:
             raise InputError(
                 "the rotation vector is longer than a whole turn",
-                where=f"{table.where(int(bad[0]))}, columns {', '.join(VECTOR)}",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(TURN_VECTOR_COLUMNS)}",
                 found=f"{size[bad[0]]:.4g}",
                 expected="radians, at most 3.1416",
                 next_step="If these are degrees, head the columns rx [deg], ry [deg], rz [deg]",
@@ -225,7 +230,7 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
     moved = float(np.nanmax(np.nanstd(there, axis=0)))
     measured = table.T[:, :3, 3] if table.kind != "heights" else table.T[:, 2:3, 3]
     spread = float(np.max(np.std(measured, axis=0)))
-    if spread <= TOO_LARGE * max(moved, 1e-6):
+    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(moved, 1e-6):
         return
     raise InputError(
         "the table's lengths look like millimetres",

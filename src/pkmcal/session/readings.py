@@ -13,7 +13,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Departure, Effect
-from pkmcal.wording import SCALES, amount, listed, number, ratio
+from pkmcal.wording import SHOWN_UNITS, amount, listed, number, ratio_in_per_cent
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.
@@ -145,7 +145,7 @@ def _shifted(
     """The error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
     column = int(np.flatnonzero(which)[0])
     low, high = ranges[column]
-    scale, name = SCALES[unit]
+    scale, name = SHOWN_UNITS[unit]
     least, most = (number(end * scale, 0 if unit == "m" else 1, signed=True) for end in shift)
     return InputError(
         f"the readings of {listed([table.columns[k] for k in np.flatnonzero(which)], 7)} are off by"
@@ -184,14 +184,14 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
     ]
 
 
-def standing(joints: Array, noise: float) -> Booleans:
+def unmoved_readings(joints: Array, noise: float) -> Booleans:
     """(m,) which of the readings (K, m) never move by more than their noise."""
     return np.ptp(joints, axis=0) <= _ALIKE * noise
 
 
 def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
     """The error about readings that never moved, where the data contradict the readings."""
-    still = np.flatnonzero(standing(joints, noise)).tolist() if len(joints) else []
+    still = np.flatnonzero(unmoved_readings(joints, noise)).tolist() if len(joints) else []
     if not still:
         return None
     names = [columns[k] for k in still]
@@ -206,7 +206,7 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
     )
 
 
-def departures(
+def reading_departures(
     joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
 ) -> tuple[list[Departure], list[Departure]]:
     """What may be otherwise with readings (K, m): of each its scale, beyond its tolerance, and its
@@ -228,7 +228,8 @@ def departures(
             factor = 1 + own * value[0]
             return (
                 f"The readings of {name} have another scale: true ones are"
-                f" {ratio(factor - 1, sigma[0])} {'larger' if factor > 1 else 'smaller'}",
+                f" {ratio_in_per_cent(factor - 1, sigma[0])}"
+                f" {'larger' if factor > 1 else 'smaller'}",
                 f"Multiply this column of joints.csv by {factor:.5f} if the encoder's counts"
                 " or the screw's lead agree, or correct it in the controller",
             )
@@ -262,7 +263,7 @@ def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[str]:
-    still = standing(table.values, noise)
+    still = unmoved_readings(table.values, noise)
     if still.all():
         raise InputError(
             "all configurations are alike: no joint moves by more than its noise",

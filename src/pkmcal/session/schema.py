@@ -8,12 +8,12 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from pkmcal.files import Metres, Point, Radians, Reading, Schema, closest, shown
 
-Body = Literal["base", "platform"]
+BoardBody = Literal["base", "platform"]
 """What a board may be fixed to."""
 Vector = tuple[float, float, float]
-NOISE = Field(ge=1e-12, lt=10)
+NOISE_FIELD_RANGE = Field(ge=1e-12, lt=10)
 """m or rad; nothing measures better, nor is of any use that measures worse."""
-WORDS = ("legs", "board")
+OBSERVE_WORDS = ("legs", "board")
 """What a station can observe, in the order in which it is written back."""
 
 
@@ -21,7 +21,7 @@ class JointsDocument(Schema):
     """``joints``: where the readings are, and how good."""
 
     file: str = Field(description="the readings' file, for example joints.csv")
-    noise: Annotated[Reading, NOISE] = Field(
+    noise: Annotated[Reading, NOISE_FIELD_RANGE] = Field(
         description="the standard deviation of a reading in metres or radians, such as 3.0e-6"
     )
 
@@ -40,13 +40,13 @@ def _words(value: Any) -> tuple[str, ...]:
     if not words:
         raise ValueError("the list is empty; a station observes legs, board, or [legs, board]")
     for word in words:
-        if word not in WORDS:
-            guess = closest(word, WORDS) if isinstance(word, str) else None
+        if word not in OBSERVE_WORDS:
+            guess = closest(word, OBSERVE_WORDS) if isinstance(word, str) else None
             wanted = guess or "legs, board, or [legs, board]"
             raise ValueError(f"no station can observe this; found {shown(word)}, expected {wanted}")
     if len(set(words)) < len(words):
         raise ValueError(f"the same word stands twice; found {shown(words)}")
-    return tuple(word for word in WORDS if word in words)
+    return tuple(word for word in OBSERVE_WORDS if word in words)
 
 
 class StationDocument(Schema):
@@ -64,10 +64,10 @@ class StationDocument(Schema):
 class NoiseDocument(Schema):
     """``noise`` of a tracker, one standard deviation."""
 
-    position: Annotated[Metres, NOISE] = Field(
+    position: Annotated[Metres, NOISE_FIELD_RANGE] = Field(
         description="the standard deviation of a coordinate in metres, such as 2.0e-5"
     )
-    rotation: Annotated[Radians, NOISE] | None = Field(
+    rotation: Annotated[Radians, NOISE_FIELD_RANGE] | None = Field(
         default=None, description="the standard deviation of a turn in radians, such as 1.0e-4"
     )
 
@@ -103,7 +103,7 @@ class BoardDocument(Schema):
     """``board``: its file, and what it is fixed to."""
 
     file: str = Field(description="the board's file, for example board.yaml")
-    fixed_to: Body = "platform"
+    fixed_to: BoardBody = "platform"
 
 
 def _board(value: Any) -> Any:

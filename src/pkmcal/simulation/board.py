@@ -20,33 +20,35 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.session.schema import Body
+from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.render import ScenePart
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
-from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned
+from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned_components
 from pkmcal.simulation.surfaces import Material, Pattern, SmoothNoise
 
-THICKNESS = 0.004
+BOARD_THICKNESS = 0.004
 """m."""
-HOLDER = 0.08
+HOLDER_ROD_RADIUS = 0.08
 """Radius of the rod that holds a board on the platform, in the platform's radius."""
-BLACK = 0.06
+PRINTED_BLACK_LIGHT = 0.06
 """Light that printed black sends back, as a share of white's."""
-SQUARES = {"base": (6, 5), "platform": (5, 4)}
+MADE_BOARD_SQUARES = {"base": (6, 5), "platform": (5, 4)}
 """Of the board made to measure: large squares are read from afar."""
-SIZE = 1.4
+BASE_BOARD_DIAGONAL = 1.4
 """Diagonal of that board with its margin, in radii of the base."""
-ON_PLATFORM, IN_PICTURE = 2.0, 0.75
-"""Diagonal of a board on the platform with its margin, in radii of that; and at least, in radii of
-the space that the machine needs: cameras stand so far away that they see all of it."""
-LOOKED_AT = 6
+PLATFORM_BOARD_DIAGONAL = 2.0
+"""Diagonal of a board on the platform with its margin, in radii of that."""
+PICTURED_BOARD_DIAGONAL = 0.75
+"""That diagonal at least, in radii of the space that the machine needs: cameras stand so far away
+that they see all of it."""
+BOARD_TRIAL_CONFIGURATIONS = 6
 """Configurations at which the places for a board are tried."""
-SLANTED = 0.6
+SLANTED_BOARD_COSINE = 0.6
 """Cosine of the angle between normal and line of sight below which a board is read less well."""
-ASKEW = 0.25
+STANDING_BOARD_LEAN = 0.25
 """rad; by which a standing board leans, and turns, from the middle of the cameras."""
-LEAST_SEEN = 0.4
+LEAST_CORNERS_SEEN = 0.4
 """Share of a board's corners that every station has to see, on average."""
 BETTER_SEEN = {
     "base": "put the stations higher, or use a wider lens",
@@ -71,8 +73,8 @@ class Sheet(Shape):
         low = np.array([printed.x[0], printed.y[0]])
         high = np.array([printed.x[-1], printed.y[-1]])
         margin = 0.5 * (board.document.get("square") or board.document["marker"])
-        middle = np.array([*(low + high) / 2, THICKNESS / 2])
-        half = np.array([*(high - low) / 2 + margin, THICKNESS / 2])
+        middle = np.array([*(low + high) / 2, BOARD_THICKNESS / 2])
+        half = np.array([*(high - low) / 2 + margin, BOARD_THICKNESS / 2])
         box = Box(apply(T_outer_board, middle), T_outer_board[:3, :3].T, half)
         return cls(box, T_outer_board, printed)
 
@@ -87,13 +89,15 @@ class Sheet(Shape):
     def local(self, points: Array) -> Array:
         """In the board's frame."""
         T = inverse(self.T_outer_board)
-        return turned(T[:3, :3], points) + T[:3, 3:]
+        return turned_components(T[:3, :3], points) + T[:3, 3:]
 
     def face(self, points: Array) -> Integers:
         """White, black, and the plate's other sides."""
         q = self.local(points)
         dark = self.print.dark_at(q[0], q[1])
-        return np.where(q[2] < THICKNESS / 2, dark.astype(np.int16), np.int16(2)).astype(np.int16)
+        return np.where(q[2] < BOARD_THICKNESS / 2, dark.astype(np.int16), np.int16(2)).astype(
+            np.int16
+        )
 
     def balls(self) -> tuple[Array, Array]:
         """The plate's."""
@@ -109,8 +113,8 @@ class Printed(Pattern):
 
     def factor(self, q: Array) -> Array:
         """1 on white, and on the plate's sides and back."""
-        dark = self.print.dark_at(q[0], q[1]) & (q[2] < THICKNESS / 2)
-        return np.where(dark, BLACK, 1.0)
+        dark = self.print.dark_at(q[0], q[1]) & (q[2] < BOARD_THICKNESS / 2)
+        return np.where(dark, PRINTED_BLACK_LIGHT, 1.0)
 
 
 def board_part(board: Board, T_base_board: Array) -> ScenePart:
@@ -124,23 +128,29 @@ def holder_part(
 ) -> ScenePart:
     """The rod that holds a board on the platform, from under its plate to the board's back."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
-    back = (low + high) / 2 + np.array([0.0, 0.0, THICKNESS])
+    back = (low + high) / 2 + np.array([0.0, 0.0, BOARD_THICKNESS])
     lift = discs.platform_side * discs.thickness * np.array([0.0, 0.0, 1.0])
     start = apply(T_base_platform, discs.platform + lift)
     end = apply(T_base_platform @ T_platform_board, back)
     length = float(np.linalg.norm(end - start))
-    shape = Cylinder(start, (end - start) / length, HOLDER * discs.platform_radius, length)
+    shape = Cylinder(
+        start, (end - start) / length, HOLDER_ROD_RADIUS * discs.platform_radius, length
+    )
     return ScenePart(shape, Material(0.05))
 
 
-def board_for(machine: Machine, on: Body = "base") -> Board:
-    """A ChArUco board in proportion to the machine: SIZE, or ON_PLATFORM and IN_PICTURE."""
+def board_for(machine: Machine, on: BoardBody = "base") -> Board:
+    """A ChArUco board in proportion to the machine: BASE_BOARD_DIAGONAL, or PLATFORM_BOARD_DIAGONAL
+    and PICTURED_BOARD_DIAGONAL.
+    """
     discs = discs_of(machine)
-    diagonal = SIZE * discs.base_radius
+    diagonal = BASE_BOARD_DIAGONAL * discs.base_radius
     if on == "platform":
         space = ball_of(legs_space(machine))[1]
-        diagonal = max(ON_PLATFORM * discs.platform_radius, IN_PICTURE * space)
-    squares = SQUARES[on]
+        diagonal = max(
+            PLATFORM_BOARD_DIAGONAL * discs.platform_radius, PICTURED_BOARD_DIAGONAL * space
+        )
+    squares = MADE_BOARD_SQUARES[on]
     square = round(diagonal / float(np.hypot(squares[0] + 1, squares[1] + 1)), 3)
     return board_from_fields(
         {
@@ -166,7 +176,7 @@ def board_from_fields(fields: dict[str, Any]) -> Board:
 def place_board(
     machine: Machine,
     board: Board,
-    on: Body,
+    on: BoardBody,
     cameras: tuple[Camera, ...],
     T_camera_base: Array,
     T_base_platform: Array,
@@ -188,7 +198,7 @@ def place_board(
     finish = Finish.from_noise(SmoothNoise.from_rng(rng))
     if on == "platform":
         places = _brackets(board, discs, rng)
-    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    few = np.unique(np.linspace(0, len(joints) - 1, BOARD_TRIAL_CONFIGURATIONS).astype(int))
     carried = (
         T_base_platform[few] if on == "platform" else np.broadcast_to(np.eye(4), (few.size, 4, 4))
     )
@@ -208,11 +218,11 @@ def place_board(
         axis=0,
     )
     best = int(np.argmax(seen))
-    if seen[best] < LEAST_SEEN:
+    if seen[best] < LEAST_CORNERS_SEEN:
         raise GeometryError(
             f"there is no place on the {on} where all stations see the board",
             found=f"{seen[best]:.0%} of its corners at most",
-            expected=f"{LEAST_SEEN:.0%}",
+            expected=f"{LEAST_CORNERS_SEEN:.0%}",
             next_step=BETTER_SEEN[on],
         )
     return places[best]
@@ -249,7 +259,7 @@ def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
     radius = discs.base_radius + 0.65 * float(np.linalg.norm(high - low))
     ring = 2 * np.pi * (np.arange(12) + rng.random()) / 12
     spots = [np.zeros(2), *(radius * np.stack([np.cos(ring), np.sin(ring)], axis=-1))]
-    heights = [THICKNESS, *np.full(len(ring), THICKNESS - discs.thickness)]
+    heights = [BOARD_THICKNESS, *np.full(len(ring), BOARD_THICKNESS - discs.thickness)]
     out: list[Array] = []
     for spot, height in zip(spots, heights, strict=True):
         lean = rotation(np.array([*rng.normal(0, 0.01, 2), rng.uniform(-np.pi, np.pi)]))
@@ -276,7 +286,9 @@ def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator)
         right = np.cross([0.0, 0.0, 1.0], way)
         flat = np.stack([right, [0.0, 0.0, -1.0], -way], axis=-1)
         # seen straight on, a board hardly tells its tilt
-        slant = rotation(ASKEW * right) @ rotation(np.array([0.0, 0.0, ASKEW]))
+        slant = rotation(STANDING_BOARD_LEAN * right) @ rotation(
+            np.array([0.0, 0.0, STANDING_BOARD_LEAN])
+        )
         rot = rotation(rng.normal(0, 0.05, 3)) @ slant @ flat
         centre = discs.base + discs.base_radius * (aside * right - depth * way)
         centre = centre + discs.side * height * discs.base_radius * np.array([0, 0, 1])
@@ -296,7 +308,9 @@ def _shares_seen(
     rays = points - eye
     distance = np.linalg.norm(rays, axis=-1)
     rays = rays / distance[..., None]
-    facing = np.clip(np.sum(T_base_board[:, None, :3, 2] * rays, axis=-1) / SLANTED, 0, 1)
+    facing = np.clip(
+        np.sum(T_base_board[:, None, :3, 2] * rays, axis=-1) / SLANTED_BOARD_COSINE, 0, 1
+    )
     seen = camera.in_image(pixels, margin=10.0)
     # all places' rays at once: a part is asked in microseconds a call, and in few a corner
     ways = np.ascontiguousarray(rays[seen].T)

@@ -7,9 +7,9 @@ import numpy as np
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.simulation.truth import Settings
 
-MECHANISM = "gough-stewart"
-SEED = 7
-SETTINGS = Settings(stations=3, configurations=6)
+DEMO_MECHANISM = "gough-stewart"
+DEMO_SEED = 7
+DEMO_SETTINGS = Settings(stations=3, configurations=6)
 
 
 def demo_camera() -> Camera:

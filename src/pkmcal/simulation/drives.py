@@ -18,13 +18,13 @@ from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.mechanisms.document import Tube
 from pkmcal.mechanisms.motors import bodies
 
-INSET = 0.1
+MOTOR_STOP_MARGIN = 0.1
 """Share of its range that a motor stays from its stops where reaches are compared."""
 NO_RANGE = 0.25
 """Length of a guide on either side, in the leg's length, where the file gives no range."""
-PIECES = 16
+BENT_GUIDE_PIECES = 16
 """Straight pieces that a bent guide is drawn with."""
-STRAIGHT = 1e-9
+STRAIGHT_GUIDE_DEVIATION = 1e-9
 """A guide's way off the line between its ends, m, below which it is one piece."""
 ROD_RADIUS = 0.02
 """Of a rod, in its length: 10 mm for half a metre, as carbon tubes of such machines have."""
@@ -87,12 +87,12 @@ def drives_of(machine: Machine) -> Drives:
     ways = [np.stack([p, p]) for p in foot]
     low, high = _guide_ranges(machine, by_value).T
     for j in np.flatnonzero(guides):
-        steps = np.linspace(low[j], high[j], PIECES + 1)[:, None]
+        steps = np.linspace(low[j], high[j], BENT_GUIDE_PIECES + 1)[:, None]
         values = np.where(np.arange(machine.n_legs) == j, steps, 0.0)
         way, along = (x[:, j] for x in _placed(machine, values))
         ways[j] = way if _is_bent(way) else way[[0, -1]]
-        foot[j] = way[PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
-        axis[j] = _unit(along[PIECES // 2], by_value[j])
+        foot[j] = way[BENT_GUIDE_PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
+        axis[j] = _unit(along[BENT_GUIDE_PIECES // 2], by_value[j])
     away = _away(machine, foot, axis, guides)
     return Drives(arms, guides, foot, axis, arm, tuple(ways), away)
 
@@ -110,7 +110,7 @@ def _placed(machine: Machine, joint_value: Array) -> tuple[Array, Array]:
 def _is_bent(way: Array) -> bool:
     """Whether a way (n, 3) leaves the line between its ends."""
     u = (way[-1] - way[0]) / max(float(np.linalg.norm(way[-1] - way[0])), 1e-300)
-    return float(np.linalg.norm(np.cross(way - way[0], u), axis=1).max()) > STRAIGHT
+    return float(np.linalg.norm(np.cross(way - way[0], u), axis=1).max()) > STRAIGHT_GUIDE_DEVIATION
 
 
 def _unit(v: Array, otherwise: Array) -> Array:
@@ -161,7 +161,7 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
     poses, readings = [machine.home()], [machine.inverse(machine.home()[None])[0]]
     ranges = machine.joint_ranges
     if any(g.carrier.driven for g in machine.layout.base) and np.isfinite(ranges).all():
-        share = np.array([[INSET], [1 - INSET]])
+        share = np.array([[MOTOR_STOP_MARGIN], [1 - MOTOR_STOP_MARGIN]])
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         found = machine.forward_result(wanted)
         poses += list(found.T_base_platform[found.converged])

@@ -26,15 +26,15 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import TubeList, tubes_of
 from pkmcal.simulation.placement import one_a_station
 
-PLACES = 48
+PLACES_ALONG_EDGE = 48
 """Places looked at along each tube: a hidden stretch is found to a fiftieth of the tube."""
-FITTED = 13
+EDGE_TURN_PLACES = 13
 """Of these, by which an edge's turns are told: how a plane follows is as smooth as the lens."""
 JOINT_HOUSING = 0.005
 """Metres at both ends of a tube that are never measured."""
-CLEARANCE = 2.0
+HIDING_LEG_CLEARANCE = 2.0
 """Pixels between an edge and a leg in front of it, nearer than which the two are one edge."""
-LEAST_SEEN = 8
+LEAST_PLACES_SEEN = 8
 """Places in a row that an edge needs; shorter stretches say little about the tilt."""
 
 
@@ -106,7 +106,7 @@ def visible_edges(
     normal = edge_normal(u, m, radius, SIDE_SIGNS[tubes.side])
     first = np.broadcast_to(tubes.start + JOINT_HOUSING, length.shape)
     last = np.minimum(tubes.stop, length) - JOINT_HOUSING
-    where = np.linspace(0, 1, PLACES)
+    where = np.linspace(0, 1, PLACES_ALONG_EDGE)
     along = first[..., None] + (last - first)[..., None] * where
     points = contour_point(
         a_e[..., None, :], u[..., None, :], normal[..., None, :], radius[:, None], along
@@ -116,7 +116,7 @@ def visible_edges(
         seen &= (leg_is_seen(m, radius) & (last > first))[..., None]
     seen &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
     begin, count = _longest_run(seen)
-    photo, edge = np.nonzero(count >= LEAST_SEEN)
+    photo, edge = np.nonzero(count >= LEAST_PLACES_SEEN)
     begin, count = begin[photo, edge], count[photo, edge]
     span = np.stack([along[photo, edge, begin], along[photo, edge, begin + count - 1]], axis=-1)
     normal = normal[photo, edge]
@@ -128,7 +128,7 @@ def visible_edges(
     edges = EdgeSet(
         station=np.zeros(len(edge), dtype=int), configuration=photo,
         leg=tubes.leg[edge], tube=tubes.tube[edge], side=tubes.side[edge], normal=normal,
-        basis=tangent_basis(normal, rays[:, PLACES // 2]),
+        basis=tangent_basis(normal, rays[:, PLACES_ALONG_EDGE // 2]),
         covariance=np.zeros((len(edge), 2, 2)), shift=np.zeros((len(edge), 2)), span=span,
     )  # fmt: skip
     return edges, rays
@@ -142,10 +142,10 @@ def hidden(
 
     points : (M, G, n, 3), camera frame, m. leg, tube : (G,) what they lie on, -1 for nothing of the
     machine. radius : (E,) of the tubes. a, b : (M, L, 3) the legs' ends. pixel : angle of a pixel,
-    rad; another leg hides what comes within CLEARANCE of it, too.
+    rad; another leg hides what comes within HIDING_LEG_CLEARANCE of it, too.
     """
     distance = np.sqrt(dot(points, points))
-    margin = CLEARANCE * pixel * distance
+    margin = HIDING_LEG_CLEARANCE * pixel * distance
     d = points / distance[..., None]
     out = np.zeros(distance.shape, dtype=bool)
     for e in range(0, len(tubes.leg), 2):  # both sides of a tube are one cylinder
@@ -190,12 +190,12 @@ def _with_errors(
     camera: Camera, edges: EdgeSet, rays: Array, noise: EdgeNoise, rng: np.random.Generator
 ) -> EdgeSet:
     """Edges with noise, its covariance, and what an outward shift by a pixel does."""
-    few = rays[:, np.linspace(0, PLACES - 1, FITTED).astype(int)]
+    few = rays[:, np.linspace(0, PLACES_ALONG_EDGE - 1, EDGE_TURN_PLACES).astype(int)]
     by_shift, by_tilt = moved_outward(camera, edges.normal, edges.basis, few)
     normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
-        edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES // 2]),
+        edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES_ALONG_EDGE // 2]),
         covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
 

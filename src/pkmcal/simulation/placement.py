@@ -21,7 +21,7 @@ from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import on_manifold, scaled_rows, singularity_of
 from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
-from pkmcal.session.schema import Body
+from pkmcal.session.schema import BoardBody, Vector
 from pkmcal.simulation.drives import ball_of, drives_of, legs_space, reaches
 from pkmcal.wording import listed
 
@@ -31,41 +31,39 @@ FARTHEST_TURN = 7 / 9
 """Of an articulated platform about z, in the turn at which its own parts are in the way."""
 LEAST_SINGULAR = 0.12
 """Smallest singular value of the scaled inverse Jacobian: a reading's error grows by eight."""
-GUIDE = 4.0
+GUIDE_SIDE_ROOM = 4.0
 """What a guide and its carriage need on the side of the leg, in radii of the leg on it."""
 SIDE_BY_SIDE = 0.9
 """Cosine of the angle between two guides' backs above which they lie side by side."""
-INSIDE = (0.03, 0.97)
+READING_RANGE_SHARES = (0.03, 0.97)
 """Share of a range from which readings are drawn: a drive at its stop reads nothing new."""
-PANORAMIC = np.deg2rad(95)
+PANORAMIC_HALF_VIEW = np.deg2rad(95)
 """A camera that sees more than this off its axis sees all legs from their middle."""
-NEAREST = np.deg2rad(35)
+NEAREST_HALF_VIEW = np.deg2rad(35)
 """Half the angle under which the machine is seen at most; nearer, legs hide each other."""
-TRIED = 24
+CAMERA_PLACES_TRIED = 24
 """Places round the machine of which a single camera takes the best."""
-CLEAR = 0.03
+HOME_LEG_GAP = 0.03
 """Gap to another leg at home, in image widths, that keeps a leg free of it elsewhere."""
-ARC = np.deg2rad(80)
+BOARD_CAMERAS_ARC = np.deg2rad(80)
 """Between the first and the last camera that see the same face of a board."""
 WITH_BOARD = {False: 1.45, True: 1.6}
 """Distance that leaves room for a board, in the machine's own, upright and flat."""
-SPARE = 1.18
+HOME_DISTANCE_FACTOR = 1.18
 """Distance in the machine's own at home: platforms move, and plates reach beyond joints."""
-FULL = 1.1
+MOVED_DISTANCE_FACTOR = 1.1
 """The same where the machine's own takes in where its motors move it."""
-NARROWEST = 1e-6
+NARROWEST_HALF_VIEW = 1e-6
 """Half a view (rad) below which a lens sees nothing from anywhere."""
 
-BY_HAND = (np.deg2rad(5), np.deg2rad(45))
+HANDHELD_ELEVATIONS = (np.deg2rad(5), np.deg2rad(45))
 """Lowest and highest view of a person who walks about a machine with a telephone."""
-STEPS = (1.0, 1.35)
+HANDHELD_DISTANCES = (1.0, 1.35)
 """Nearest and furthest, in the distance at which the machine fills the picture."""
-ROLL = np.deg2rad(15)
+MOST_HANDHELD_ROLL = np.deg2rad(15)
 """Roll at most, of the telephone upright or on its side."""
-UPRIGHT = 1 / 3
+UPRIGHT_PHOTOGRAPH_SHARE = 1 / 3
 """Share of the photographs for which the telephone is held upright: the sensor lies on its side."""
-
-Vector = tuple[float, float, float]
 
 
 def check_drawable(machine: Machine) -> None:
@@ -120,11 +118,11 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     )
     good &= sign_of(rows) == sign_of(home_rows)
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
-    good &= unfolded(machine, T_base_platform)
+    good &= platform_unfolded(machine, T_base_platform)
     return good & _legs_apart(machine, T_base_platform, joints)
 
 
-def unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
+def platform_unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
     """(n,) True where the parts of an articulated platform, if it is one, stand apart."""
     turn = np.arctan2(T_base_platform[..., 1, 0], T_base_platform[..., 0, 0])
     return np.abs(turn) < FARTHEST_TURN * machine.most_turn[0]
@@ -135,8 +133,8 @@ def _candidates(
 ) -> tuple[Array, Array]:
     """Poses and readings that close the machine, usable or not."""
     ranges = machine.joint_ranges
-    share = rng.uniform(*INSIDE, (n, machine.n_joints))
-    ends = np.where(rng.random(share.shape) < 0.5, *INSIDE)
+    share = rng.uniform(*READING_RANGE_SHARES, (n, machine.n_joints))
+    ends = np.where(rng.random(share.shape) < 0.5, *READING_RANGE_SHARES)
     if not machine.layout.overdetermined:  # else no pose has every leg near an end
         share = np.where(rng.random((n, 1)) < extreme, ends, share)
     if ranges.size and np.isfinite(ranges).all():
@@ -197,7 +195,9 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
                 axis = (stop - start) / np.linalg.norm(stop - start)
                 s = np.clip((points[:, i] - start) @ axis, 0, (stop - start) @ axis)
                 gap = points[:, i] - start - s[..., None] * axis
-                apart &= np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE * widths[j]
+                apart &= (
+                    np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE_SIDE_ROOM * widths[j]
+                )
     return apart
 
 
@@ -241,7 +241,7 @@ def default_stations(
     machine: Machine,
     cameras: tuple[Camera, ...],
     rng: np.random.Generator,
-    board: Body | None = None,
+    board: BoardBody | None = None,
     *,
     distance: float | None = None,
     elevation: float | None = None,
@@ -263,13 +263,15 @@ def default_stations(
         away = fitting_distance(machine, camera, board)
         if distance is not None:
             away = distance / ball_of(space)[1]
-        if half > PANORAMIC:
+        if half > PANORAMIC_HALF_VIEW:
             poses.append(_inside(machine, rng))
         elif len(cameras) == 1 and board != "base" and len(tubes_of(machine)):
             poses.append(_clearest(machine, camera, away, start, rng, elevation))
         else:
             turn = (
-                ARC * (k / max(len(cameras) - 1, 1) - 0.5) if arc else 2 * np.pi * k / len(cameras)
+                BOARD_CAMERAS_ARC * (k / max(len(cameras) - 1, 1) - 0.5)
+                if arc
+                else 2 * np.pi * k / len(cameras)
             )
             azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
             poses.append(_outside(space, away, azimuth, rng, elevation))
@@ -286,15 +288,15 @@ def places_by_hand(
     turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
     for k, camera in enumerate(cameras):
         azimuth = start + turn * (k + rng.uniform(-0.3, 0.3))
-        elevation = rng.uniform(*BY_HAND)
-        away = fitting_distance(machine, camera) * rng.uniform(*STEPS)
+        elevation = rng.uniform(*HANDHELD_ELEVATIONS)
+        away = fitting_distance(machine, camera) * rng.uniform(*HANDHELD_DISTANCES)
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         way = np.cos(elevation) * level + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
         position = centre + away * radius * way
         target = centre + rng.uniform(-0.08, 0.08, 3) * radius
         forward = (target - position) / np.linalg.norm(target - position)
-        roll = rng.uniform(-ROLL, ROLL)
-        if rng.uniform() < UPRIGHT:
+        roll = rng.uniform(-MOST_HANDHELD_ROLL, MOST_HANDHELD_ROLL)
+        if rng.uniform() < UPRIGHT_PHOTOGRAPH_SHARE:
             roll += np.pi / 2 * rng.choice([-1, 1])
         up = rotation(roll * forward) @ np.array([0.0, 0.0, 1.0])
         up = up - (up @ forward) * forward
@@ -304,14 +306,14 @@ def places_by_hand(
     return tuple(out)
 
 
-def fitting_distance(machine: Machine, camera: Camera, board: Body | None = None) -> float:
+def fitting_distance(machine: Machine, camera: Camera, board: BoardBody | None = None) -> float:
     """From which the machine, and the board, fill the camera's picture, in the machine's radius."""
     if len(reaches(machine)[0]) > 1 and board != "base":
-        share = FULL
+        share = MOVED_DISTANCE_FACTOR
     else:
-        share = SPARE if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
-    half = min(view_angle(camera), NEAREST)
-    return float(share / np.sin(max(half, NARROWEST)))
+        share = HOME_DISTANCE_FACTOR if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
+    half = min(view_angle(camera), NEAREST_HALF_VIEW)
+    return float(share / np.sin(max(half, NARROWEST_HALF_VIEW)))
 
 
 def _clearest(
@@ -326,14 +328,14 @@ def _clearest(
     is seen least is seen best.
     """
     space = legs_space(machine)
-    azimuths = start + 2 * np.pi * np.arange(TRIED) / TRIED
+    azimuths = start + 2 * np.pi * np.arange(CAMERA_PLACES_TRIED) / CAMERA_PLACES_TRIED
     poses = [_outside(space, away, azimuth, rng, elevation) for azimuth in azimuths]
     tubes, home = tubes_of(machine), machine.home()[None]
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
     points = edge_points(machine, camera, legs, tubes, 12)
     # legs move: what comes near another one at home is behind it elsewhere
-    clear = CLEAR * camera.image_size[0]
+    clear = HOME_LEG_GAP * camera.image_size[0]
     seen = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
     share = np.stack([seen[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
     return poses[int(np.argmax(share.min(axis=0)))]

@@ -12,13 +12,13 @@ from pkmcal.boards.board import Board, board_from_document
 from pkmcal.cameras import Camera
 from pkmcal.cameras.files import camera_from_document
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, read_json, validate
+from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.simulation.truth import Asked
 
-PLAN = "plan.json"
+PLAN_FILE = "plan.json"
 
 
 class _Part(Schema):
@@ -61,15 +61,15 @@ class Rehearsal(NamedTuple):
 
 def rehearsal_of(plan: Path | str) -> Rehearsal:
     """What a plan asked for; plan : its folder, or its plan.json. Raises InputError for others."""
-    path = Path(plan) / PLAN if Path(plan).is_dir() else Path(plan)
+    path = Path(plan) / PLAN_FILE if Path(plan).is_dir() else Path(plan)
     if not path.is_file():
         raise InputError(
             "there is no plan here",
             where=str(plan),
-            expected=f"a folder that pkmcal plan wrote, or its {PLAN}",
+            expected=f"a folder that pkmcal plan wrote, or its {PLAN_FILE}",
         )
     document = read_json(path, label=str(path))
-    found = validate(document, _Plan)
+    found = validated_document(document, _Plan)
     number = {station.name: k for k, station in enumerate(found.stations)}
     pairs = [
         (number[name], k)

@@ -21,18 +21,18 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.simulation.shapes import Shape, turned
+from pkmcal.simulation.shapes import Shape, turned_components
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, radiance
 
-TILE = 16
+RAY_BUNDLE_SIDE = 16
 """Pixels along the side of a bundle of neighbouring rays."""
-SAMPLES = 32
+BORDER_PIXEL_SAMPLES = 32
 """Points in a border pixel. They stand on as many different rows and columns, and are shifted at
 random from pixel to pixel: a straight edge is then right to 0.02 px in each row of pixels, and
 without bias along the edge, upright ones included."""
 LEAST_STEP = 0.004
 """Steps in light below this (a grey level) need no second look: soft shadows have them."""
-CHUNK = 256
+RAY_BUNDLES_AT_ONCE = 256
 """Bundles at a time: 65 thousand rays, whose arrays stay in the processor's cache."""
 
 
@@ -150,7 +150,7 @@ class RayHits(NamedTuple):
     seen: Array
 
 
-def look(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHits:
+def ray_hits(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHits:
     """What rays (3, bundles, rays) meet."""
     distance, owner = first_hits([part.shape for part in scene.parts], bounds, origin, rays)
     lost = owner < 0
@@ -254,7 +254,9 @@ class PixelRays:
         )
 
 
-def render(scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.Generator) -> Array:
+def render_light(
+    scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.Generator
+) -> Array:
     """Light (H, W) that falls on each pixel, mean over its area, before blur; 1 is white."""
     rot = T_camera_base[:3, :3].T
     origin = -rot @ T_camera_base[:3, 3]
@@ -301,7 +303,9 @@ def _through_centres(
     rays = view.centre.reshape(3, -1)
     for rows in _chunks(pixels[seeing]):
         d = _seeing(rays[:, rows])
-        light[rows], label[rows], seen[rows] = look(scene, bounds, origin, turned(rot, d))
+        light[rows], label[rows], seen[rows] = ray_hits(
+            scene, bounds, origin, turned_components(rot, d)
+        )
     label[blind.ravel()] = -2
     return RayHits(light.reshape(shape), label.reshape(shape), seen.reshape(shape))
 
@@ -320,7 +324,7 @@ def _over_area(
     width, shapes = border.shape[1], [part.shape for part in scene.parts]
     wanted = np.flatnonzero(border)
     # neighbours together, for narrow bundles
-    order = np.lexsort((wanted % width // TILE, wanted // width // TILE))
+    order = np.lexsort((wanted % width // RAY_BUNDLE_SIDE, wanted // width // RAY_BUNDLE_SIDE))
     at = wanted[order]
     offsets = (_pattern()[None] + rng.random((at.size, 1, 2))) % 1.0
     corner = view.corner.reshape(3, -1)
@@ -335,7 +339,7 @@ def _over_area(
     alike = (maximum_filter(seen, 3) == minimum_filter(seen, 3)).ravel()[at]
     for known in (True, False):
         part = np.flatnonzero(~whole & (alike == known))
-        for rows in _chunks(_grouped(part, TILE)):
+        for rows in _chunks(_grouped(part, RAY_BUNDLE_SIDE)):
             fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
             c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
             d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
@@ -344,13 +348,13 @@ def _over_area(
                 centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
                 d = np.where(np.isfinite(d).all(axis=0), d, centre)
             d /= np.sqrt(np.einsum("i...,i...->...", d, d))
-            d = turned(rot, d.reshape(3, rows.shape[0], -1))
+            d = turned_components(rot, d.reshape(3, rows.shape[0], -1))
             if known:
-                lit = np.repeat(seen.ravel()[at[rows]], SAMPLES, axis=1)
+                lit = np.repeat(seen.ravel()[at[rows]], BORDER_PIXEL_SAMPLES, axis=1)
                 light = light_of(scene, origin, d, *first_hits(shapes, bounds, origin, d), lit)
             else:
-                light = look(scene, bounds, origin, d).light
-            out[rows] = light.reshape(*rows.shape, SAMPLES).mean(axis=-1)
+                light = ray_hits(scene, bounds, origin, d).light
+            out[rows] = light.reshape(*rows.shape, BORDER_PIXEL_SAMPLES).mean(axis=-1)
     result = np.empty(at.size)
     result[order] = out
     return result
@@ -371,8 +375,8 @@ def _through_corners(
     order = np.argsort(begins, kind="stable")
     seeing = order[np.isfinite(corner[:, numbers[order]]).all(axis=0)]
     label, light = np.full(numbers.size, -2, dtype=np.int16), np.zeros(numbers.size)
-    for rows in _chunks(_grouped(seeing, TILE * TILE)):
-        found = look(scene, bounds, origin, turned(rot, corner[:, numbers[rows]]))
+    for rows in _chunks(_grouped(seeing, RAY_BUNDLE_SIDE * RAY_BUNDLE_SIDE)):
+        found = ray_hits(scene, bounds, origin, turned_components(rot, corner[:, numbers[rows]]))
         label[rows], light[rows] = found.label, found.light
     which = which.reshape(-1, 4)
     return label[which], light[which]
@@ -387,11 +391,15 @@ def _grouped(numbers: Integers, size: int) -> Integers:
 
 
 def _pattern() -> Array:
-    """(SAMPLES, 2) Hammersley points: every row and column once, and even over the square."""
-    k = np.arange(SAMPLES)
-    bits = SAMPLES.bit_length() - 1
+    """(BORDER_PIXEL_SAMPLES, 2) Hammersley points: every row and column once, and even over the
+    square.
+    """
+    k = np.arange(BORDER_PIXEL_SAMPLES)
+    bits = BORDER_PIXEL_SAMPLES.bit_length() - 1
     mirrored = sum(((k >> b) & 1) << (bits - 1 - b) for b in range(bits))
-    return np.stack([(k + 0.5) / SAMPLES, (mirrored + 0.5) / SAMPLES], axis=-1)
+    return np.stack(
+        [(k + 0.5) / BORDER_PIXEL_SAMPLES, (mirrored + 0.5) / BORDER_PIXEL_SAMPLES], axis=-1
+    )
 
 
 def _borders(label: Integers, light: Array) -> Booleans:
@@ -408,14 +416,22 @@ def _borders(label: Integers, light: Array) -> Booleans:
 
 
 def _tiles(height: int, width: int) -> Integers:
-    """Pixel numbers (tiles, TILE^2) of square tiles; the last ones repeat the border's."""
-    y = np.arange(height + -height % TILE).clip(max=height - 1).reshape(-1, TILE)
-    x = np.arange(width + -width % TILE).clip(max=width - 1).reshape(-1, TILE)
-    return (y[:, None, :, None] * width + x[None, :, None, :]).reshape(-1, TILE * TILE)
+    """Pixel numbers (tiles, RAY_BUNDLE_SIDE^2) of square tiles; the last ones repeat the
+    border's.
+    """
+    y = (
+        np.arange(height + -height % RAY_BUNDLE_SIDE)
+        .clip(max=height - 1)
+        .reshape(-1, RAY_BUNDLE_SIDE)
+    )
+    x = np.arange(width + -width % RAY_BUNDLE_SIDE).clip(max=width - 1).reshape(-1, RAY_BUNDLE_SIDE)
+    return (y[:, None, :, None] * width + x[None, :, None, :]).reshape(
+        -1, RAY_BUNDLE_SIDE * RAY_BUNDLE_SIDE
+    )
 
 
 def _chunks(rows: Integers) -> list[Integers]:
-    return [rows[k : k + CHUNK] for k in range(0, len(rows), CHUNK)]
+    return [rows[k : k + RAY_BUNDLES_AT_ONCE] for k in range(0, len(rows), RAY_BUNDLES_AT_ONCE)]
 
 
 def _seeing(d: Array) -> Array:

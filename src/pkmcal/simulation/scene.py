@@ -14,7 +14,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.carriers.contract import PLANAR
+from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.render import Scene, ScenePart
@@ -32,38 +32,38 @@ from pkmcal.simulation.surfaces import (
     WavyStripes,
 )
 
-Z = np.array([0.0, 0.0, 1.0])
-MOTOR = 0.17
+Z_AXIS = np.array([0.0, 0.0, 1.0])
+MOTOR_RADIUS = 0.17
 """Radius of a motor, in its arm's length; three radii of the joint at least."""
-CARRIAGE = (2.4, 1.4, 0.6)
+CARRIAGE_HALF_SIZE = (2.4, 1.4, 0.6)
 """Half a carriage's size along, across and from its guide, in radii of the joint on it."""
-RAIL = 1.2
+RAIL_HALF_WIDTH = 1.2
 """Half a guide's width, in radii of the joint on its carriage."""
-POSTS = 3.5, 7.5
+PLANAR_POST_HEIGHTS = 3.5, 7.5
 """Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
 plate over the legs would hide them; one close below them would show their shadows for edges."""
-COLUMN = 0.12, 12.0
+HANGING_COLUMN_SIZE = 0.12, 12.0
 """Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
-BED = 4.0
+GUIDE_BED_DEPTH = 4.0
 """Height of what guides stand on below the platform's lowest joints, in the platform's radius:
 a tool or a board has room under the platform."""
-AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
-DIRECT = 0.7
+SKY_AND_GROUND_LIGHT = {False: (0.26, 0.13), True: (0.42, 0.28)}
+SOFT_LAMP_SHARE = 0.7
 """Light from above and below, and the share of the lamps' that is left where it is soft, round
 machines with thin rods: in hard light these end, for a camera, where their lit side does."""
-LIGHTS: dict[Light, tuple[float, float, float]] = {
+KINDS_OF_LIGHT: dict[Light, tuple[float, float, float]] = {
     "usual": (1.0, 1.0, 1.0),
     "soft": (2.5, 0.5, 1.8),
     "hard": (0.3, 1.3, 0.4),
 }
 """How wide and how strong the lamps are, and how strong the light from everywhere, in kinds of
 light: under a white ceiling, and in the sun or under a spot."""
-ASIDE = 1.2
+BOARD_LAMP_ASIDE = 1.2
 """rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
 MOTOR_SHARE, RING_AT, CABLE_PIECES = 0.5, 0.7, 8
 """Length of a leg's motor and place of its ring, in the length of its first tube; straight pieces
 of the motor's cable."""
-FLANGE = 0.3
+TOOL_FLANGE_RADIUS = 0.3
 """Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
 
 
@@ -104,11 +104,11 @@ def discs_of(machine: Machine) -> Discs:
         for p in (held[:, :2], b)
     )
     base, platform = held.mean(axis=0), b.mean(axis=0)
-    planar = machine.document.motion in PLANAR
+    planar = machine.document.motion in PLANAR_MOTIONS
     near, far = (p[0, :, 2].mean() for p in reaches(machine))
-    lift, drop = POSTS if planar else (2.2, 2.2)
+    lift, drop = PLANAR_POST_HEIGHTS if planar else (2.2, 2.2)
     over = -side if planar else -1.0 if far - near < -1e-3 else 1.0
-    drop = max(drop * ball, room, BED * width_b if drives.upright.any() else 0.0)
+    drop = max(drop * ball, room, GUIDE_BED_DEPTH * width_b if drives.upright.any() else 0.0)
     base[2] = (side * held[:, 2]).min() * side - side * drop
     platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
     thickness = max(0.012, 0.8 * ball)
@@ -163,14 +163,14 @@ def machine_parts(
 
 def _base(discs: Discs, balls: Array, finish: Finish) -> list[ScenePart]:
     """The base plate, and what it hangs on; or beams in its place, for guides that lie."""
-    up = discs.side * Z
+    up = discs.side * Z_AXIS
     parts = beams(discs.drives, balls, finish)
     if not parts:
         parts = [
             ScenePart(Cylinder(discs.base, -up, discs.base_radius, discs.thickness), finish.base)
         ]
     if discs.side < 0 and discs.drives.any:
-        radius, length = (size * discs.base_radius for size in COLUMN)
+        radius, length = (size * discs.base_radius for size in HANGING_COLUMN_SIZE)
         parts.append(ScenePart(Cylinder(discs.base - discs.thickness * up, -up, radius, length),
                           finish.base))  # fmt: skip
     return parts
@@ -178,7 +178,7 @@ def _base(discs: Discs, balls: Array, finish: Finish) -> list[ScenePart]:
 
 def _base_end(discs: Discs, j: int, chain: Array, balls: Array, finish: Finish) -> list[ScenePart]:
     """What holds leg j's end on the base, the last point of its chain (k, 3)."""
-    drives, up, a = discs.drives, discs.side * Z, chain[-1]
+    drives, up, a = discs.drives, discs.side * Z_AXIS, chain[-1]
     if drives.arms[j]:
         return arm_parts(drives, j, chain, balls, discs.base, up, finish)
     if drives.guides[j]:
@@ -197,7 +197,7 @@ def _platform(
     """The platform's plate with the tool's holder, and its joints b (L, 3) or the bars to them."""
     up = discs.platform_side * T_base_platform[:3, 2]
     centre = apply(T_base_platform, discs.platform)
-    radius = discs.platform_radius * (FLANGE if bars else 1.0)
+    radius = discs.platform_radius * (TOOL_FLANGE_RADIUS if bars else 1.0)
     top = centre + discs.thickness * up
     parts = [
         ScenePart(Cylinder(centre, up, radius, discs.thickness), finish.platform),
@@ -284,7 +284,7 @@ def _ball_radii(machine: Machine) -> Array:
 
 def motor_radius(arm: float, ball: float) -> float:
     """Of an arm's motor, m."""
-    return max(MOTOR * arm, 2.2 * ball)
+    return max(MOTOR_RADIUS * arm, 2.2 * ball)
 
 
 def arm_parts(
@@ -350,8 +350,12 @@ def guide_parts(
     straight pieces.
     """
     foot, away, ball = drives.foot[j], drives.away[j], float(balls[j])
-    along, across, deep = (ball * size for size in CARRIAGE)
-    width, spare, back = RAIL * ball, 1.2 * along, ball + 2 * deep + RAIL * ball
+    along, across, deep = (ball * size for size in CARRIAGE_HALF_SIZE)
+    width, spare, back = (
+        RAIL_HALF_WIDTH * ball,
+        1.2 * along,
+        ball + 2 * deep + RAIL_HALF_WIDTH * ball,
+    )
     way = drives.ways[j]
     rails: list[Box] = []
     if len(way) == 2:
@@ -403,10 +407,10 @@ def beams(drives: Drives, balls: Array, finish: Finish) -> list[ScenePart]:
     away = away / np.linalg.norm(away)
     side, ball = np.cross(u, away), float(balls[rows].max())
     # on the far side of the guides, whose own depth is that of carriage and rail
-    clear = ball * (1 + 2 * CARRIAGE[2] + 2 * RAIL)
+    clear = ball * (1 + 2 * CARRIAGE_HALF_SIZE[2] + 2 * RAIL_HALF_WIDTH)
     points = drives.ends[rows].reshape(-1, 3)
     t, s, h = points @ u, points @ side, (points @ away).max() + clear
-    width = 2 * RAIL * ball
+    width = 2 * RAIL_HALF_WIDTH * ball
     half = np.array([np.ptp(s) / 2 + 2 * width, width, width])
     middle = (s.min() + s.max()) / 2 * side + (h + width) * away
     rot, ends = np.stack([side, u, away]), (t.min() + width, t.max() - width)
@@ -464,16 +468,16 @@ def room_of(
     """
     size = max(discs.base_radius, discs.platform_radius)
     reach = max(reach, 2.5 * size)
-    middle = discs.base - discs.side * discs.thickness * Z
+    middle = discs.base - discs.side * discs.thickness * Z_AXIS
     if discs.side < 0:  # a machine that hangs from its base has no table under it
-        middle = middle - 4.0 * size * Z
+        middle = middle - 4.0 * size * Z_AXIS
     parts = _table(middle, size, noise, rng)
     floor = middle[2] - 2.2 * size
     parts += _walls(middle, floor, reach, noise, rng)
     for azimuth in 2 * np.pi * (np.arange(11) + rng.uniform(-0.4, 0.4, 11)) / 11:
         parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
     usual = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
-    wide, strong, around = LIGHTS[light]
+    wide, strong, around = KINDS_OF_LIGHT[light]
     lamps = tuple(
         replace(lamp, radius=wide * lamp.radius, power=strong * lamp.power) for lamp in usual
     )
@@ -481,7 +485,7 @@ def room_of(
         ScenePart(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False)
         for lamp in lamps
     ]
-    sky, ground = AROUND[discs.drives.any]
+    sky, ground = SKY_AND_GROUND_LIGHT[discs.drives.any]
     return Scene((*parts, *bulbs), Lighting(lamps, around * sky, around * ground))
 
 
@@ -489,10 +493,10 @@ def _table(
     middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator
 ) -> list[ScenePart]:
     half = np.array([1.75, 1.6, 0.05]) * size
-    turn = rotation(rng.uniform(-np.pi, np.pi) * Z)
+    turn = rotation(rng.uniform(-np.pi, np.pi) * Z_AXIS)
     pattern = WavyStripes(noise, 0.42 * size, 0.42)
-    top = Box(middle - half[2] * Z, turn, half)
-    leg = Box(middle - size * Z, turn, np.array([0.5, 0.5, 0.9]) * size)
+    top = Box(middle - half[2] * Z_AXIS, turn, half)
+    leg = Box(middle - size * Z_AXIS, turn, np.array([0.5, 0.5, 0.9]) * size)
     return [
         ScenePart(top, Material(0.30, pattern, gloss=0.04, sharpness=8.0)),
         ScenePart(leg, Material(0.05)),
@@ -512,12 +516,12 @@ def _walls(
     turn = rng.uniform(0, 2 * np.pi)
     parts = [
         ScenePart(
-            Wall(np.array([*middle[:2], floor]), Z),
+            Wall(np.array([*middle[:2], floor]), Z_AXIS),
             Material(0.32, Slats(0.12 * reach, 0.06 * reach, 0.3)),
             False,
         ),
         ScenePart(
-            Wall(np.array([*middle[:2], floor + 4.5 * reach]), -Z),
+            Wall(np.array([*middle[:2], floor + 4.5 * reach]), -Z_AXIS),
             Material(0.6, Slats(0.6 * reach, 0.6 * reach, 0.7)),
             False,
         ),
@@ -552,10 +556,12 @@ def _furniture(
         Material(0.6, Clouds(noise, 0.2 * size, 0.1)),
     ][rng.integers(5)]
     if rng.random() < 0.25:
-        return ScenePart(Cylinder(place, Z, size * rng.uniform(0.06, 0.2), height), material, False)
+        return ScenePart(
+            Cylinder(place, Z_AXIS, size * rng.uniform(0.06, 0.2), height), material, False
+        )
     lean = rotation(np.array([*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]))
     half = np.array([*rng.uniform(0.1, 0.45, 2) * size, height / 2])
-    return ScenePart(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
+    return ScenePart(Box(place + lean.T @ (half[2] * Z_AXIS), lean, half), material, False)
 
 
 def _lamps(
@@ -569,8 +575,8 @@ def _lamps(
     """A key lamp with shadows, a weaker one across, one from above and behind."""
     azimuth = rng.uniform(0, 2 * np.pi)
     if lit_from is not None:
-        azimuth = lit_from + ASIDE * (azimuth / np.pi - 1)
-    share = DIRECT if soft else 1.0
+        azimuth = lit_from + BOARD_LAMP_ASIDE * (azimuth / np.pi - 1)
+    share = SOFT_LAMP_SHARE if soft else 1.0
     lamps: list[Lamp] = []
     for turn, elevation, distance, power in (
         (0.0, rng.uniform(40, 60), 1.8, 1.25),
@@ -581,7 +587,7 @@ def _lamps(
         way = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
         lamps.append(
             Lamp(
-                middle + (distance * reach) * way + size * Z,
+                middle + (distance * reach) * way + size * Z_AXIS,
                 0.16 * size,
                 share * power,
                 distance * reach,

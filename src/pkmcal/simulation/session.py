@@ -18,15 +18,15 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import Exif, csv_text, entries, staged_folder, with_exif, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
-from pkmcal.mechanisms.carriers.contract import PLANAR
+from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
 from pkmcal.simulation.board import board_part, holder_part
 from pkmcal.simulation.placement import check_drawable, one_a_station
-from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render_light
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import (
-    FILE,
-    HANDHELD,
+    HANDHELD_STATION_NAME,
+    TRUTH_FILE,
     Settings,
     Truth,
     draw_truth,
@@ -34,8 +34,8 @@ from pkmcal.simulation.truth import (
     truth_document,
 )
 
-Progress = Callable[[int, int], None]
-QUALITY = 95
+PhotographProgress = Callable[[int, int], None]
+HANDHELD_JPEG_QUALITY = 95
 """Of JPEG files by hand, as telephones write them."""
 
 
@@ -47,7 +47,7 @@ def simulate_session(
     *,
     seed: int = 0,
     workers: int = 2,
-    progress: Progress | None = None,
+    progress: PhotographProgress | None = None,
 ) -> Truth:
     """Write a session into a new folder, whole or not at all; the truth goes to truth.json.
 
@@ -112,7 +112,7 @@ class Studio:
         fixed: tuple[ScenePart, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
-        flat = truth.machine.document.motion in PLANAR
+        flat = truth.machine.document.motion in PLANAR_MOTIONS
         finish = Finish.from_noise(noise, flat, settings.finish)
         board, built, eyes = settings.board, settings.as_built, tuple(cameras)
         return cls(truth, discs, finish, room, eyes, views, settings.sensor, fixed, board, built)
@@ -148,7 +148,7 @@ class Studio:
         scene = self.room.having([*parts, *self.fixed])
         camera = self.cameras[station]
         view = self.views.get(id(camera)) or PixelRays.of(camera)
-        return render(scene, view, T_camera_base, rng)
+        return render_light(scene, view, T_camera_base, rng)
 
 
 def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
@@ -190,7 +190,7 @@ def _write_texts(
         "mechanism.yaml": mechanism_text(drawing),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),
         "joints.csv": csv_text(drawing.joint_names, truth.configurations, truth.readings),
-        FILE: json.dumps(truth_document(truth), indent=1) + "\n",
+        TRUTH_FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
     if settings.board is not None:
         texts["board.yaml"] = yaml_text(settings.board.document)
@@ -223,9 +223,9 @@ def _session_document(
     }
     if settings.handheld:
         stations = {
-            HANDHELD: {
+            HANDHELD_STATION_NAME: {
                 "camera": camera_files[truth.stations[0]],
-                "images": f"images/{HANDHELD}/{{configuration}}-{{repeat}}.jpg",
+                "images": f"images/{HANDHELD_STATION_NAME}/{{configuration}}-{{repeat}}.jpg",
                 "observe": observe,
                 "handheld": True,
             }
@@ -245,11 +245,11 @@ def _write_photographs(
     settings: Settings,
     truth: Truth,
     workers: int,
-    progress: Progress | None,
+    progress: PhotographProgress | None,
 ) -> None:
     """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
     studio = Studio.of(truth, cameras, settings)
-    for name in [HANDHELD] if settings.handheld else truth.stations:
+    for name in [HANDHELD_STATION_NAME] if settings.handheld else truth.stations:
         (stage / "images" / name).mkdir(parents=True)
     total = len(truth.photographs)
     with ThreadPoolExecutor(max(1, workers)) as pool:
@@ -271,8 +271,8 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
     station, k = truth.photographs[index]
     if settings.handheld:
         (picture,) = studio.photographs(index)
-        name = truth.stations[station].removeprefix(f"{HANDHELD}-")
-        path = stage / "images" / HANDHELD / f"{name}.jpg"
+        name = truth.stations[station].removeprefix(f"{HANDHELD_STATION_NAME}-")
+        path = stage / "images" / HANDHELD_STATION_NAME / f"{name}.jpg"
         camera, T_camera_base = studio.cameras[station], truth.T_camera_base[station]
         path.write_bytes(_as_by_telephone(picture, camera, T_camera_base))
         return
@@ -289,7 +289,7 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
     """A JPEG file with EXIF: how the telephone was held, and its focal length in whole mm."""
     import cv2
 
-    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, HANDHELD_JPEG_QUALITY])
     if not ok:
         raise OSError("a photograph could not be encoded as JPEG")
     # where up is in the picture as stored: viewers turn it so that it is above

@@ -62,7 +62,7 @@ def inner(d: Array, v: Array) -> Array:
     return out
 
 
-def turned(rot: Array, v: Array) -> Array:
+def turned_components(rot: Array, v: Array) -> Array:
     """Vectors (3, ...) turned by a matrix (3, 3).
 
     Not by BLAS: its own threads, for so small a matrix, wait more than they work, and photographs
@@ -125,7 +125,7 @@ class Cylinder(Shape):
 
     def local(self, points: Array) -> Array:
         """Two coordinates across the axis and one along it."""
-        return turned(_frame_of(self.axis), points - self.start[:, None])
+        return turned_components(_frame_of(self.axis), points - self.start[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """A row along the axis, or one ball round a disc."""
@@ -218,7 +218,7 @@ class Box(Shape):
         """The last of the three slabs to be entered, before the first is left."""
         o = self.local(origin)
         with np.errstate(divide="ignore", invalid="ignore"):
-            inv = 1 / turned(self.rot, d)
+            inv = 1 / turned_components(self.rot, d)
             near = -o * inv - self.half[:, None] * np.abs(inv)
             far = -o * inv + self.half[:, None] * np.abs(inv)
         first, last = near.max(axis=0), far.min(axis=0)
@@ -236,7 +236,7 @@ class Box(Shape):
 
     def local(self, points: Array) -> Array:
         """Along the box's axes, from its centre."""
-        return turned(self.rot, points - self.centre[:, None])
+        return turned_components(self.rot, points - self.centre[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """A row along the longest axis."""
@@ -269,7 +269,7 @@ class Wall(Shape):
 
     def local(self, points: Array) -> Array:
         """Two coordinates in the plane, the third zero."""
-        return turned(_frame_of(self.inward), points - self.point[:, None])
+        return turned_components(_frame_of(self.inward), points - self.point[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """Everything."""

@@ -24,7 +24,7 @@ from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
-from pkmcal.session.schema import Body
+from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import (
     StationPlace,
@@ -32,19 +32,19 @@ from pkmcal.simulation.placement import (
     draw_configurations,
     in_picture,
     places_by_hand,
+    platform_unfolded,
     rough_pose,
-    unfolded,
 )
 from pkmcal.simulation.render import Sensor
 from pkmcal.simulation.surfaces import Light, Style
 
-FILE = "truth.json"
-STREAMS = (
+TRUTH_FILE = "truth.json"
+RANDOM_STREAMS = (
     "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
 )  # fmt: skip
-SAME = 1e-9
+READING_ROUNDING = 1e-9
 """By which readings that were drawn at one end differ from each other, m or rad: rounding."""
-HANDHELD = "phone"
+HANDHELD_STATION_NAME = "phone"
 """The name in session.yaml of a station whose camera is held by hand."""
 
 
@@ -89,7 +89,7 @@ class Settings:
     extreme: float = 0.5
     sensor: Sensor = field(default_factory=Sensor)
     board: Board | None = None
-    board_on: Body = "base"
+    board_on: BoardBody = "base"
     observe: tuple[str, ...] = ("legs", "board")
     repeats: int = 1
     shake: tuple[float, float] = (0.0, 0.0)
@@ -140,7 +140,7 @@ class Truth:
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
     """The seed of one of the session's streams of random numbers."""
-    return np.random.SeedSequence(seed).spawn(len(STREAMS))[STREAMS.index(name)]
+    return np.random.SeedSequence(seed).spawn(len(RANDOM_STREAMS))[RANDOM_STREAMS.index(name)]
 
 
 def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
@@ -160,7 +160,7 @@ def draw_truth(
     """A true machine, stations, configurations and readings; cameras : one a station, by hand
     without its breathing.
     """
-    rngs = {name: np.random.default_rng(stream(seed, name)) for name in STREAMS}
+    rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if settings.handheld:
@@ -200,7 +200,8 @@ def draw_truth(
     if settings.handheld:
         taken = enumerate(photographs[:, 1].tolist())
         names = tuple(
-            f"{HANDHELD}-{configurations[k]}-{s % settings.repeats + 1}" for s, k in taken
+            f"{HANDHELD_STATION_NAME}-{configurations[k]}-{s % settings.repeats + 1}"
+            for s, k in taken
         )
     return Truth(
         machine=machine,
@@ -240,7 +241,7 @@ def _configurations(
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
     by_drawing = drawing.forward_result(joints)
-    reached = by_drawing.converged & unfolded(drawing, by_drawing.T_base_platform)
+    reached = by_drawing.converged & platform_unfolded(drawing, by_drawing.T_base_platform)
     poses, joints = poses[reached], joints[reached]
     seen = np.stack(
         [
@@ -283,8 +284,10 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
     their names and their noise. groups : of each, the candidates (N,) that its stations see.
     joints : (N, m).
     """
-    rows, pose = rows.copy(), same_pose(joints, SAME)
-    ends = (joints < joints.min(axis=0) + SAME) | (joints > joints.max(axis=0) - SAME)
+    rows, pose = rows.copy(), same_pose(joints, READING_ROUNDING)
+    ends = (joints < joints.min(axis=0) + READING_ROUNDING) | (
+        joints > joints.max(axis=0) - READING_ROUNDING
+    )
     extreme = ends.all(axis=1)
     n = len(rows) // len(groups)
     for place in range(len(rows)):
@@ -364,7 +367,7 @@ def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
 
     Readings and rough poses are the session's; here the exact readings stand for the former.
     """
-    path = Path(folder) / FILE
+    path = Path(folder) / TRUTH_FILE
     data = json.loads(read_text(path))
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))

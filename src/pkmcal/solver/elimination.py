@@ -14,10 +14,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 
-ROWS = 2**15
+SOLVER_ROWS_AT_ONCE = 2**15
 """Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
 of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
-TALL = 512
+TALL_BLOCK_ROWS = 512
 """Rows of a block that is condensed by itself, where there are many: of fewer unknowns it takes a
 third of the time."""
 
@@ -64,7 +64,7 @@ def flat(rows: Array) -> Array:
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
-def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
+def rows_on_shared(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
     """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na)
     and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
     """
@@ -81,9 +81,11 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
     """
     both = np.concatenate([rows, value[..., None]], axis=-1)
     n_runs, n, m = both.shape
-    if n > 2 * TALL and m < TALL:  # in blocks first, which stay in the processor's cache
-        whole = n - n % TALL
-        blocks = both[:, :whole].reshape(n_runs, whole // TALL, TALL, m)
+    if (
+        n > 2 * TALL_BLOCK_ROWS and m < TALL_BLOCK_ROWS
+    ):  # in blocks first, which stay in the processor's cache
+        whole = n - n % TALL_BLOCK_ROWS
+        blocks = both[:, :whole].reshape(n_runs, whole // TALL_BLOCK_ROWS, TALL_BLOCK_ROWS, m)
         reduced = np.asarray(np.linalg.qr(blocks, mode="r")).reshape(n_runs, -1, m)
         both = np.concatenate([reduced, both[:, whole:]], axis=1)
     triangle: Array = np.asarray(np.linalg.qr(both, mode="r"))
@@ -91,6 +93,8 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
 
 
 def divisions(count: int, rows: int) -> list[slice]:
-    """Configurations, of so many rows each, that are worked on together; see ROWS."""
-    each = max(1, ROWS // max(1, rows))
+    """Configurations, of so many rows each, that are worked on together; see
+    SOLVER_ROWS_AT_ONCE.
+    """
+    each = max(1, SOLVER_ROWS_AT_ONCE // max(1, rows))
     return [slice(first, min(first + each, count)) for first in range(0, count, each)]

@@ -8,9 +8,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 
-LEAST = 1e-150
+SINGULAR_VALUE_FLOOR = 1e-150
 """Of a singular value or an eigenvalue; where all are zero nothing is known, and that is finite."""
-EPSILON = float(np.finfo(float).eps)
+DOUBLE_EPSILON = float(np.finfo(float).eps)
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
 there with exact derivatives, and real directions are many orders above."""
@@ -23,7 +23,7 @@ def column_space(columns: Array) -> Array:
     return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
 
 
-def directions(rows: Array) -> tuple[Array, Array, Array]:
+def scaled_directions(rows: Array) -> tuple[Array, Array, Array]:
     """How well rows (..., n, m) know each direction of their unknowns, columns made of length one.
 
     Singular values s (..., m), right vectors vt (..., m, m), and the columns' lengths scale
@@ -42,9 +42,9 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
     Directions below ``least`` of the largest singular value are not known. loose : they get a huge
     variance; otherwise none, as in a pseudo-inverse.
     """
-    s, vt, scale = directions(rows)
+    s, vt, scale = scaled_directions(rows)
     limit = least * s[..., :1]
-    inverse = 1 / np.maximum(s, limit + LEAST) if loose else _of_known(s, limit)
+    inverse = 1 / np.maximum(s, limit + SINGULAR_VALUE_FLOOR) if loose else _of_known(s, limit)
     return vt.mT * inverse[..., None, :] / scale[..., None]
 
 
@@ -53,7 +53,9 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
     scaled, scale = unit_diagonal(normal)
     values, vectors = np.linalg.eigh(scaled)
     limit = least * values[..., -1:]
-    inverse = 1 / np.maximum(values, limit + LEAST) if loose else _of_known(values, limit)
+    inverse = (
+        1 / np.maximum(values, limit + SINGULAR_VALUE_FLOOR) if loose else _of_known(values, limit)
+    )
     return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
 
 
@@ -68,7 +70,7 @@ def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
         return np.full_like(normal, np.nan), np.zeros(len(normal), dtype=bool)
     size = np.abs(scaled).sum(axis=-1).max(axis=-1) * np.abs(inverse).sum(axis=-1).max(axis=-1)
     inverse = 0.5 * (inverse + inverse.mT)
-    return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(EPSILON)
+    return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(DOUBLE_EPSILON)
 
 
 def _of_known(values: Array, limit: Array) -> Array:

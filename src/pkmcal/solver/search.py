@@ -30,28 +30,29 @@ from pkmcal.solver.strips import (
 LEAST_DAMPING = 1e-14
 """Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
 step is the best, and any damping costs steps along what is known little of."""
-GROWTH = 8.0
+DAMPING_GROWTH = 8.0
 """Factor on it after a step that was refused, and that factor's after each more in a row: from
 nothing to a hundredth in five."""
-STRONG = 1e-2
+STRONG_DAMPING = 1e-2
 """Damping from which on a step is small anywhere, so that its size tells nothing."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
-REFUSED = 1e-3
+REFUSED_STEP_TOLERANCE = 1e-3
 """The same of a step that the residuals refuse, though the linear model promises something: so
 little is their rounding, where a direction is a millionth as well known as the others."""
-ROUNDING = 1e-13
+COST_ROUNDING = 1e-13
 """Of the cost, relative."""
-KEPT = 16
+KEPT_PROBLEM_PARTS = 16
 """Parts of a problem of which is kept what their residuals took, so that the next step goes on from
 it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
 
-FULL, NONE = 4.0, 6.5
-"""Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
-3 in 10^4 lose part of their weight and none all of it, so efficiency is above 0.999."""
+FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
+"""Final weights are 1 up to FULL_WEIGHT_DISTANCE and 0 from NO_WEIGHT_DISTANCE standard deviations:
+of clean pairs of residuals 3 in 10^4 lose part of their weight and none all of it, so efficiency is
+above 0.999."""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
@@ -259,7 +260,7 @@ class _Divided(NamedTuple):
         for k in range(1, len(self.parts)):
             values = self.parts[k][1].residuals(self._state_among(state, k))
             values = values._replace(shared_value=values.shared_value[:, :0])
-            found.append(values if k < KEPT else values._replace(rows=None))
+            found.append(values if k < KEPT_PROBLEM_PARTS else values._replace(rows=None))
         return found
 
     def _state_among(self, state: Any, k: int) -> Any:
@@ -328,7 +329,7 @@ class _Search(NamedTuple):
     @classmethod
     def begun(cls, n_runs: int) -> _Search:
         """Before the first step."""
-        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, GROWTH, np.inf)))
+        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, DAMPING_GROWTH, np.inf)))
 
     def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
         """After a step of a size that kept a ratio of what it promised."""
@@ -336,7 +337,7 @@ class _Search(NamedTuple):
         damping = self.damping * np.where(accepted, less, self.growth)
         return _Search(
             np.clip(damping, LEAST_DAMPING, MOST_DAMPING),
-            np.where(accepted, GROWTH, GROWTH * self.growth),
+            np.where(accepted, DAMPING_GROWTH, DAMPING_GROWTH * self.growth),
             np.where(accepted & self.undamped, size, np.inf),
         )
 
@@ -383,7 +384,7 @@ def _try(
     cost, promised = normal.cost, descent - size2
     size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
-    small = (size < tolerance * unit) | (np.abs(promised) < ROUNDING * cost)
+    small = (size < tolerance * unit) | (np.abs(promised) < COST_ROUNDING * cost)
     last = search.left(size) < tolerance * unit
     usable = [part.usable for part in normal.parts]
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
@@ -399,11 +400,16 @@ def _try(
         for part, use in zip(values, usable, strict=True)
     )
     ratio = (cost - cost_trial) / np.maximum(promised, 1e-300)
-    accepted = cost_trial <= cost * (1 + ROUNDING)
+    accepted = cost_trial <= cost * (1 + COST_ROUNDING)
     small |= accepted & last
     # a step that is refused for its rounding is better taken: all that is known of it is good
-    little = ~accepted & (promised < (REFUSED * unit) ** 2) & (damping < STRONG)
-    small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
+    little = (
+        ~accepted & (promised < (REFUSED_STEP_TOLERANCE * unit) ** 2) & (damping < STRONG_DAMPING)
+    )
+    small, accepted = (
+        small | little,
+        accepted | (little & (cost_trial - cost < REFUSED_STEP_TOLERANCE**2)),
+    )
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
     return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)
@@ -412,7 +418,7 @@ def _try(
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
     if not usable:
         return Stop.NOT_FINITE
-    if small and damping < STRONG:
+    if small and damping < STRONG_DAMPING:
         return Stop.CONVERGED
     return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
 
@@ -427,8 +433,10 @@ def soft_weights(distance: Array, scale: Array | float) -> Array:
 
 
 def final_weights(distance: Array) -> Array:
-    """Weights of distances in standard deviations: 1 up to FULL, a cosine's way down to 0 at NONE;
-    0 where nothing can be predicted.
+    """Weights of distances in standard deviations: 1 up to FULL_WEIGHT_DISTANCE, a cosine's way
+    down to 0 at NO_WEIGHT_DISTANCE; 0 where nothing can be predicted.
     """
-    x = np.clip((distance - FULL) / (NONE - FULL), 0, 1)
+    x = np.clip(
+        (distance - FULL_WEIGHT_DISTANCE) / (NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE), 0, 1
+    )
     return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)

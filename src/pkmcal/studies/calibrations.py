@@ -31,7 +31,7 @@ from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
 from pkmcal.identify.estimate import State
-from pkmcal.identify.found import EXACT
+from pkmcal.identify.found import ROUNDING_SIGMA
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
@@ -46,11 +46,11 @@ from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
-from pkmcal.measurements import ALIKE, OWN_SHADING, SHADING_SIGMA
+from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, SHADING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.simulation.edges import FITTED, moved_outward
+from pkmcal.simulation.edges import EDGE_TURN_PLACES, moved_outward
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
@@ -58,22 +58,22 @@ from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import covered
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-ESTIMATE: Key = ("joint",)
-BATCH = 10
+JOINT_ESTIMATE_KEY: Key = ("joint",)
+CALIBRATIONS_A_BATCH = 10
 """Runs that are solved at once, and that share a plan of photographs."""
-NEAR = 1e-9
+UNSHARED_SHADING_VARIANCE = 1e-9
 """Of a variance, what two edges with the same normal are shaded by each for itself; a covariance of
 equal rows has no root."""
-ROUGH = np.repeat([np.deg2rad(1.0), 0.01], 3)
+STATION_START_SIGMAS = np.repeat([np.deg2rad(1.0), 0.01], 3)
 """rad and m, standard deviations by which stations start off: so far is what a search for the drawn
 machine in photographs leaves, as the drawing's own errors do."""
-WORKSPACE = 20
+TOOL_ERROR_POSES = 20
 """Poses at which the tool's error is told."""
-REDRAWN = 20
+TIMES_MACHINES_REDRAWN = 20
 """Times that a machine is drawn again which cannot take the plan's readings."""
-PLAN, SPACE = 1, 2
+PHOTOGRAPH_PLAN_STREAM, TOOL_POSES_STREAM = 1, 2
 """Uses of a batch's draws, besides the simulation."""
-QUANTITIES: Mapping[str, Quantity] = {
+CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
     "position": Quantity("rms", 1e3, "mm"),
     "orientation": Quantity("rms", 1e3, "mrad"),
     "position_sigma": Quantity("rms", 1e3, "mm"),
@@ -105,8 +105,8 @@ class SimulatedCalibrations:
     """Calibrations of machines by one design. batch : runs that share a plan."""
 
     design: Design
-    batch: int = BATCH
-    quantities: Mapping[str, Quantity] = field(default_factory=lambda: QUANTITIES)
+    batch: int = CALIBRATIONS_A_BATCH
+    quantities: Mapping[str, Quantity] = field(default_factory=lambda: CALIBRATED_QUANTITIES)
 
     doing = "Calibrating simulated machines"
 
@@ -128,7 +128,7 @@ class SimulatedCalibrations:
     def draw(self, batch: Batch) -> SimulatedSessions:
         """True machines, their poses at the plan's readings, and what is measured of them."""
         design, rng = self.design, batch.generator(0)
-        capture = captured(design, batch.generator(PLAN))
+        capture = captured(design, batch.generator(PHOTOGRAPH_PLAN_STREAM))
         theta, poses, internal = _machines(design, capture, batch.runs, rng)
         readings = capture.joints + design.reading_noise * rng.standard_normal(
             (batch.runs, *capture.joints.shape)
@@ -142,7 +142,7 @@ class SimulatedCalibrations:
         pose_data = problem.pose_data
         if len(capture.views):
             pose_data = _measured_boards(design, capture, one, poses, rng)
-        off = ROUGH * rng.standard_normal((batch.runs, len(capture.cameras), 6))
+        off = STATION_START_SIGMAS * rng.standard_normal((batch.runs, len(capture.cameras), 6))
         stations = perturb(capture.T_camera_base, off)
         problem = replace(problem, data=data, pose_data=pose_data)
         assembled = replace(one, problem=problem)
@@ -166,7 +166,7 @@ class SimulatedCalibrations:
         good = np.array([stop is Stop.CONVERGED for stop in found.solution.stop])
         told = [self._told(data, found, run) for run in range(n)]
         return {
-            ESTIMATE: Fitted(
+            JOINT_ESTIMATE_KEY: Fitted(
                 np.array([theta for theta, _ in told]),
                 told={
                     "chi2": found.solution.cost / dof,
@@ -193,13 +193,15 @@ class SimulatedCalibrations:
         self, batch: Batch, data: SimulatedSessions, found: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of parameters and tool, and what is stated of them."""
-        machine, fit = data.capture.machine, found[ESTIMATE]
+        machine, fit = data.capture.machine, found[JOINT_ESTIMATE_KEY]
         by_board = "legs" not in self.design.observe
-        joints = draw_configurations(machine, WORKSPACE, 0.0, batch.generator(SPACE))[1]
-        joints = joints[:WORKSPACE]
+        joints = draw_configurations(
+            machine, TOOL_ERROR_POSES, 0.0, batch.generator(TOOL_POSES_STREAM)
+        )[1]
+        joints = joints[:TOOL_ERROR_POSES]
         parts = [self._judged(data, fit, run, joints, every=by_board) for run in range(batch.runs)]
         parameters, tool = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
-        return {ESTIMATE: judged(parameters, tool, fit)}
+        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, fit)}
 
     def _judged(
         self, data: SimulatedSessions, fit: Fitted, run: int, joints: Array, *, every: bool
@@ -212,9 +214,9 @@ class SimulatedCalibrations:
         covariance = np.zeros((len(theta),) * 2) if fit.covariance is None else fit.covariance[run]
         told = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        sigma = np.where(sigma > EXACT, sigma, np.nan)
+        sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
         sigma[_along_axes(machine)] = np.nan
-        off = tool_difference(machine, theta, covariance, true, joints, every=every)
+        off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
         return np.stack([theta - told, sigma]), np.stack(off)
 
 
@@ -235,7 +237,7 @@ def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
     return Sample(values | fit.told, {"parameters": parameters[1], "tool": tool[1]})
 
 
-def tool_difference(
+def tool_error_and_sigma(
     machine: Machine,
     theta: Array,
     covariance: Array,
@@ -270,7 +272,7 @@ def tool_difference(
     variance = np.einsum("kip,pq,kiq->ki", by, covariance, by)
     out = np.full((2, len(joints), 6), np.nan)
     out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
-    out[:, out[1] < EXACT] = np.nan  # no motion in this direction
+    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # no motion in this direction
     return out[0], out[1]
 
 
@@ -320,7 +322,7 @@ def _machines(
     poses = np.empty((runs, *start.T_base_platform.shape))
     internal = np.empty((runs, *start.internal.shape))
     left = np.arange(runs)
-    for _ in range(REDRAWN):
+    for _ in range(TIMES_MACHINES_REDRAWN):
         step = tolerance * rng.standard_normal((len(left), len(tolerance)))
         theta[left] = table.unit_axes(table.drawing + step @ free.T)
         found = forward(
@@ -332,7 +334,7 @@ def _machines(
             return theta, poses, internal
     raise ResultError(
         "machines within the drawing's tolerances cannot take the readings of the plan",
-        found=f"{left.size} of {runs} machines, drawn {REDRAWN} times",
+        found=f"{left.size} of {runs} machines, drawn {TIMES_MACHINES_REDRAWN} times",
         next_step="Look at the tolerances and ranges in the mechanism file",
     )
 
@@ -363,13 +365,13 @@ def _measured_edges(
         u, m = line_through(a, b)
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
-        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, FITTED)
+        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
         points = contour_point(
             a[:, :, None], u[:, :, None], exact[:, :, None], radius[:, own, None],
             np.broadcast_to(along, (runs, *along.shape)),
         )  # fmt: skip
         rays = points / np.sqrt(dot(points, points))[..., None]
-        middle = rays[:, :, FITTED // 2]
+        middle = rays[:, :, EDGE_TURN_PLACES // 2]
         frame = tangent_basis(exact, middle)
         flat = (x.reshape(-1, *x.shape[2:]) for x in (exact, frame, rays))
         shift, tilt = moved_outward(camera, *flat)
@@ -411,7 +413,10 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
         own = np.flatnonzero(line == number)
         angle = np.arccos(np.clip(normal[own] @ normal[own].T, -1, 1))
         out[:, own] = (
-            out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE) + NEAR * np.eye(len(own))).T
+            out[:, own]
+            @ np.linalg.cholesky(
+                np.exp(-angle / SHADING_ALIKE_ANGLE) + UNSHARED_SHADING_VARIANCE * np.eye(len(own))
+            ).T
         )
     return out
 

@@ -26,14 +26,14 @@ from pkmcal.simulation.edges import visible_edges
 from pkmcal.simulation.placement import default_stations, draw_configurations, in_picture
 from pkmcal.simulation.truth import Settings
 
-LEAST_CORNERS = 0.5
+LEAST_BOARD_SHARE_SHOWN = 0.5
 """Share of a board's corners that a photograph has to show."""
 LEAST_FACING = 0.2
 """Cosine of the angle between a board's normal and the line of sight below which it shows nothing:
 detectors give up at some eighty degrees."""
-MARGIN = 10.0
+CORNER_BORDER_MARGIN = 10.0
 """px between a corner and the image's border."""
-SPARE = 10
+SPARE_CONFIGURATIONS_DRAWN = 10
 """Configurations drawn beyond those wanted, of which a station takes what it sees."""
 
 
@@ -136,7 +136,9 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
         T_camera_base = np.stack([place.T_camera_base() for place in places])
     n = design.configurations
     wanted = n if design.shared else n * design.stations
-    poses, joints = draw_configurations(machine, 2 * wanted + SPARE, design.extreme, rng)
+    poses, joints = draw_configurations(
+        machine, 2 * wanted + SPARE_CONFIGURATIONS_DRAWN, design.extreme, rng
+    )
     board = T_platform_board = None
     seen = np.ones((design.stations, len(joints)), dtype=bool)
     if by_board:
@@ -146,7 +148,7 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
             whole, board, "platform", cameras, T_camera_base, poses, whole.inverse(poses), rng
         )
         shown = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        seen &= shown.mean(axis=-1) >= LEAST_CORNERS
+        seen &= shown.mean(axis=-1) >= LEAST_BOARD_SHARE_SHOWN
     if "legs" in design.observe:
         seen &= np.stack(
             [
@@ -229,5 +231,5 @@ def _corners(
         facing = dot(there[:, None, :3, 2], points) / np.sqrt(dot(points, points))
         with np.errstate(invalid="ignore"):
             pixels = camera.project(points)
-        out.append(camera.in_image(pixels, margin=MARGIN) & (facing > LEAST_FACING))
+        out.append(camera.in_image(pixels, margin=CORNER_BORDER_MARGIN) & (facing > LEAST_FACING))
     return np.stack(out)

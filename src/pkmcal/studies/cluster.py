@@ -10,19 +10,19 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pkmcal.errors import InputError, ResultError
-from pkmcal.studies.tasks import Done, Finished, Job, Runner, work
+from pkmcal.studies.tasks import Finished, Job, Runner, SolvedBatch, work
 
-TIMEOUT = 20
+SCHEDULER_TIMEOUT = 20
 """Seconds for a scheduler to answer, and for its first worker to be there."""
-SCHEMES = ("tcp", "tls", "ws", "wss")
-EXPECTED = "the address that dask scheduler prints, such as tcp://10.0.0.1:8786"
+SCHEDULER_SCHEMES = ("tcp", "tls", "ws", "wss")
+EXPECTED_SCHEDULER_ADDRESS = "the address that dask scheduler prints, such as tcp://10.0.0.1:8786"
 
 
 def _is_address(text: str) -> bool:
     """Whether a text names a host and a port, and how to speak with it."""
     try:
         parts = urlsplit(text if "://" in text else f"tcp://{text}")
-        return parts.scheme in SCHEMES and bool(parts.hostname) and bool(parts.port)
+        return parts.scheme in SCHEDULER_SCHEMES and bool(parts.hostname) and bool(parts.port)
     except ValueError:  # a port that is no number
         return False
 
@@ -32,7 +32,7 @@ def _version() -> str:
     return version("pkmcal")
 
 
-def _worked(task: Job) -> Done:
+def _worked(task: Job) -> SolvedBatch:
     """On a worker, which keeps to one thread in its linear algebra from then on: its tasks may
     overlap, and each would give the others' threads back when it ends.
     """
@@ -57,20 +57,20 @@ def on_cluster(address: str) -> Runner:
     if not _is_address(address):  # which Dask's client only tells after it has begun, and late
         raise InputError(
             "this is no address of a Dask scheduler",
-            where="--scheduler", found=f"'{address}'", expected=EXPECTED,
+            where="--scheduler", found=f"'{address}'", expected=EXPECTED_SCHEDULER_ADDRESS,
         )  # fmt: skip
 
     def runner(tasks: Sequence[Job], finished: Finished) -> int:
         from distributed import Client
 
         try:
-            client: Any = Client(address, timeout=TIMEOUT, set_as_default=False)
+            client: Any = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 "no Dask scheduler answers",
                 where="--scheduler",
                 found=f"{address}: {str(error) or type(error).__name__}",
-                expected=EXPECTED,
+                expected=EXPECTED_SCHEDULER_ADDRESS,
             ) from None
         log = logging.getLogger("distributed.client")
         level = log.level
@@ -89,7 +89,7 @@ def on_cluster(address: str) -> Runner:
 def _checked(client: Any, address: str) -> int:
     """The number of the cluster's workers, all of which have this program."""
     try:
-        client.wait_for_workers(1, timeout=TIMEOUT)
+        client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
     except TimeoutError:
         raise InputError(
             "the cluster has no worker",

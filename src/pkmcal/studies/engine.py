@@ -15,15 +15,15 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.studies.statistics import STATISTICS, Summary
+from pkmcal.studies.statistics import SUMMARIES_BY_STATISTIC, Summary
 from pkmcal.studies.store import Store
-from pkmcal.studies.tasks import Batch, Done, Job, Key, Runner, Sample, Setting
+from pkmcal.studies.tasks import Batch, Job, Key, Runner, Sample, SolvedBatch, StudySetting
 from pkmcal.studies.workers import on_cores
 
-Told = Callable[[str, float], None]
+StudyProgress = Callable[[str, float], None]
 
 
-S = TypeVar("S", bound=Setting)
+S = TypeVar("S", bound=StudySetting)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-def run(setting: S, runs: int, seed: int, told: Told | None = None) -> StudyResult[S]:
+def run(setting: S, runs: int, seed: int, told: StudyProgress | None = None) -> StudyResult[S]:
     """The whole study of one setting. told : called with what is done and the share of it."""
     return run_all([setting], runs, seed, told)[0]
 
@@ -63,7 +63,7 @@ def run_all(
     settings: Sequence[S],
     runs: int,
     seed: int,
-    told: Told | None = None,
+    told: StudyProgress | None = None,
     runner: Runner | None = None,
     kept: Store | None = None,
     names: Sequence[str] = (),
@@ -82,7 +82,7 @@ def run_all(
     ]
     # The first batch of every setting first: one that cannot be simulated is told at once.
     parts.sort(key=lambda part: (part[1], part[0]))
-    done: dict[int, Done] = {}
+    done: dict[int, SolvedBatch] = {}
     for k, part in enumerate(parts):
         found = kept.load(*part) if kept else None
         if found is not None:
@@ -91,7 +91,7 @@ def run_all(
     if told and done:
         told(settings[0].doing, len(done) / len(parts))
 
-    def finished(task: int, result: Done) -> None:
+    def finished(task: int, result: SolvedBatch) -> None:
         k = left[task]
         cell, number, _ = parts[k]
         if kept:
@@ -115,7 +115,7 @@ def run_all(
     return out
 
 
-def batches(setting: Setting, runs: int, seed: int) -> list[Batch]:
+def batches(setting: StudySetting, runs: int, seed: int) -> list[Batch]:
     """All that is to be done, the same for any number of workers."""
     parts = [
         (population.name, min(population.batch, population.runs - first))
@@ -139,10 +139,10 @@ def collected(parts: Sequence[Mapping[Key, Sample]]) -> dict[Key, Sample]:
     return out
 
 
-def summed_up(setting: Setting, sample: Sample) -> dict[str, Summary]:
+def summed_up(setting: StudySetting, sample: Sample) -> dict[str, Summary]:
     """A sample's quantities over its runs, in SI units."""
     return {
-        name: STATISTICS[quantity.statistic](sample.values[name])
+        name: SUMMARIES_BY_STATISTIC[quantity.statistic](sample.values[name])
         for name, quantity in setting.quantities.items()
         if name in sample.values
     }

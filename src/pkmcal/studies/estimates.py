@@ -15,17 +15,17 @@ from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.mechanisms.kinematics import forward, on_manifold, readings_at_poses
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.solver.elimination import eliminate
-from pkmcal.solver.ranks import directions
+from pkmcal.solver.ranks import scaled_directions
 from pkmcal.solver.search import minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
-LOOSE = 1e-9
+UNTOLD_SINGULAR_SHARE = 1e-9
 """Singular values of scaled rows below this share of the largest are of what nothing tells."""
-FREE = 1e3
+FREE_TOOL_FRAME_SIGMA = 1e3
 """Standard deviation (m) of the tool frame in a registration: free."""
 
 
@@ -71,8 +71,8 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """
     reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
-    s, vt, scale = directions(rows)
-    known = s > LOOSE * s[:, :1]
+    s, vt, scale = scaled_directions(rows)
+    known = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
     spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
     # the symmetric root, as singular vectors' signs are rounding's
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
@@ -90,7 +90,7 @@ def tool_places(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
     """Those near the wanted poses (n, 4, 4) that each true machine can take, and its readings."""
     layout, theta = data.machine.layout, data.theta[:, None]
     poses = on_manifold(layout, theta, wanted).T_base_platform if layout.n_internal else wanted
-    readings = inverse(layout, theta, poses)
+    readings = readings_at_poses(layout, theta, poses)
     return ToolPlaces(np.broadcast_to(poses, (*readings.shape[:2], 4, 4)), readings)
 
 
@@ -112,7 +112,7 @@ def tool_errors(
     found = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
     still = np.broadcast_to(np.eye(4), (len(found), 4, 4))
     weight = np.ones(found.shape[:2])
-    problem = PairProblem(found, at.poses, weight, turn, shift, FREE)
+    problem = PairProblem(found, at.poses, weight, turn, shift, FREE_TOOL_FRAME_SIGMA)
     pair: Pair = minimise(problem, Pair(still, still)).state
     off = problem.differences(pair) * np.repeat([turn, shift], 3)
     size = np.sqrt(np.mean(np.square(off).reshape(*off.shape[:2], 2, 3).sum(axis=-1), axis=1))

@@ -17,15 +17,15 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
-from pkmcal.studies.calibrations import ESTIMATE
+from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.cluster import on_cluster
-from pkmcal.studies.engine import StudyResult, Told, batches, run_all
+from pkmcal.studies.engine import StudyProgress, StudyResult, batches, run_all
 from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import (
     Cell,
-    Setting,
     StudySubject,
+    SweptSetting,
     Value,
     cells_of,
     in_words,
@@ -35,10 +35,10 @@ from pkmcal.studies.sweep import (
 from pkmcal.studies.tasks import Runner
 from pkmcal.wording import brief, count, number
 
-PROMISE = 0.95
-HELD = 0.02
+PROMISED_COVERAGE = 0.95
+COVERAGE_TOLERANCE = 0.02
 """Coverage may be off its promise by this, as asked of a calibration: 93 to 97 %."""
-SHARES = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
+COVERAGE_INTERVALS = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
 """Intervals of which it is told how often they hold."""
 
 
@@ -51,9 +51,9 @@ class CellFindings:
     position (m) and orientation (rad) : the tool's errors over the workspace, root mean square;
     ``_95`` : that 95 % of them stay below; ``_sigma`` : what calibrations state, their mean.
     covered, covered_tool : share of 95 % intervals that hold the truth, of all parameters and of
-    the tool's pose. held, held_tool : (n,) the same of the intervals of SHARES. chi2 : per degree
-    of freedom. parameters : (P,) names. by_parameter : (P,) share of each parameter's 95 %
-    intervals, NaN of what has none.
+    the tool's pose. held, held_tool : (n,) the same of the intervals of COVERAGE_INTERVALS. chi2 :
+    per degree of freedom. parameters : (P,) names. by_parameter : (P,) share of each parameter's 95
+    % intervals, NaN of what has none.
     """
 
     values: Mapping[str, Value]
@@ -87,7 +87,8 @@ class CellFindings:
             return None
         few = float(stdtrit(self.freedom, 0.975))
         return all(
-            s.value + few * s.error >= PROMISE - HELD for s in (self.covered, self.covered_tool)
+            s.value + few * s.error >= PROMISED_COVERAGE - COVERAGE_TOLERANCE
+            for s in (self.covered, self.covered_tool)
         )
 
 
@@ -121,7 +122,7 @@ class SweepResult:
     subject: StudySubject
     varied: Mapping[str, tuple[Value, ...]]
     cells: tuple[Cell, ...]
-    results: tuple[StudyResult[Setting], ...]
+    results: tuple[StudyResult[SweptSetting], ...]
     found: tuple[CellFindings, ...]
     runs: int
     seed: int
@@ -189,7 +190,7 @@ def study(
     seed: int = 0,
     out: Path | str | None = None,
     scheduler: str | None = None,
-    progress: Told | None = None,
+    progress: StudyProgress | None = None,
 ) -> SweepResult:
     """How accurate calibrations would be, by simulation; the same as the command.
 
@@ -222,9 +223,9 @@ def study(
     return SweepResult(begun, varied, tuple(cells), tuple(results), found, runs, seed)
 
 
-def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
+def found_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
     """One combination's runs summed up; NaN where all of them failed."""
-    sample = result.samples[ESTIMATE]
+    sample = result.samples[JOINT_ESTIMATE_KEY]
     values, sigma = sample.values, sample.sigma
     sizes = [batch.runs for batch in batches(result.setting, result.runs, result.seed)]
     batch = np.repeat(np.arange(len(sizes)), sizes)
@@ -256,8 +257,8 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         orientation_sigma=summed("orientation_sigma").value,
         covered=summed("covered"),
         covered_tool=summed("covered_tool"),
-        held=np.array([_mean(covered(e, s, float(share))) for share in SHARES]),
-        held_tool=np.array([_mean(covered(t, st, float(share))) for share in SHARES]),
+        held=np.array([_mean(covered(e, s, float(share))) for share in COVERAGE_INTERVALS]),
+        held_tool=np.array([_mean(covered(t, st, float(share))) for share in COVERAGE_INTERVALS]),
         chi2=_mean(values["chi2"][good]),
         parameters=tuple(name for name, _ in result.setting.parameters),
         by_parameter=np.where(np.isfinite(s).any(axis=0), covered(e.T, s.T), np.nan),

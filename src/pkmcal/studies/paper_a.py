@@ -34,10 +34,10 @@ from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, wi
 from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
-from pkmcal.papers.four_step import Form, parameters_of, solve
+from pkmcal.papers.four_step import FourStepForm, parameters_of, solve_from_centres
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
-from pkmcal.studies.calibrations import ESTIMATE, judged
-from pkmcal.studies.calibrations import QUANTITIES as CALIBRATED
+from pkmcal.studies.calibrations import CALIBRATED_QUANTITIES as CALIBRATED
+from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, judged
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
 from pkmcal.studies.simulated import (
@@ -45,48 +45,68 @@ from pkmcal.studies.simulated import (
     SimulatedRuns,
     Viewpoints,
     joint_problem,
-    simulate,
+    simulate_runs,
     spread_evenly,
 )
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-DRAWING, PRINTED, CORRECTED = "drawing", "four steps as printed", "four steps"
-JOINT, BOUND = "joint", "bound"
-METHODS = (DRAWING, PRINTED, CORRECTED, JOINT, BOUND)
-FORMS: dict[str, Form] = {PRINTED: "printed", CORRECTED: "corrected"}
+PAPER_A_DRAWING, FOUR_STEPS_PRINTED, FOUR_STEPS_CORRECTED = (
+    "drawing",
+    "four steps as printed",
+    "four steps",
+)
+PAPER_A_JOINT, PAPER_A_BOUND = "joint", "bound"
+PAPER_A_METHODS = (
+    PAPER_A_DRAWING,
+    FOUR_STEPS_PRINTED,
+    FOUR_STEPS_CORRECTED,
+    PAPER_A_JOINT,
+    PAPER_A_BOUND,
+)
+FOUR_STEP_FORMS: dict[str, FourStepForm] = {
+    FOUR_STEPS_PRINTED: "printed",
+    FOUR_STEPS_CORRECTED: "corrected",
+}
 
-STATIONS = 3
-PHOTOGRAPHS = 25 * 45
+PAPER_A_STATIONS = 3
+PHOTOGRAPHS_SOLVED_AT_ONCE = 25 * 45
 """Photographs of all runs that are solved at once; more only leaves the processor's cache."""
-POSES = 10
+END_EFFECTOR_POSES = 10
 """Poses a run at which the end-effector is compared, [A] 4.3."""
-DRAWS = 4
+DRAWS_FROM_BOUND = 4
 """Draws from each run's bound, so that the bound's end-effector is known twice as well."""
-RIGHT = 1.5
+RIGHT_MINIMUM_CHI2 = 1.5
 """A run whose chi2 per degree of freedom is below has found its minimum; a false one has far
 more than a hundred."""
-OFF = np.array([0.03, -0.02, 0.03, 0.01, -0.01, 0.02])
+STATION_GUESS_OFFSET = np.array([0.03, -0.02, 0.03, 0.01, -0.01, 0.02])
 """rad and m by which stations are off where nothing but the drawing is known."""
-EVALUATION, BEGIN, LEAST = 1, 2, 3
+END_EFFECTOR_STREAM, START_ERROR_STREAM, PAPER_A_BOUND_STREAM = 1, 2, 3
 """Uses of a batch's draws, besides the simulation."""
 
-DEGREE = float(np.degrees(1.0))
-GROUPS = ("base_xy", "base_z", "platform_xy", "platform_z", "offset")
-EFFECTOR = ("displacement", "orientation", "displacement_registered", "orientation_registered")
+RADIAN_IN_DEGREES = float(np.degrees(1.0))
+PAPER_A_PARAMETER_GROUPS = ("base_xy", "base_z", "platform_xy", "platform_z", "offset")
+END_EFFECTOR_QUANTITIES = (
+    "displacement",
+    "orientation",
+    "displacement_registered",
+    "orientation_registered",
+)
 """Mean error of the end-effector at random poses, [A] eq. 20, in frames by the centres 1, 3 and 5;
 then with frames registered on all centres, so that the error of the frames' own definition by three
 joints is left out."""
-QUANTITIES: Mapping[str, Quantity] = {
-    **{name: Quantity("rms", 1e3, "mm") for name in (*GROUPS, "parameters")},
+PAPER_A_QUANTITIES: Mapping[str, Quantity] = {
+    **{name: Quantity("rms", 1e3, "mm") for name in (*PAPER_A_PARAMETER_GROUPS, "parameters")},
     **{
-        name: Quantity("mean", *((1e3, "mm") if "displacement" in name else (DEGREE, "°")))
-        for name in EFFECTOR
+        name: Quantity(
+            "mean", *((1e3, "mm") if "displacement" in name else (RADIAN_IN_DEGREES, "°"))
+        )
+        for name in END_EFFECTOR_QUANTITIES
     },
     "chi2": Quantity("mean"),
     "steps": Quantity("mean"),
 }
-"""GROUPS and all thirty parameters; the end-effector; of the joint estimate chi2 per degree of
-freedom and the solver's steps."""
+"""PAPER_A_PARAMETER_GROUPS and all thirty parameters; the end-effector; of the joint estimate chi2
+per degree of freedom and the solver's steps."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +133,16 @@ class HexapodByAxes:
     batch: int | None = None
 
     doing = "Four steps and joint estimate"
-    quantities = QUANTITIES
+    quantities = PAPER_A_QUANTITIES
 
     def populations(self, runs: int) -> list[Population]:
         """One hexapod after another."""
-        most = max(1, PHOTOGRAPHS // (STATIONS * self.poses))
+        most = max(1, PHOTOGRAPHS_SOLVED_AT_ONCE // (PAPER_A_STATIONS * self.poses))
         return [Population("hexapod", runs, self.batch or most)]
 
     def draw(self, batch: Batch) -> SimulatedRuns:
         """True machines, told in the study's frames; poses by their readings."""
-        machine, rng = study_machine(), batch.generator(0)
+        machine, rng = hexapod_with_held_radii(), batch.generator(0)
         table = machine.parameters
         error = spread_evenly(rng, (batch.runs, len(table)), self.drawing_error)
         error *= np.array(table.kinds) != "radius"
@@ -134,15 +154,15 @@ class HexapodByAxes:
         start = start.reshape(*readings.shape[:2], 4, 4)
         poses = forward(machine.layout, theta[:, None], readings, start).T_base_platform
         noise = Noise(self.joint_noise, even=True, axis=self.noise.sigma())
-        return simulate(machine, theta, readings, poses, self.view(machine), noise, rng)
+        return simulate_runs(machine, theta, readings, poses, self.view(machine), noise, rng)
 
     def _readings(self, machine: Machine, runs: int, rng: np.random.Generator) -> Array:
         """Readings (B, K, 6): distinct corners of the legs' ranges per station, or uniform."""
         low, high = machine.joint_ranges.T
         if not self.extreme:
-            return rng.uniform(low, high, (runs, STATIONS * self.poses, 6))
+            return rng.uniform(low, high, (runs, PAPER_A_STATIONS * self.poses, 6))
         corners = np.array(list(product(*zip(low, high, strict=True))))
-        order = np.argsort(rng.random((runs, STATIONS, len(corners))), axis=-1)
+        order = np.argsort(rng.random((runs, PAPER_A_STATIONS, len(corners))), axis=-1)
         repeats = -(-self.poses // len(corners))
         pick = np.concatenate([order] * repeats, axis=-1)[..., : self.poses]
         return corners[pick].reshape(runs, -1, 6)
@@ -161,23 +181,26 @@ class HexapodByAxes:
         )
         depth = apply(T_camera_base[:, None], machine.base_centers())[..., 2]
         legs = np.sort(np.argsort(depth, axis=1)[:, : self.legs_seen], axis=1)
-        station: Integers = np.repeat(np.arange(STATIONS), self.poses)
+        station: Integers = np.repeat(np.arange(PAPER_A_STATIONS), self.poses)
         return Viewpoints(T_camera_base, station, legs[station])
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
         """The four steps in both forms, and the joint estimate from the corrected ones."""
         machine = data.machine
         axes = measured_axes(data)
-        a_camera, centres = centres_from_axes(axes, STATIONS)
+        a_camera, centres = centres_from_axes(axes, PAPER_A_STATIONS)
         steps = {
-            method: solve(machine, axes, a_camera, centres, form) for method, form in FORMS.items()
+            method: solve_from_centres(machine, axes, a_camera, centres, form)
+            for method, form in FOUR_STEP_FORMS.items()
         }
         out = {(method,): Fitted(parameters_of(machine, found)) for method, found in steps.items()}
-        start = Start(out[CORRECTED,].theta, steps[CORRECTED].T_camera_base)
+        start = Start(out[FOUR_STEPS_CORRECTED,].theta, steps[FOUR_STEPS_CORRECTED].T_camera_base)
         if self.start_error is not None:
-            draws = batch.generator(BEGIN).uniform(-1, 1, (batch.runs, len(machine.parameters)))
+            draws = batch.generator(START_ERROR_STREAM).uniform(
+                -1, 1, (batch.runs, len(machine.parameters))
+            )
             start = start_off_drawing(data, draws * self.start_error)
-        return {**out, (JOINT,): joint_estimate(data, start)}
+        return {**out, (PAPER_A_JOINT,): joint_from_readings(data, start)}
 
     def judge(
         self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
@@ -188,16 +211,18 @@ class HexapodByAxes:
         machine, rows = data.machine, thirty(data.machine).rows
 
         def effector(theta: Array) -> Array:
-            return effector_errors(data, theta, batch.generator(EVALUATION))
+            return effector_errors(data, theta, batch.generator(END_EFFECTOR_STREAM))
 
         out: dict[Key, Sample] = {}
-        for key, fit in {(DRAWING,): drawing(machine, batch.runs), **found}.items():
+        for key, fit in {(PAPER_A_DRAWING,): drawing(machine, batch.runs), **found}.items():
             errors = (fit.theta - data.theta) @ rows.T
             out[key] = _sample(machine, errors, effector(fit.theta), fit)
-        root = bound(machine, joint_problem(machine, data, ThreeCentres()), data)
-        draws = batch.generator(LEAST).normal(size=(DRAWS, batch.runs, root.shape[-1], 1))
+        root = root_of_bound(machine, joint_problem(machine, data, ThreeCentres()), data)
+        draws = batch.generator(PAPER_A_BOUND_STREAM).normal(
+            size=(DRAWS_FROM_BOUND, batch.runs, root.shape[-1], 1)
+        )
         moved = np.mean([effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0)
-        out[BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), moved)
+        out[PAPER_A_BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), moved)
         return out
 
 
@@ -205,9 +230,9 @@ def _sample(
     machine: Machine, errors: Array, effector: Array, fit: Fitted | None = None
 ) -> Sample:  # fmt: skip
     """Errors (B, 30) of the parameters, also by group, and (B, 4) of the end-effector."""
-    values = {name: errors[:, at] for name, at in groups(machine).items()}
+    values = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
     values |= {"parameters": errors}
-    values |= {name: effector[:, k] for k, name in enumerate(EFFECTOR)}
+    values |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
     return Sample(values | (fit.told if fit else {}), fit.sigma if fit else {})
 
 
@@ -223,7 +248,7 @@ class JointByAxes(HexapodByAxes):
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """Names and units of the thirty parameters."""
-        return tuple((name, "m") for name in thirty(study_machine()).names)
+        return tuple((name, "m") for name in thirty(hexapod_with_held_radii()).names)
 
     def solve(
         self,
@@ -232,9 +257,11 @@ class JointByAxes(HexapodByAxes):
     ) -> dict[Key, Fitted]:
         """The four steps, and the joint estimate from there."""
         measured = measured_axes(data)
-        steps = solve(data.machine, measured, *centres_from_axes(measured, STATIONS), "corrected")
+        steps = solve_from_centres(
+            data.machine, measured, *centres_from_axes(measured, PAPER_A_STATIONS), "corrected"
+        )
         start = Start(parameters_of(data.machine, steps), steps.T_camera_base)
-        return {ESTIMATE: joint_estimate(data, start)}
+        return {JOINT_ESTIMATE_KEY: joint_from_readings(data, start)}
 
     def judge(
         self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
@@ -242,28 +269,28 @@ class JointByAxes(HexapodByAxes):
         """Errors of the thirty parameters, and of the platform at random poses of the workspace,
         in frames by three centres.
         """
-        fit, machine = found[ESTIMATE], data.machine
+        fit, machine = found[JOINT_ESTIMATE_KEY], data.machine
         errors = (fit.theta - data.theta) @ thirty(machine).rows.T
         parameters = np.stack([errors, fit.sigma["parameters"]])
-        tool = _tool(machine, data.theta, fit, batch.generator(EVALUATION))
-        told = fit.told | {"failed": (fit.told["chi2"] > RIGHT).astype(float)}
+        tool = _tool(machine, data.theta, fit, batch.generator(END_EFFECTOR_STREAM))
+        told = fit.told | {"failed": (fit.told["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
         told["scale"] = np.ones(batch.runs)
-        return {ESTIMATE: judged(parameters, tool, Fitted(fit.theta, told=told))}
+        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, told=told))}
 
 
 def converged(study: StudyResult[HexapodByAxes]) -> int:
     """Runs whose joint estimate ended at the right answer."""
-    return int(np.sum(study.values("chi2", JOINT) < RIGHT))
+    return int(np.sum(study.values("chi2", PAPER_A_JOINT) < RIGHT_MINIMUM_CHI2))
 
 
 def mean_error(study: StudyResult[HexapodByAxes], method: str) -> Array:
     """Mean |error| (30,), m; of the bound's standard deviations, that of a normal distribution."""
     errors = np.abs(study.values("parameters", method)).mean(axis=0)
-    return errors * (np.sqrt(2 / np.pi) if method == BOUND else 1.0)
+    return errors * (np.sqrt(2 / np.pi) if method == PAPER_A_BOUND else 1.0)
 
 
 @cache
-def study_machine() -> Machine:
+def hexapod_with_held_radii() -> Machine:
     """The catalogue's Gough-Stewart platform with its radii held: axes do not need them. Its
     readings are what they say, as in the paper.
     """
@@ -311,8 +338,8 @@ def thirty(machine: Machine) -> Thirty:
     return Thirty(tuple(names), np.array(rows), np.array(drawn))
 
 
-def groups(machine: Machine) -> dict[str, Integers]:
-    """Which of the thirty parameters belong to each of GROUPS."""
+def parameters_by_group(machine: Machine) -> dict[str, Integers]:
+    """Which of the thirty parameters belong to each of PAPER_A_PARAMETER_GROUPS."""
     names = thirty(machine).names
     out: dict[str, Integers] = {}
     for body, letter in (("base", "A"), ("platform", "B")):
@@ -349,14 +376,14 @@ def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
     """
     table = data.machine.parameters
     free = np.any(table.free_matrix() != 0, axis=1)
-    guess = perturb(data.view.T_camera_base, OFF)
+    guess = perturb(data.view.T_camera_base, STATION_GUESS_OFFSET)
     return Start(
         table.drawing + np.where(free, error, 0.0),
         np.broadcast_to(guess, (len(error), *guess.shape)),
     )
 
 
-def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
+def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
     """The joint estimate; poses start by forward kinematics from the readings."""
     machine = data.machine
     problem = joint_problem(machine, data, ThreeCentres())
@@ -366,7 +393,9 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
     found = joint(problem, state)
     theta, nz = problem.theta(found.solution.state), z.shape[1]
-    dof = freedom(data, machine.layout, known=nz - 12 + 6 * STATIONS)  # the gauge fixes twelve
+    dof = freedom(
+        data, machine.layout, known=nz - 12 + 6 * PAPER_A_STATIONS
+    )  # the gauge fixes twelve
     spread = in_frames(machine, problem, theta)
     stated = spread @ found.info.covariance[:, :nz, :nz] @ spread.mT
     rows = thirty(machine).rows
@@ -391,14 +420,14 @@ def in_frames(machine: Machine, problem: Problem, theta: Array) -> Array:
     return problem.free - generators(machine.layout, theta) @ change @ problem.free
 
 
-def bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
+def root_of_bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
     """Square root (B, P, nz) of the Cramér-Rao covariance, frames by three centres, at the truth.
 
     An efficient estimate's errors are this matrix times independent unit normals.
     """
     z = machine.parameters.to_free(data.theta)
     n, nz = z.shape
-    T = np.broadcast_to(data.view.T_camera_base, (n, STATIONS, 4, 4))
+    T = np.broadcast_to(data.view.T_camera_base, (n, PAPER_A_STATIONS, 4, 4))
     state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
     covariance = Information(problem, state).covariance[:, :nz, :nz]
     values, vectors = np.linalg.eigh(covariance)
@@ -408,10 +437,10 @@ def bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
 
 
 def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator) -> Array:
-    """Errors (B, 4) of the end-effector by machines (B, P), EFFECTOR, m and rad."""
+    """Errors (B, 4) of the end-effector by machines (B, P), END_EFFECTOR_QUANTITIES, m and rad."""
     machine = data.machine
     low, high = machine.joint_ranges.T
-    readings = rng.uniform(low, high, (len(theta), POSES, len(low)))
+    readings = rng.uniform(low, high, (len(theta), END_EFFECTOR_POSES, len(low)))
     home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
     T, T_true = (
         forward(machine.layout, p[:, None], readings, home).T_base_platform
@@ -430,9 +459,11 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
 
 
 def _tool(machine: Machine, true: Array, fit: Fitted, rng: np.random.Generator) -> Array:
-    """Errors (2, B, POSES, 6) of the platform's pose (omega, tau), and their stated deviations."""
+    """Errors (2, B, END_EFFECTOR_POSES, 6) of the platform's pose (omega, tau), and their stated
+    deviations.
+    """
     layout, (low, high) = machine.layout, machine.joint_ranges.T
-    readings = rng.uniform(low, high, (len(true), POSES, len(low)))
+    readings = rng.uniform(low, high, (len(true), END_EFFECTOR_POSES, len(low)))
     home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
     there, T_true = (
         forward(layout, theta[:, None], readings, home).T_base_platform

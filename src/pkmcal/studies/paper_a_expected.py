@@ -8,17 +8,23 @@ from pkmcal.outcome import Check
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.paper_a import (
-    BOUND,
-    CORRECTED,
-    DEGREE,
-    GROUPS,
-    JOINT,
-    PRINTED,
+    FOUR_STEPS_CORRECTED,
+    FOUR_STEPS_PRINTED,
+    PAPER_A_BOUND,
+    PAPER_A_JOINT,
+    PAPER_A_PARAMETER_GROUPS,
+    RADIAN_IN_DEGREES,
     HexapodByAxes,
     converged,
 )
-from pkmcal.studies.reproduction import ASIDE, Compared, at_most, compared, prototype_check
-from pkmcal.studies.statistics import ratio
+from pkmcal.studies.reproduction import (
+    MONTE_CARLO_ASIDE,
+    Compared,
+    at_most,
+    compared,
+    prototype_check,
+)
+from pkmcal.studies.statistics import ratio_of_figures
 from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
@@ -27,36 +33,44 @@ TABLE_1 = AxisNoise(images=1)
 would be off by centimetres."""
 MEAN_ERRORS = (0.04e-3, 1e-3)
 """[A] 4.3: mean errors of the thirty parameters lie between, m."""
-BEFORE, AFTER = (1e-3, float(np.radians(0.12))), (0.08e-3, float(np.radians(0.018)))
+PAPER_A_ERRORS_BEFORE, PAPER_A_ERRORS_AFTER = (
+    (1e-3, float(np.radians(0.12))),
+    (0.08e-3, float(np.radians(0.018))),
+)
 """[A] 4.3: end-effector with the drawing and calibrated, m and rad; printed in rad, as above."""
 
 _GROUPS = {
-    PRINTED: ("0.077", "1.79", "0.100", "1.62", "0.198"),
-    CORRECTED: ("0.061", "0.181", "0.086", "0.146", "0.170"),
-    JOINT: ("0.034", "0.063", "0.021", "0.032", "0.060"),
-    BOUND: ("0.034", "0.060", "0.020", "0.030", "0.059"),
+    FOUR_STEPS_PRINTED: ("0.077", "1.79", "0.100", "1.62", "0.198"),
+    FOUR_STEPS_CORRECTED: ("0.061", "0.181", "0.086", "0.146", "0.170"),
+    PAPER_A_JOINT: ("0.034", "0.063", "0.021", "0.032", "0.060"),
+    PAPER_A_BOUND: ("0.034", "0.060", "0.020", "0.030", "0.059"),
 }
-_EFFECTOR = {PRINTED: ("2.6", "0.49"), CORRECTED: ("0.27", "0.048"), JOINT: ("0.091", "0.0142")}
-PROTOTYPE: dict[Key, dict[str, str]] = {
+_EFFECTOR = {
+    FOUR_STEPS_PRINTED: ("2.6", "0.49"),
+    FOUR_STEPS_CORRECTED: ("0.27", "0.048"),
+    PAPER_A_JOINT: ("0.091", "0.0142"),
+}
+PAPER_A_PROTOTYPE: dict[Key, dict[str, str]] = {
     (method,): {
-        **dict(zip(GROUPS, figures, strict=True)),
+        **dict(zip(PAPER_A_PARAMETER_GROUPS, figures, strict=True)),
         **dict(zip(("displacement", "orientation"), _EFFECTOR.get(method, ()), strict=False)),
     }
     for method, figures in _GROUPS.items()
 }
-"""RMSE (mm) of GROUPS, and errors of the end-effector (mm and degrees), by an independent prototype
-that shares no code with this program: 3 stations x 15 poses x 4 legs. Where its cameras stood and
-how large its drawing errors were is not known."""
+"""RMSE (mm) of PAPER_A_PARAMETER_GROUPS, and errors of the end-effector (mm and degrees), by an
+independent prototype that shares no code with this program: 3 stations x 15 poses x 4 legs. Where
+its cameras stood and how large its drawing errors were is not known."""
 PROTOTYPE_POSES = {5: 0.169, 15: 0.091, 30: 0.060, 120: 0.029}
 """End-effector (mm) of the joint estimate by poses a station."""
 MOST_DISPLACEMENT, MOST_ORIENTATION = 0.095, 0.015
 """mm and degrees that the joint estimate must not exceed."""
 
 FOLLOWS_DRAWING = {
-    ((PRINTED,), name) for name in ("base_z", "platform_z", "displacement", "orientation")
+    ((FOUR_STEPS_PRINTED,), name)
+    for name in ("base_z", "platform_z", "displacement", "orientation")
 }
 """What the four steps as printed leave at the drawing's own error."""
-TOLERANCE, OPEN_TOLERANCE = 0.25, 0.35
+PAPER_A_TOLERANCE, PAPER_A_OPEN_TOLERANCE = 0.25, 0.35
 """Relative difference from the prototype that fails: its cameras stood elsewhere, which moves the
 bound by a tenth; for FOLLOWS_DRAWING the size of the drawing's errors is open as well."""
 BOUND_TOLERANCE = 1.05
@@ -66,23 +80,23 @@ CHI2_TOLERANCE = 0.02
 
 def tolerance(key: Key, quantity: str) -> float:
     """Of one of the prototype's figures."""
-    return OPEN_TOLERANCE if (key, quantity) in FOLLOWS_DRAWING else TOLERANCE
+    return PAPER_A_OPEN_TOLERANCE if (key, quantity) in FOLLOWS_DRAWING else PAPER_A_TOLERANCE
 
 
-def figures_compared(study: StudyResult[HexapodByAxes]) -> list[Compared]:
+def paper_a_figures(study: StudyResult[HexapodByAxes]) -> list[Compared]:
     """Every figure that the prototype gives, the end-effector's last."""
-    figures = compared(study, PROTOTYPE, tolerance)
-    return sorted(figures, key=lambda figure: figure.quantity not in GROUPS)
+    figures = compared(study, PAPER_A_PROTOTYPE, tolerance)
+    return sorted(figures, key=lambda figure: figure.quantity not in PAPER_A_PARAMETER_GROUPS)
 
 
-def checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
+def paper_a_checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
-    joint, right = study.of(JOINT), converged(study)
-    over = ratio(joint["parameters"], study.of(BOUND)["parameters"]).value
+    joint, right = study.of(PAPER_A_JOINT), converged(study)
+    over = ratio_of_figures(joint["parameters"], study.of(PAPER_A_BOUND)["parameters"]).value
     chi2 = joint["chi2"].value
-    dof = float(study.values("dof", JOINT)[0])
+    dof = float(study.values("dof", PAPER_A_JOINT)[0])
     scatter = float(np.sqrt(2 / dof / study.runs))
-    spread = max(joint[name].error / joint[name].value for name in GROUPS)
+    spread = max(joint[name].error / joint[name].value for name in PAPER_A_PARAMETER_GROUPS)
     return (
         Check(
             "runs in which the joint estimate finds the right minimum",
@@ -96,23 +110,23 @@ def checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
         ),
         at_most(
             "joint estimate, orientation of the end-effector", "°",
-            joint["orientation"].times(DEGREE), MOST_ORIENTATION, 4,
+            joint["orientation"].times(RADIAN_IN_DEGREES), MOST_ORIENTATION, 4,
         ),
         Check(
             "joint estimate over its Cramér-Rao bound, all thirty parameters",
             number(over, 3),
-            f"≤ {BOUND_TOLERANCE:g}{ASIDE}",
+            f"≤ {BOUND_TOLERANCE:g}{MONTE_CARLO_ASIDE}",
             over <= BOUND_TOLERANCE + 2 * spread,
         ),
         Check(
             "χ² per degree of freedom of the joint estimate, mean",
             number(chi2, 3),
-            f"1 ± {CHI2_TOLERANCE:g}{ASIDE}",
+            f"1 ± {CHI2_TOLERANCE:g}{MONTE_CARLO_ASIDE}",
             abs(chi2 - 1) <= CHI2_TOLERANCE + 2 * scatter,
         ),
         prototype_check(
-            figures_compared(study),
-            f"within {TOLERANCE:.0%}; what follows the drawing's error, within"
-            f" {OPEN_TOLERANCE:.0%}",
+            paper_a_figures(study),
+            f"within {PAPER_A_TOLERANCE:.0%}; what follows the drawing's error, within"
+            f" {PAPER_A_OPEN_TOLERANCE:.0%}",
         ),
     )  # fmt: skip

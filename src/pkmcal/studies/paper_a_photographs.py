@@ -11,13 +11,13 @@ from pkmcal.calibration.repeats import LegScatter, study_repeats
 from pkmcal.mechanisms import load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.simulation import Settings, simulate_session
-from pkmcal.simulation.demo import MECHANISM, camera_of_size
+from pkmcal.simulation.demo import DEMO_MECHANISM, camera_of_size
 
-SIZE = (1024, 768)
+PAPER_A_PICTURE_SIZE = (1024, 768)
 """[A] 4.2: pixels; the lens of 6 mm is the demonstration's too."""
-SETTINGS = Settings(stations=3, configurations=6, repeats=5)
+PAPER_A_SESSION_SETTINGS = Settings(stations=3, configurations=6, repeats=5)
 """Six orientations of the legs, [A] 4.2. Three stations, so that the session can be calibrated."""
-RENDERING = 0.8
+RENDERING_PROGRESS_SHARE = 0.8
 
 
 class MeasuredNoise(NamedTuple):
@@ -35,18 +35,25 @@ def measured_noise(seed: int, told: Callable[[str, float], None]) -> MeasuredNoi
     """Render the photographs, calibrate them, and see how they scatter."""
 
     def rendered(done: int, total: int) -> None:
-        told(f"Photograph {done} of {total}", RENDERING * done / total)
+        told(f"Photograph {done} of {total}", RENDERING_PROGRESS_SHARE * done / total)
 
     with tempfile.TemporaryDirectory(prefix="pkmcal-") as name:
         folder = Path(name) / "session"
-        machine = machine_from_document(with_exact_scales(load_mechanism(MECHANISM).document))
+        machine = machine_from_document(with_exact_scales(load_mechanism(DEMO_MECHANISM).document))
         simulate_session(
-            folder, machine, camera_of_size(SIZE), SETTINGS, seed=seed, progress=rendered
+            folder,
+            machine,
+            camera_of_size(PAPER_A_PICTURE_SIZE),
+            PAPER_A_SESSION_SETTINGS,
+            seed=seed,
+            progress=rendered,
         )
         found = study_repeats(
             folder,
             seed=seed,
-            progress=lambda text, share: told(text, RENDERING + (1 - RENDERING) * share),
+            progress=lambda text, share: told(
+                text, RENDERING_PROGRESS_SHARE + (1 - RENDERING_PROGRESS_SHARE) * share
+            ),
         )
     return MeasuredNoise(_noise(found.middle), _noise(found.bound), found.middle.shift)
 

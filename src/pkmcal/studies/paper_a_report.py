@@ -11,63 +11,69 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Outcome, Part, Row, Table
-from pkmcal.pages.plots import AXIS, CLEAR, LOOKS, bars, trace
+from pkmcal.pages.plots import (
+    COMMON_AXIS_LAYOUT,
+    COMMON_PLOT_LAYOUT,
+    TRANSPARENT_COLOUR,
+    bars,
+    trace,
+)
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_a import (
-    BOUND,
-    CORRECTED,
-    DEGREE,
-    DRAWING,
-    EFFECTOR,
-    GROUPS,
-    JOINT,
-    METHODS,
-    PRINTED,
+    END_EFFECTOR_QUANTITIES,
+    FOUR_STEPS_CORRECTED,
+    FOUR_STEPS_PRINTED,
+    PAPER_A_BOUND,
+    PAPER_A_DRAWING,
+    PAPER_A_JOINT,
+    PAPER_A_METHODS,
+    PAPER_A_PARAMETER_GROUPS,
+    RADIAN_IN_DEGREES,
     HexapodByAxes,
     converged,
+    hexapod_with_held_radii,
     mean_error,
-    study_machine,
     thirty,
 )
 from pkmcal.studies.paper_a_expected import (
-    AFTER,
-    BEFORE,
     FOLLOWS_DRAWING,
     MEAN_ERRORS,
-    PROTOTYPE,
+    PAPER_A_ERRORS_AFTER,
+    PAPER_A_ERRORS_BEFORE,
+    PAPER_A_PROTOTYPE,
     PROTOTYPE_POSES,
     TABLE_1,
-    checks,
-    figures_compared,
+    paper_a_checks,
+    paper_a_figures,
 )
 from pkmcal.studies.reproduction import (
     Column,
     Compared,
     Options,
-    Shown,
+    ShownNumber,
     Words,
     accuracy_rows,
     deg,
     mm,
 )
-from pkmcal.studies.statistics import Summary, covered, mean, ratio
+from pkmcal.studies.statistics import Summary, covered, mean, ratio_of_figures
 from pkmcal.wording import joined, number
 
 if TYPE_CHECKING:
     from pkmcal.studies.paper_a_photographs import MeasuredNoise
 
-NARROW = 0.002 / 3**0.5
+NARROW_DRAWING_ERROR = 0.002 / 3**0.5
 """Standard deviation (m) of drawing errors spread evenly within 2 mm, the other reading of "uniform
 noise with variance equal to 2 mm"."""
-LABELS = {
-    DRAWING: "the drawing, before",
-    PRINTED: "four steps as printed",
-    CORRECTED: "four steps corrected",
-    JOINT: "joint estimate",
-    BOUND: "Cramér-Rao bound",
+PAPER_A_METHOD_LABELS = {
+    PAPER_A_DRAWING: "the drawing, before",
+    FOUR_STEPS_PRINTED: "four steps as printed",
+    FOUR_STEPS_CORRECTED: "four steps corrected",
+    PAPER_A_JOINT: "joint estimate",
+    PAPER_A_BOUND: "Cramér-Rao bound",
 }
-QUANTITIES = {
+PAPER_A_QUANTITY_LABELS = {
     "base_xy": "base x, y",
     "base_z": "base z",
     "platform_xy": "platform x, y",
@@ -76,14 +82,14 @@ QUANTITIES = {
     "displacement": "displacement",
     "orientation": "orientation",
 }
-REMARKS = ("printed", "before", "agree", "of_drawing", "others")
+PAPER_A_REMARKS = ("printed", "before", "agree", "of_drawing", "others")
 """The last two where there is something to tell."""
-TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
+ERROR_AXIS_TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
 """mm that logarithmic axes tell."""
-RANGE = (0.005, 5.0)
+FIGURE_4_ERROR_RANGE = (0.005, 5.0)
 """mm that Fig. 4's logarithmic axis of errors holds."""
 
-Found = StudyResult[HexapodByAxes]
+HexapodByAxesStudy = StudyResult[HexapodByAxes]
 
 
 def reproduce(options: Options) -> Outcome:
@@ -100,11 +106,11 @@ def reproduce(options: Options) -> Outcome:
         run(setting, options.runs, options.seed, options.within(begin, begin + share))
         for setting, begin in (
             (HexapodByAxes(), done),
-            (HexapodByAxes(drawing_error=NARROW), done + share),
+            (HexapodByAxes(drawing_error=NARROW_DRAWING_ERROR), done + share),
         )
     )
     done += 2 * share
-    by_poses: dict[int, Found] = {}  # with other numbers of poses a station
+    by_poses: dict[int, HexapodByAxesStudy] = {}  # with other numbers of poses a station
     for poses in PROTOTYPE_POSES if options.long else ():
         upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
         told = options.within(done, upto)
@@ -112,7 +118,7 @@ def reproduce(options: Options) -> Outcome:
         setting = replace(found.setting, poses=poses)
         by_poses[poses] = found if same else run(setting, options.runs, options.seed, told)
         done = upto
-    figures = figures_compared(found)
+    figures = paper_a_figures(found)
     elapsed = perf_counter() - began
     words = _words(found, narrow, figures, measured, elapsed)
     return words.reproduction(
@@ -124,30 +130,32 @@ def reproduce(options: Options) -> Outcome:
                 "groups",
                 Table(
                     "RMSE, mm",
-                    ("", *(QUANTITIES[g] for g in GROUPS)),
-                    tuple(_by_method(found, [Column(name, 3, 4) for name in GROUPS])),
+                    ("", *(PAPER_A_QUANTITY_LABELS[g] for g in PAPER_A_PARAMETER_GROUPS)),
+                    tuple(
+                        _by_method(found, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
+                    ),
                 ),
             ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
-        checks=checks(found),
-        remarks=[name for name in REMARKS if words.values.get(name, True)],
+        checks=paper_a_checks(found),
+        remarks=[name for name in PAPER_A_REMARKS if words.values.get(name, True)],
         numbers={**_numbers(found, narrow, figures, by_poses, elapsed), **_noise(measured)},
     )
 
 
-def _by_method(s: Found, columns: Sequence[Column]) -> list[Row]:
+def _by_method(s: HexapodByAxesStudy, columns: Sequence[Column]) -> list[Row]:
     """Every method's accuracy, beside the prototype's."""
     return [
         row
-        for m in METHODS
-        for row in accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
+        for m in PAPER_A_METHODS
+        for row in accuracy_rows(s, (m,), _name(m), columns, PAPER_A_PROTOTYPE.get((m,)))
     ]
 
 
 def _name(method: str) -> str:
-    text = LABELS[method]
+    text = PAPER_A_METHOD_LABELS[method]
     return text[:1].upper() + text[1:]
 
 
@@ -156,24 +164,24 @@ def _told(figures: list[Compared]) -> str:
     said: list[str] = []
     for (method,) in dict.fromkeys(f.key for f in figures):
         items = [
-            f"{QUANTITIES[f.quantity]} {f.found.value:.3g} for {f.expected:g}"
+            f"{PAPER_A_QUANTITY_LABELS[f.quantity]} {f.found.value:.3g} for {f.expected:g}"
             for f in figures
             if f.key == (method,)
         ]
-        said.append(f"{LABELS[method]}, {joined(items)}")
+        said.append(f"{PAPER_A_METHOD_LABELS[method]}, {joined(items)}")
     text = "; ".join(said)
     return text[:1].upper() + text[1:]
 
 
-def _depth_as_printed(s: Found) -> float:
+def _depth_as_printed(s: HexapodByAxesStudy) -> float:
     """Mean |error| in z of the four steps as printed, m."""
-    z = np.char.endswith(np.array(thirty(study_machine()).names), "z")
-    return float(mean_error(s, PRINTED)[z].mean())
+    z = np.char.endswith(np.array(thirty(hexapod_with_held_radii()).names), "z")
+    return float(mean_error(s, FOUR_STEPS_PRINTED)[z].mean())
 
 
 def _words(
-    s: Found,
-    narrow: Found,
+    s: HexapodByAxesStudy,
+    narrow: HexapodByAxesStudy,
     figures: list[Compared],
     measured: MeasuredNoise | None,
     elapsed: float,
@@ -181,24 +189,29 @@ def _words(
     """All that is said, with the figures that it names; differences from the prototype too."""
 
     def over(method: str, other: str) -> float:
-        return ratio(s.of(method)["parameters"], s.of(other)["parameters"]).value
+        return ratio_of_figures(s.of(method)["parameters"], s.of(other)["parameters"]).value
 
     apart = [f for f in figures if f.differs]
     of_drawing = [f for f in apart if (f.key, f.quantity) in FOLLOWS_DRAWING]
-    joint = s.samples[JOINT,]
+    joint = s.samples[PAPER_A_JOINT,]
     inside = mean(covered(joint.values["parameters"], joint.sigma["parameters"])).times(100)
     return Words.of(
         "a",
         s,
         elapsed=elapsed,
-        after=(Shown(1e3 * AFTER[0]), Shown(DEGREE * AFTER[1])),
-        joint_over_bound=over(JOINT, BOUND),
-        corrected_over_joint=over(CORRECTED, JOINT),
-        printed_over_joint=over(PRINTED, JOINT),
+        after=(
+            ShownNumber(1e3 * PAPER_A_ERRORS_AFTER[0]),
+            ShownNumber(RADIAN_IN_DEGREES * PAPER_A_ERRORS_AFTER[1]),
+        ),
+        joint_over_bound=over(PAPER_A_JOINT, PAPER_A_BOUND),
+        corrected_over_joint=over(FOUR_STEPS_CORRECTED, PAPER_A_JOINT),
+        printed_over_joint=over(FOUR_STEPS_PRINTED, PAPER_A_JOINT),
         converged=converged(s),
         narrow_depth=1e3 * _depth_as_printed(narrow),
-        narrow_displacement=1e3 * narrow.of(PRINTED)["displacement"].value,
-        drawing_error_asked=2 * BEFORE[0] / s.of(DRAWING)["displacement"].value,
+        narrow_displacement=1e3 * narrow.of(FOUR_STEPS_PRINTED)["displacement"].value,
+        drawing_error_asked=2
+        * PAPER_A_ERRORS_BEFORE[0]
+        / s.of(PAPER_A_DRAWING)["displacement"].value,
         agree=len(figures) - len(apart),
         compared=len(figures),
         of_drawing=_told(of_drawing),
@@ -234,10 +247,10 @@ def table_1(measured: MeasuredNoise | None = None) -> Table:
     return Table(title, ("", "ψ", "θ", "x", "z"), tuple(rows))
 
 
-def _figure_part(words: Words, s: Found) -> Part:
+def _figure_part(words: Words, s: HexapodByAxesStudy) -> Part:
     """[A] Fig. 4."""
-    params = thirty(study_machine())
-    errors = {method: mean_error(s, method) for method in METHODS}
+    params = thirty(hexapod_with_held_radii())
+    errors = {method: mean_error(s, method) for method in PAPER_A_METHODS}
     low, high = (mm(v, 2) for v in MEAN_ERRORS)
     summary = [Row("The paper", (low, "", high, "z"), "paper")]
     for method, error in errors.items():
@@ -245,10 +258,10 @@ def _figure_part(words: Words, s: Found) -> Part:
         cells = (*(mm(float(v)) for v in (error.min(), error.mean(), error.max())), worst)
         summary.append(Row(_name(method), cells))
     every = [
-        Row(name, (mm(float(value), 1), *(mm(float(errors[m][k])) for m in METHODS)))
+        Row(name, (mm(float(value), 1), *(mm(float(errors[m][k])) for m in PAPER_A_METHODS)))
         for k, (name, value) in enumerate(zip(params.names, params.drawing, strict=True))
     ]
-    heads = ("", "true value", *(_name(m) for m in METHODS))
+    heads = ("", "true value", *(_name(m) for m in PAPER_A_METHODS))
     return words.part(
         "figure",
         Table(
@@ -270,13 +283,24 @@ def _figure_part(words: Words, s: Found) -> Part:
 def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) -> dict[str, Any]:
     """True values (30,) as a line, mean errors (30,) of each method as bars below; m."""
     in_mm = {method: 1e3 * error for method, error in errors.items()}
-    colours = {PRINTED: "--quiet", CORRECTED: "--drawing", JOINT: "--calibrated"}
+    colours = {
+        FOUR_STEPS_PRINTED: "--quiet",
+        FOUR_STEPS_CORRECTED: "--drawing",
+        PAPER_A_JOINT: "--calibrated",
+    }
     data = [
-        *(bars(LABELS[m], names, in_mm[m], color=colour) for m, colour in colours.items()),
-        bars(LABELS[BOUND], names, in_mm[BOUND],  # no estimate, so not filled
-             color=CLEAR, line={"color": "--ink", "width": 1.2}),
+        *(
+            bars(PAPER_A_METHOD_LABELS[method], names, in_mm[method], color=colour)
+            for method, colour in colours.items()
+        ),
+        bars(
+            PAPER_A_METHOD_LABELS[PAPER_A_BOUND], names, in_mm[PAPER_A_BOUND],
+            color=TRANSPARENT_COLOUR,  # no estimate, so not filled
+            line={"color": "--ink", "width": 1.2},
+        ),
         trace(
-            LABELS[DRAWING], names, in_mm[DRAWING], "--muted", "markers",
+            PAPER_A_METHOD_LABELS[PAPER_A_DRAWING], names, in_mm[PAPER_A_DRAWING], "--muted",
+            "markers",
             marker={"symbol": "line-ew-open", "size": 22, "color": "--muted",
                     "line": {"width": 2, "color": "--muted"}},
         ),
@@ -297,17 +321,18 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
         "xref": "paper", "x": 1.0, "xanchor": "right", "showarrow": False,
         "y": float(np.log10(high)), "yanchor": "bottom",
     }  # fmt: skip
-    axis = {**AXIS, "fixedrange": True}
+    axis = {**COMMON_AXIS_LAYOUT, "fixedrange": True}
     layout = {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "margin": {"l": 64, "r": 8, "t": 34, "b": 46},
         "barmode": "group", "bargap": 0.22, "bargroupgap": 0,
         "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom",
                    "traceorder": "normal"},
         "xaxis": {**axis, "tickangle": -60, "anchor": "y", "showgrid": False,
                   "range": [-0.7, len(names) - 0.3]},
-        "yaxis": {**axis, "type": "log", "range": np.log10(RANGE).tolist(), "domain": [0.0, 0.68],
-                  "tickvals": TICKS, "title": {"text": "mean |error|, mm"}},
+        "yaxis": {**axis, "type": "log", "range": np.log10(FIGURE_4_ERROR_RANGE).tolist(),
+                  "domain": [0.0, 0.68],
+                  "tickvals": ERROR_AXIS_TICKS, "title": {"text": "mean |error|, mm"}},
         "yaxis2": {**axis, "domain": [0.76, 1.0], "title": {"text": "true value, mm"}},
         "shapes": [band],
         "annotations": [said],
@@ -315,7 +340,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
     return {"data": data, "layout": layout}
 
 
-def _effector_table(s: Found) -> Table:
+def _effector_table(s: HexapodByAxesStudy) -> Table:
     """[A] eq. 20."""
     columns = (
         Column("displacement", 3, 3),
@@ -323,8 +348,16 @@ def _effector_table(s: Found) -> Table:
         Column("displacement_registered", 3, 3),
     )
     rows = [
-        Row("The paper, before", (mm(BEFORE[0], 2), deg(BEFORE[1], 3), ""), "paper"),
-        Row("The paper, after", (mm(AFTER[0], 2), deg(AFTER[1], 3), ""), "paper"),
+        Row(
+            "The paper, before",
+            (mm(PAPER_A_ERRORS_BEFORE[0], 2), deg(PAPER_A_ERRORS_BEFORE[1], 3), ""),
+            "paper",
+        ),
+        Row(
+            "The paper, after",
+            (mm(PAPER_A_ERRORS_AFTER[0], 2), deg(PAPER_A_ERRORS_AFTER[1], 3), ""),
+            "paper",
+        ),
         *_by_method(s, columns),
     ]
     note = "The paper's angles are printed in rad; degrees are meant, as in Table 1."
@@ -332,11 +365,14 @@ def _effector_table(s: Found) -> Table:
     return Table("Errors of the end-effector", heads, tuple(rows), note)
 
 
-def _readings_table(wide: Found, narrow: Found) -> Table:
+def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Table:
     """What the drawing's errors do, by the two readings of the paper."""
 
-    def row(name: str, s: Found) -> Row:
-        before, printed, joint = (s.of(m)["displacement"].value for m in (DRAWING, PRINTED, JOINT))
+    def row(name: str, s: HexapodByAxesStudy) -> Row:
+        before, printed, joint = (
+            s.of(m)["displacement"].value
+            for m in (PAPER_A_DRAWING, FOUR_STEPS_PRINTED, PAPER_A_JOINT)
+        )
         depth = mm(_depth_as_printed(s), 2)
         return Row(name, (mm(before, 2), mm(printed, 2), depth, mm(joint)))
 
@@ -344,7 +380,11 @@ def _readings_table(wide: Found, narrow: Found) -> Table:
         "Drawing errors: “uniform noise with variance equal to 2 mm”",
         ("", "drawing", "as printed", "its mean |z|", "joint"),
         (
-            Row("The paper", (mm(BEFORE[0], 2), mm(AFTER[0], 2), "up to 1", ""), "paper"),
+            Row(
+                "The paper",
+                (mm(PAPER_A_ERRORS_BEFORE[0], 2), mm(PAPER_A_ERRORS_AFTER[0], 2), "up to 1", ""),
+                "paper",
+            ),
             row("Standard deviation 2 mm", wide),
             row("Within ± 2 mm", narrow),
         ),
@@ -352,11 +392,11 @@ def _readings_table(wide: Found, narrow: Found) -> Table:
     )
 
 
-def _poses_part(words: Words, studies: dict[int, Found]) -> Part:
+def _poses_part(words: Words, studies: dict[int, HexapodByAxesStudy]) -> Part:
     """Accuracy by the number of poses a station."""
     poses = sorted(studies)
-    found = {n: studies[n].of(JOINT)["displacement"].times(1e3) for n in poses}
-    least = [1e3 * studies[n].of(BOUND)["displacement"].value for n in poses]
+    found = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
+    least = [1e3 * studies[n].of(PAPER_A_BOUND)["displacement"].value for n in poses]
     rows = [
         Row(
             str(n),
@@ -390,13 +430,13 @@ def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict
                "--drawing", "markers",
                marker={"color": "--drawing", "size": 9, "symbol": "diamond-open"}),
     ]  # fmt: skip
-    axis = {**AXIS, "type": "log", "fixedrange": True}
+    axis = {**COMMON_AXIS_LAYOUT, "type": "log", "fixedrange": True}
     layout = {
-        **LOOKS,
+        **COMMON_PLOT_LAYOUT,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 48},
-        "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": CLEAR},
+        "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": TRANSPARENT_COLOUR},
         "xaxis": {**axis, "tickvals": poses, "title": {"text": "poses a station, N"}},
-        "yaxis": {**axis, "tickvals": TICKS, "title": {"text": "displacement, mm"}},
+        "yaxis": {**axis, "tickvals": ERROR_AXIS_TICKS, "title": {"text": "displacement, mm"}},
     }
     return {"data": data, "layout": layout}
 
@@ -405,30 +445,32 @@ def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict
 
 
 def _numbers(
-    s: Found,
-    narrow: Found,
+    s: HexapodByAxesStudy,
+    narrow: HexapodByAxesStudy,
     figures: list[Compared],
-    by_poses: dict[int, Found],
+    by_poses: dict[int, HexapodByAxesStudy],
     elapsed: float,
 ) -> dict[str, Any]:
     """Everything for programs, m and rad."""
-    names = thirty(study_machine()).names
+    names = thirty(hexapod_with_held_radii()).names
     return {
         "runs": s.runs,
         "seed": s.seed,
         "poses_per_station": s.setting.poses,
         "converged": converged(s),
-        "chi2_per_dof": s.of(JOINT)["chi2"].value,
+        "chi2_per_dof": s.of(PAPER_A_JOINT)["chi2"].value,
         "seconds": {"wall": elapsed, "solving": s.solving, "cpu": s.cpu, "workers": s.workers},
         "paper": {
             "mean_error": MEAN_ERRORS,
-            "before": dict(zip(("displacement", "orientation"), BEFORE, strict=True)),
-            "after": dict(zip(("displacement", "orientation"), AFTER, strict=True)),
+            "before": dict(
+                zip(("displacement", "orientation"), PAPER_A_ERRORS_BEFORE, strict=True)
+            ),
+            "after": dict(zip(("displacement", "orientation"), PAPER_A_ERRORS_AFTER, strict=True)),
         },
-        "methods": {m: _accuracy(s, m) for m in METHODS},
-        "methods_with_drawing_within_2_mm": {m: _accuracy(narrow, m) for m in METHODS},
+        "methods": {m: _accuracy(s, m) for m in PAPER_A_METHODS},
+        "methods_with_drawing_within_2_mm": {m: _accuracy(narrow, m) for m in PAPER_A_METHODS},
         "mean_error": {
-            m: dict(zip(names, mean_error(s, m).tolist(), strict=True)) for m in METHODS
+            m: dict(zip(names, mean_error(s, m).tolist(), strict=True)) for m in PAPER_A_METHODS
         },
         "prototype": [
             {
@@ -443,12 +485,14 @@ def _numbers(
             }
             for f in figures
         ],
-        "by_poses": {n: _accuracy(other, JOINT) for n, other in by_poses.items()},
+        "by_poses": {n: _accuracy(other, PAPER_A_JOINT) for n, other in by_poses.items()},
     }
 
 
-def _accuracy(s: Found, method: str) -> dict[str, Any]:
-    found = {name: s.of(method)[name] for name in (*GROUPS, *EFFECTOR)}
+def _accuracy(s: HexapodByAxesStudy, method: str) -> dict[str, Any]:
+    found = {
+        name: s.of(method)[name] for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
+    }
     return {
         "found": {name: summary.value for name, summary in found.items()},
         "standard_error": {name: summary.error for name, summary in found.items()},

@@ -31,26 +31,43 @@ from pkmcal.simulation.truth import true_machine
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-RADIUS, REACH = 0.014, (0.02, 0.6)
+PAPER_B_LEG_RADIUS, PAPER_B_LEG_REACH = 0.014, (0.02, 0.6)
 """m, of a leg, which is one cylinder from joint to joint, as in the paper."""
-CONFIGURATIONS = 60
-POINTS, POINT_NOISE = 100, 0.2
+PAPER_B_CONFIGURATIONS = 60
+POINTS_FITTED_AN_EDGE, POINT_NOISE = 100, 0.2
 """Points an edge is fitted to, and px of each."""
-READING = 3e-6
+PAPER_B_READING_NOISE = 3e-6
 """m, noise of a reading."""
-BATCH = 5
-SHARE = 4
+PAPER_B_BATCH_RUNS = 5
+ASKED_RUNS_A_CASE = 4
 """One run of a case for so many that are asked for: there are twelve, and most end in a joint
 estimate."""
-CONTROL = 20
+MOST_CONTROLLED_RUNS = 20
 """Most runs of the machine that is controlled."""
-TRUTH = 2006
+CONTROLLED_MACHINE_SEED = 2006
 """Seed of that machine."""
 
-MIRROR, PERSPECTIVE = "mirror", "perspective"
-PLAIN, HUBER, TUKEY, MEDIAN, ROBUST = "plain", "huber", "tukey", "least-median", "robust"
-RATIO, SCALE, JOINT, DRAWING = "eq. 16", "similarity", "joint", "drawing"
-REGRESSIONS: tuple[linear.Method, ...] = (PLAIN, HUBER, TUKEY, MEDIAN, ROBUST)
+MIRROR_VIEW, PERSPECTIVE_VIEW = "mirror", "perspective"
+PLAIN_REGRESSION, HUBER_REGRESSION, TUKEY_REGRESSION, LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION = (
+    "plain",
+    "huber",
+    "tukey",
+    "least-median",
+    "robust",
+)
+SCALED_BY_RATIO, SCALED_BY_SIMILARITY, PAPER_B_JOINT, PAPER_B_DRAWING = (
+    "eq. 16",
+    "similarity",
+    "joint",
+    "drawing",
+)
+PAPER_B_REGRESSIONS: tuple[linear.RegressionMethod, ...] = (
+    PLAIN_REGRESSION,
+    HUBER_REGRESSION,
+    TUKEY_REGRESSION,
+    LEAST_MEDIAN_REGRESSION,
+    ROBUST_REGRESSION,
+)
 
 
 class View(NamedTuple):
@@ -73,18 +90,20 @@ class Case(NamedTuple):
     radius: float = 0.0
 
 
-CASES = {
-    "right": Case((*REGRESSIONS, JOINT)),
-    "5 % wrong": Case((*REGRESSIONS, JOINT), wrong=0.05),
-    "20 % wrong": Case((MEDIAN, ROBUST, JOINT), wrong=0.2),
-    "35 % wrong": Case((MEDIAN, ROBUST), wrong=0.35),
-    "shifted": Case((ROBUST, JOINT), outward=0.1),
-    "radius": Case((ROBUST, RATIO, SCALE, JOINT), radius=0.01),
+PAPER_B_CASES = {
+    "right": Case((*PAPER_B_REGRESSIONS, PAPER_B_JOINT)),
+    "5 % wrong": Case((*PAPER_B_REGRESSIONS, PAPER_B_JOINT), wrong=0.05),
+    "20 % wrong": Case((LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION, PAPER_B_JOINT), wrong=0.2),
+    "35 % wrong": Case((LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION), wrong=0.35),
+    "shifted": Case((ROBUST_REGRESSION, PAPER_B_JOINT), outward=0.1),
+    "radius": Case(
+        (ROBUST_REGRESSION, SCALED_BY_RATIO, SCALED_BY_SIMILARITY, PAPER_B_JOINT), radius=0.01
+    ),
 }
-CONTROLLED = "controlled"
+CONTROLLED_POPULATION = "controlled"
 """The population of one machine that is measured again and again, to be controlled."""
-VIEWS = (MIRROR, PERSPECTIVE)
-QUANTITIES = {
+PAPER_B_VIEW_NAMES = (MIRROR_VIEW, PERSPECTIVE_VIEW)
+PAPER_B_QUANTITIES = {
     "centre": Quantity("rms", 1e3, "mm"),
     "depth": Quantity("rms", 1e3, "mm"),
     "cad": Quantity("mean", 1e3, "mm"),
@@ -99,46 +118,56 @@ class HexapodByLegs:
     """[B] V.A and V.B."""
 
     doing = "Edges of the legs"
-    quantities = QUANTITIES
+    quantities = PAPER_B_QUANTITIES
 
     def populations(self, runs: int) -> list[Population]:
         """Each camera with each case; and one machine that is controlled."""
-        each = max(2, runs // SHARE)
-        out = [Population(f"{view}, {case}", each, BATCH) for view, case in product(VIEWS, CASES)]
-        return [*out, Population(CONTROLLED, min(each, CONTROL), BATCH)]
+        each = max(2, runs // ASKED_RUNS_A_CASE)
+        out = [
+            Population(f"{view}, {case}", each, PAPER_B_BATCH_RUNS)
+            for view, case in product(PAPER_B_VIEW_NAMES, PAPER_B_CASES)
+        ]
+        return [
+            *out,
+            Population(CONTROLLED_POPULATION, min(each, MOST_CONTROLLED_RUNS), PAPER_B_BATCH_RUNS),
+        ]
 
-    def draw(self, batch: Batch) -> list[Seen]:
+    def draw(self, batch: Batch) -> list[MeasuredHexapod]:
         """A true machine a run, its configurations, and the edges that are seen."""
         rng = batch.generator(0)
-        if batch.population == CONTROLLED:
-            truth, view, case = controlled_machine(), views()[PERSPECTIVE], CASES["right"]
+        if batch.population == CONTROLLED_POPULATION:
+            truth, view, case = (
+                controlled_machine(),
+                views_by_name()[PERSPECTIVE_VIEW],
+                PAPER_B_CASES["right"],
+            )
             return [seen(truth, view, case, rng) for _ in range(batch.runs)]
         where, _, name = batch.population.partition(", ")
-        view, case = views()[where], CASES[name]
+        view, case = views_by_name()[where], PAPER_B_CASES[name]
         return [seen(drawn_machine(rng), view, case, rng) for _ in range(batch.runs)]
 
-    def solve(self, batch: Batch, data: list[Seen]) -> dict[Key, Fitted]:
+    def solve(self, batch: Batch, data: list[MeasuredHexapod]) -> dict[Key, Fitted]:
         """Every method's base centres in the camera's frame, (B, L, 3)."""
         where, _, name = batch.population.partition(", ")
-        methods = CASES[name].methods if name else (ROBUST,)
+        methods = PAPER_B_CASES[name].methods if name else (ROBUST_REGRESSION,)
         rng = batch.generator(1)
         found = [solved(one, methods, rng) for one in data]
-        values = study_machine().parameters.drawing
+        values = hexapod_with_cylinder_legs().parameters.drawing
         theta = np.broadcast_to(values, (batch.runs, len(values)))
         return {
-            (where, name or CONTROLLED, method): Fitted(
+            (where, name or CONTROLLED_POPULATION, method): Fitted(
                 theta, told={"centres": np.stack([f[method] for f in found])}
             )
             for method in methods
         }
 
     def judge(
-        self, batch: Batch, data: list[Seen], found: Mapping[Key, Fitted]
+        self, batch: Batch, data: list[MeasuredHexapod], found: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of the base centres."""
         del batch
         truth = np.stack([one.centres for one in data])
-        camera, drawing = data[0].view.camera, study_machine().base_centers()
+        camera, drawing = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
         for key, fit in found.items():
@@ -161,7 +190,7 @@ class HexapodByLegs:
 
 
 @dataclass(frozen=True)
-class Seen:
+class MeasuredHexapod:
     """One run: the true base centres (L, 3) in the camera's frame, and what is measured and
     believed.
     """
@@ -173,11 +202,13 @@ class Seen:
 
 
 @cache
-def study_machine() -> Machine:
+def hexapod_with_cylinder_legs() -> Machine:
     """The catalogue's Gough-Stewart platform with one cylinder a leg, readings as they are."""
     document = with_exact_scales(load_mechanism("gough-stewart").document)
     kind = type(document.legs[0].tubes[0])
-    tube = kind.model_validate({"radius": RADIUS, "from": REACH[0], "to": REACH[1]})
+    tube = kind.model_validate(
+        {"radius": PAPER_B_LEG_RADIUS, "from": PAPER_B_LEG_REACH[0], "to": PAPER_B_LEG_REACH[1]}
+    )
     legs = tuple(leg.model_copy(update={"tubes": (tube,)}) for leg in document.legs)
     return machine_from_document(document.model_copy(update={"legs": legs}))
 
@@ -186,7 +217,7 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
     """A machine built within the drawing's tolerances, its radii as drawn: what a wrong radius does
     is a case of its own.
     """
-    drawing = study_machine()
+    drawing = hexapod_with_cylinder_legs()
     values = true_machine(drawing, 1.0, rng).values.copy()
     radii = np.array(drawing.parameters.kinds) == "radius"
     values[radii] = drawing.values[radii]
@@ -196,11 +227,11 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
 @cache
 def controlled_machine() -> Machine:
     """The one machine that is controlled, [B] V.B."""
-    return drawn_machine(np.random.default_rng(TRUTH))
+    return drawn_machine(np.random.default_rng(CONTROLLED_MACHINE_SEED))
 
 
 @cache
-def views() -> dict[str, View]:
+def views_by_name() -> dict[str, View]:
     """[B] V.A: a mirror between the legs, its 640 x 480 pixels parallel to the base, and a camera
     of 1024 x 780 that looks level from in front.
     """
@@ -210,53 +241,56 @@ def views() -> dict[str, View]:
     middle = np.array([0.0, 0.0, 0.16])
     place = middle + 0.95 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3), 0.0])
     return {
-        MIRROR: View(mirror, look_at(up, up + np.array([0.0, 0.0, 0.4]), -np.eye(3)[1])),
-        PERSPECTIVE: View(front, look_at(place, middle, np.eye(3)[2])),
+        MIRROR_VIEW: View(mirror, look_at(up, up + np.array([0.0, 0.0, 0.4]), -np.eye(3)[1])),
+        PERSPECTIVE_VIEW: View(front, look_at(place, middle, np.eye(3)[2])),
     }
 
 
-def seen(truth: Machine, view: View, case: Case, rng: np.random.Generator) -> Seen:
+def seen(truth: Machine, view: View, case: Case, rng: np.random.Generator) -> MeasuredHexapod:
     """What a camera sees of a machine at the limits of its workspace."""
     corners = np.array(list(product(*truth.joint_ranges)))
-    readings = corners[rng.permutation(len(corners))[:CONFIGURATIONS]]
+    readings = corners[rng.permutation(len(corners))[:PAPER_B_CONFIGURATIONS]]
     poses = truth.forward(readings)
     noise = EdgeNoise(
-        shift=POINT_NOISE / np.sqrt(POINTS),
-        tilt=POINT_NOISE * np.sqrt(3 / POINTS),  # of a line's ends, by points all along it
+        shift=POINT_NOISE / np.sqrt(POINTS_FITTED_AN_EDGE),
+        tilt=POINT_NOISE
+        * np.sqrt(3 / POINTS_FITTED_AN_EDGE),  # of a line's ends, by points all along it
         outward=case.outward,
         wrong=case.wrong,
     )
     T = view.T_camera_base
     edges, joints = simulate_edges(
-        truth, T[None], view.camera, poses, noise, rng, joint_noise=READING
+        truth, T[None], view.camera, poses, noise, rng, joint_noise=PAPER_B_READING_NOISE
     )
-    believed = study_machine()
+    believed = hexapod_with_cylinder_legs()
     if case.radius:
         values = believed.values.copy()
         values[np.array(believed.parameters.kinds) == "radius"] *= 1 + case.radius
         believed = believed.with_values(values)
-    measured = Measurements(edges, joints, READING, 1, np.zeros(1, dtype=int))
-    return Seen(view, apply(T, truth.base_centers()), believed, measured)
+    measured = Measurements(edges, joints, PAPER_B_READING_NOISE, 1, np.zeros(1, dtype=int))
+    return MeasuredHexapod(view, apply(T, truth.base_centers()), believed, measured)
 
 
-def solved(one: Seen, methods: tuple[str, ...], rng: np.random.Generator) -> dict[str, Array]:
+def solved(
+    one: MeasuredHexapod, methods: tuple[str, ...], rng: np.random.Generator
+) -> dict[str, Array]:
     """Base centres (L, 3), camera frame, by each of the methods."""
-    drawing = study_machine().base_centers()
+    drawing = hexapod_with_cylinder_legs().base_centers()
     out: dict[str, Array] = {}
-    for method in REGRESSIONS:
-        if method in methods or method == ROBUST:
+    for method in PAPER_B_REGRESSIONS:
+        if method in methods or method == ROBUST_REGRESSION:
             found = linear.centres(one.machine, one.measurements, method, rng)
             out[method] = found.centres[0]
-    start = out[ROBUST]
-    if RATIO in methods:
-        out[RATIO] = start / linear.scale_ratio(start, drawing)
-        out[SCALE] = start / linear.procrustes_scale(start, drawing)
-    if JOINT in methods:
-        out[JOINT] = joint_centres(one, start)
+    start = out[ROBUST_REGRESSION]
+    if SCALED_BY_RATIO in methods:
+        out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, drawing)
+        out[SCALED_BY_SIMILARITY] = start / linear.procrustes_scale(start, drawing)
+    if PAPER_B_JOINT in methods:
+        out[PAPER_B_JOINT] = jointly_estimated_centres(one, start)
     return {method: out[method] for method in methods}
 
 
-def joint_centres(one: Seen, start: Array) -> Array:
+def jointly_estimated_centres(one: MeasuredHexapod, start: Array) -> Array:
     """The joint estimate's base centres (L, 3), camera frame, begun where the linear ones lay the
     drawing.
     """

@@ -10,19 +10,24 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.control.image import Eye
 from pkmcal.control.seen import SeenMachine, seen_machine
-from pkmcal.control.simulation import LoopSettings, Runs, simulate
+from pkmcal.control.simulation import LoopSettings, ServoRuns, simulate_servo_runs
 from pkmcal.control.study import Belief, Trials, Uncertainty, estimates, outcome
 from pkmcal.geometry.rigid import apply, inverse, register
 from pkmcal.identify.gauge import centre_index
 from pkmcal.simulation.edges import EdgeNoise
-from pkmcal.studies.paper_b import PERSPECTIVE, controlled_machine, study_machine, views
+from pkmcal.studies.paper_b import (
+    PERSPECTIVE_VIEW,
+    controlled_machine,
+    hexapod_with_cylinder_legs,
+    views_by_name,
+)
 
-LOOP = LoopSettings(law="edges", gain=1.0, rate=12.5, delay=1, duration=10.0,
+PAPER_B_LOOP_SETTINGS = LoopSettings(law="edges", gain=1.0, rate=12.5, delay=1, duration=10.0,
                     noise=EdgeNoise(shift=0.02, tilt=0.02))  # fmt: skip
-START = np.array([0.385, 0.445, 0.405, 0.455, 0.375, 0.425])
-GOAL = np.array([0.445, 0.395, 0.440, 0.385, 0.445, 0.400])
+CONTROL_START_READINGS = np.array([0.385, 0.445, 0.405, 0.455, 0.375, 0.425])
+CONTROL_GOAL_READINGS = np.array([0.445, 0.395, 0.440, 0.385, 0.445, 0.400])
 """m, readings of [B] Fig. 9's configurations, which the paper shows and does not tell."""
-BY_HAND = {"hand": (0.03, 3.0), "coarse": (0.1, 10.0)}
+CAMERA_BY_HAND_ERRORS = {"hand": (0.03, 3.0), "coarse": (0.1, 10.0)}
 """m and degrees by which a camera's place by hand is off: with ruler and eye, and at a guess."""
 E1, E2 = "cad", "linear"
 
@@ -38,16 +43,20 @@ class ControlledHexapod(NamedTuple):
     centres: dict[str, Array]
 
 
-def controlled(centres: Array, seed: int) -> ControlledHexapod:
+def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     """The same way with every estimate. centres : (R, L, 3) of [B] 14, camera frame, a run each."""
-    machine, view, drawing = controlled_machine(), views()[PERSPECTIVE], study_machine()
+    machine, view, drawing = (
+        controlled_machine(),
+        views_by_name()[PERSPECTIVE_VIEW],
+        hexapod_with_cylinder_legs(),
+    )
     true = seen_machine(machine, view.T_camera_base)
     eye = Eye.of(true, view.camera)
     runs = len(centres)
     rng = np.random.default_rng(seed)
     exact = Uncertainty(np.zeros((len(machine.values),) * 2), np.zeros(3), np.zeros(3))
     beliefs: dict[str, Belief] = {}
-    for name, (position, degrees) in BY_HAND.items():
+    for name, (position, degrees) in CAMERA_BY_HAND_ERRORS.items():
         found = estimates(
             true, drawing.values, exact, runs, rng, position, float(np.radians(degrees))
         )
@@ -60,10 +69,15 @@ def controlled(centres: Array, seed: int) -> ControlledHexapod:
     fitted = register(np.broadcast_to(drawing.base_centers(), centres.shape), centres)
     as_drawn = np.broadcast_to(drawing.values, values.shape)
     beliefs[E1] = _belief(E1, "Drawing, fitted", true, as_drawn, fitted)
-    start, goal = (np.broadcast_to(machine.forward(q), (runs, 4, 4)) for q in (START, GOAL))
-    ran: dict[str, Runs] = {
+    start, goal = (
+        np.broadcast_to(machine.forward(q), (runs, 4, 4))
+        for q in (CONTROL_START_READINGS, CONTROL_GOAL_READINGS)
+    )
+    ran: dict[str, ServoRuns] = {
         # the same noise for all, so that differences are the estimates'
-        name: simulate(eye, belief.seen, start, goal, LOOP, np.random.default_rng(seed))
+        name: simulate_servo_runs(
+            eye, belief.seen, start, goal, PAPER_B_LOOP_SETTINGS, np.random.default_rng(seed)
+        )
         for name, belief in beliefs.items()
     }
     trials = {

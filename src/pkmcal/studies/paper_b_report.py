@@ -13,70 +13,88 @@ from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_b import (
-    CASES,
-    CONTROLLED,
-    HUBER,
-    JOINT,
-    MEDIAN,
-    MIRROR,
-    PERSPECTIVE,
-    PLAIN,
+    CONTROLLED_POPULATION,
+    HUBER_REGRESSION,
+    LEAST_MEDIAN_REGRESSION,
+    MIRROR_VIEW,
+    PAPER_B_CASES,
+    PAPER_B_JOINT,
+    PAPER_B_VIEW_NAMES,
+    PERSPECTIVE_VIEW,
+    PLAIN_REGRESSION,
     POINT_NOISE,
-    POINTS,
-    RATIO,
-    ROBUST,
-    SCALE,
-    TUKEY,
-    VIEWS,
+    POINTS_FITTED_AN_EDGE,
+    ROBUST_REGRESSION,
+    SCALED_BY_RATIO,
+    SCALED_BY_SIMILARITY,
+    TUKEY_REGRESSION,
     HexapodByLegs,
-    study_machine,
-    views,
+    hexapod_with_cylinder_legs,
+    views_by_name,
 )
-from pkmcal.studies.paper_b_control import E1, E2, GOAL, START, ControlledHexapod, controlled
-from pkmcal.studies.paper_b_expected import CAD, PROTOTYPE, checks, figures_compared
+from pkmcal.studies.paper_b_control import (
+    CONTROL_GOAL_READINGS,
+    CONTROL_START_READINGS,
+    E1,
+    E2,
+    ControlledHexapod,
+    controlled_by_estimates,
+)
+from pkmcal.studies.paper_b_expected import (
+    CAD_MEDIAN_ERROR,
+    PAPER_B_PROTOTYPE,
+    paper_b_checks,
+    paper_b_figures,
+)
 from pkmcal.studies.reproduction import Column, Options, Words, accuracy_rows
 from pkmcal.wording import number
 
-LABELS = {
-    PLAIN: "least squares",
-    HUBER: "Huber",
-    TUKEY: "Tukey",
-    MEDIAN: "least median",
-    ROBUST: "median, Tukey, EIV",
-    RATIO: "eq. 16's scale",
-    SCALE: "similarity",
-    JOINT: "joint estimate",
+PAPER_B_METHOD_LABELS = {
+    PLAIN_REGRESSION: "least squares",
+    HUBER_REGRESSION: "Huber",
+    TUKEY_REGRESSION: "Tukey",
+    LEAST_MEDIAN_REGRESSION: "least median",
+    ROBUST_REGRESSION: "median, Tukey, EIV",
+    SCALED_BY_RATIO: "eq. 16's scale",
+    SCALED_BY_SIMILARITY: "similarity",
+    PAPER_B_JOINT: "joint estimate",
 }
-TITLES = {MIRROR: "Through the mirror", PERSPECTIVE: "Before the camera"}
+VIEW_TABLE_TITLES = {MIRROR_VIEW: "Through the mirror", PERSPECTIVE_VIEW: "Before the camera"}
 CASE_NAMES = {
     "right": "Right edges",
     "shifted": "0.1 px outside",
     "radius": "Radius 1 % wrong",
     **{f"{n} % wrong": f"{n} % wrong edges" for n in (5, 20, 35)},
 }
-COLUMNS = [
+PAPER_B_COLUMNS = [
     Column("centre", 3, 3),
     Column("depth", 3, 3),
     Column("pixel", 3, 3),
     Column("cad", 1, 1),
 ]
-ALONG = 9
+DRAWN_EDGE_PLACES = 9
 """Places along an edge that is drawn."""
-ENLARGED = 10.0
+DRAWN_ERROR_ENLARGEMENT = 10.0
 """Times that errors are drawn enlarged."""
 RUNS_SHOWN = 0
 """The run whose joints are drawn: the first, not the best."""
-CURVES = {
+CONTROL_CURVE_STYLES = {
     "true": ("True geometry", "--quiet", "dot"),
     E1: ("E1: drawing, fitted", "--good", "dash"),
     E2: ("E2: linear", "--drawing", "solid"),
     "hand": ("E3: by hand, 3 cm and 3°", "--calibrated", "solid"),
     "coarse": ("E3: 10 cm and 10°", "--leg7", "dash"),
 }
-COLOURS = {PLAIN: "--quiet", HUBER: "--leg1", TUKEY: "--leg3", MEDIAN: "--leg4",
-           ROBUST: "--drawing", JOINT: "--calibrated"}  # fmt: skip
+PAPER_B_METHOD_COLOURS = {
+    PLAIN_REGRESSION: "--quiet",
+    HUBER_REGRESSION: "--leg1",
+    TUKEY_REGRESSION: "--leg3",
+    LEAST_MEDIAN_REGRESSION: "--leg4",
+    ROBUST_REGRESSION: "--drawing",
+    PAPER_B_JOINT: "--calibrated",
+}
 
-Found = StudyResult[HexapodByLegs]
+HexapodByLegsStudy = StudyResult[HexapodByLegs]
 
 
 def reproduce(options: Options) -> Outcome:
@@ -84,24 +102,30 @@ def reproduce(options: Options) -> Outcome:
     began = perf_counter()
     found = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
     options.told("Control by the edges", 0.9)
-    ran = controlled(found.values("centres", CONTROLLED, CONTROLLED, ROBUST), options.seed)
-    return reproduced(found, ran, perf_counter() - began)
+    ran = controlled_by_estimates(
+        found.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION),
+        options.seed,
+    )
+    return paper_b_outcome(found, ran, perf_counter() - began)
 
 
-def reproduced(found: Found, ran: ControlledHexapod, elapsed: float) -> Outcome:
+def paper_b_outcome(found: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Outcome:
     """The reproduction that a study and the controlled runs give. elapsed : s, of both."""
     words = _words(found, ran, elapsed)
     return words.reproduction(
         (
             words.part("accuracy", *_tables(found), plots={"shares": {"figure": _shares(found)}}),
-            words.part("figure-6", plots={"mirror": _picture(found, MIRROR)}),
+            words.part("figure-6", plots={"mirror": _picture(found, MIRROR_VIEW)}),
             _geometry_part(words, found),
-            words.part("figure-8", plots={"camera": _picture(found, PERSPECTIVE, ran)}),
+            words.part("figure-8", plots={"camera": _picture(found, PERSPECTIVE_VIEW, ran)}),
             words.part(
                 "figure-9",
                 plots={
                     name: _configuration(ran, readings)
-                    for name, readings in (("start", START), ("goal", GOAL))
+                    for name, readings in (
+                        ("start", CONTROL_START_READINGS),
+                        ("goal", CONTROL_GOAL_READINGS),
+                    )
                 },
             ),
             words.part(
@@ -114,30 +138,32 @@ def reproduced(found: Found, ran: ControlledHexapod, elapsed: float) -> Outcome:
             ),
             words.part("how"),
         ),
-        checks=checks(found, ran),
+        checks=paper_b_checks(found, ran),
         remarks=("accuracy", "scale", "overshoot", "alike"),
         numbers=_numbers(found, ran, elapsed),
     )
 
 
-def _words(s: Found, ran: ControlledHexapod, elapsed: float) -> Words:
+def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Words:
     """All that is said, with the figures that it names."""
-    true, estimated = _joints(s, MIRROR)
-    project = views()[MIRROR].camera.project
+    true, estimated = _joints(s, MIRROR_VIEW)
+    project = views_by_name()[MIRROR_VIEW].camera.project
     seen = ran.eye.camera.project
     by_hand = np.linalg.norm(seen(ran.centres["hand"]) - seen(ran.centres["true"]), axis=-1)
     astray = {
         f"{name}_astray": 1e3 * float(np.median(trial.astray)) for name, trial in ran.trials.items()
     }
-    start, goal = ran.eye.true.machine.forward(np.array([START, GOAL]))
+    start, goal = ran.eye.true.machine.forward(
+        np.array([CONTROL_START_READINGS, CONTROL_GOAL_READINGS])
+    )
     way = pose_difference(goal, start)
     return Words.of(
         "b",
         s,
         elapsed=elapsed,
-        each=len(s.values("centre", MIRROR, "right", ROBUST)),
+        each=len(s.values("centre", MIRROR_VIEW, "right", ROBUST_REGRESSION)),
         controlled=len(ran.centres[E2]),
-        points=POINTS,
+        points=POINTS_FITTED_AN_EDGE,
         noise=POINT_NOISE,
         mirror_pixel=float(np.linalg.norm(project(estimated) - project(true), axis=-1).max()),
         mirror_off=1e3 * float(np.linalg.norm(estimated - true, axis=-1).max()),
@@ -151,18 +177,23 @@ def _words(s: Found, ran: ControlledHexapod, elapsed: float) -> Words:
 # ------------------------------------------------------------------ tables
 
 
-def _tables(s: Found) -> list[Table]:
+def _tables(s: HexapodByLegsStudy) -> list[Table]:
     """A table a camera."""
     out: list[Table] = []
-    for view in VIEWS:
-        rows = [Row("The paper", ("", "", "", number(1e3 * CAD[view], 0)), "paper")]
-        for case, tried in CASES.items():
+    for view in PAPER_B_VIEW_NAMES:
+        rows = [Row("The paper", ("", "", "", number(1e3 * CAD_MEDIAN_ERROR[view], 0)), "paper")]
+        for case, tried in PAPER_B_CASES.items():
             for method in tried.methods:
-                key, name = (view, case, method), f"{CASE_NAMES[case]}: {LABELS[method]}"
-                rows += accuracy_rows(s, key, name, COLUMNS, PROTOTYPE.get(key), errors=False)
+                key, name = (
+                    (view, case, method),
+                    f"{CASE_NAMES[case]}: {PAPER_B_METHOD_LABELS[method]}",
+                )
+                rows += accuracy_rows(
+                    s, key, name, PAPER_B_COLUMNS, PAPER_B_PROTOTYPE.get(key), errors=False
+                )
         heads = ("", "mm", "depth, mm", "px", "drawing, mm")
         note = "Pictures of joints that have collapsed into the camera have no place."
-        out.append(Table(TITLES[view], heads, tuple(rows), note))
+        out.append(Table(VIEW_TABLE_TITLES[view], heads, tuple(rows), note))
     return out
 
 
@@ -179,7 +210,7 @@ def _control_table(ran: ControlledHexapod) -> Table:
                 number(float(np.nanmedian(t.settling)), 1) if t.reached else "–",
             ),
         )
-        for name, (title, _, _) in CURVES.items()
+        for name, (title, _, _) in CONTROL_CURVE_STYLES.items()
         for t in [ran.trials[name]]
     ]
     heads = ("", "reached", "off its way, mm", "passed goal, %", "error rose, %", "settled, s")
@@ -193,35 +224,37 @@ def _control_table(ran: ControlledHexapod) -> Table:
 # ------------------------------------------------------------------ plots
 
 
-def _joints(s: Found, view: str, case: str = "shifted") -> tuple[Array, Array]:
+def _joints(s: HexapodByLegsStudy, view: str, case: str = "shifted") -> tuple[Array, Array]:
     """True and linearly estimated base joints (L, 3) of the run that is drawn, camera frame, m."""
-    key = (view, case, ROBUST)
+    key = (view, case, ROBUST_REGRESSION)
     return s.values("truth", *key)[RUNS_SHOWN], s.values("centres", *key)[RUNS_SHOWN]
 
 
-def _shares(s: Found) -> dict[str, Any]:
+def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
     """Error by the share of wrong edges, through the mirror."""
     data: list[dict[str, Any]] = []
-    for method, colour in COLOURS.items():
+    for method, colour in PAPER_B_METHOD_COLOURS.items():
         cases = {
-            share: 1e3 * s.of(MIRROR, case, method)["centre"].value
+            share: 1e3 * s.of(MIRROR_VIEW, case, method)["centre"].value
             for case, share in (("right", 0), ("5 % wrong", 5), ("20 % wrong", 20),
                                 ("35 % wrong", 35))
-            if method in CASES[case].methods
+            if method in PAPER_B_CASES[case].methods
         }  # fmt: skip
-        drawn = trace(LABELS[method], cases, cases.values(), colour)
+        drawn = trace(PAPER_B_METHOD_LABELS[method], cases, cases.values(), colour)
         data.append({**drawn, "hovertemplate": "%{y:.3g} mm with %{x} %"})
     layout = plane("wrong edges, %", "error of a joint, mm")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout}
 
 
-def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[str, Any]:
+def _picture(
+    s: HexapodByLegsStudy, view: str, ran: ControlledHexapod | None = None
+) -> dict[str, Any]:
     """[B] Figs. 6 and 8: joints in the picture, and the legs of the drawing at home; ran : where
     joints by hand are drawn, too.
     """
-    camera, T = views()[view]
-    machine = study_machine()
+    camera, T = views_by_name()[view]
+    machine = hexapod_with_cylinder_legs()
     home = machine.home()
     ends = machine.ends_at(machine.inverse(home), home)
     along = ends.a[:, None] + np.linspace(0, 1, 25)[:, None] * (ends.b - ends.a)[:, None]
@@ -253,18 +286,21 @@ def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict
     return {"figure": {"data": data, "layout": layout}, "height": 500}
 
 
-def _geometry_part(words: Words, s: Found) -> Part:
+def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
     """[B] Fig. 7."""
-    drawing = study_machine().base_centers()
+    drawing = hexapod_with_cylinder_legs().base_centers()
     sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
-    looks = (MIRROR, "--calibrated", "circle-open"), (PERSPECTIVE, "--drawing", "diamond-open")
+    looks = (
+        (MIRROR_VIEW, "--calibrated", "circle-open"),
+        (PERSPECTIVE_VIEW, "--drawing", "diamond-open"),
+    )
     for view, colour, symbol in looks:
         true, estimated = _joints(s, view)
         # the run's own machine is the drawing's here, so that its errors are the method's alone
         fitted = register(true, estimated)
         off = apply(inverse(fitted), estimated) - true
-        turned = views()[view].T_camera_base[:3, :3]
-        sets.append((view, drawing + ENLARGED * off @ turned, colour, symbol, 10))
+        turned = views_by_name()[view].T_camera_base[:3, :3]
+        sets.append((view, drawing + DRAWN_ERROR_ENLARGEMENT * off @ turned, colour, symbol, 10))
     plots: dict[str, dict[str, Any]] = {}
     for name, axes in (("lateral", (0, 2)), ("top", (0, 1))):
         data = [
@@ -282,7 +318,11 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
     """[B] Fig. 9: the camera's picture at readings (m,); nearer legs before those behind them."""
     machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
     pose = machine.forward(readings)
-    edges = ran.eye.points(pose[None], readings[None], ALONG).pixel[0].reshape(-1, 2, ALONG, 2)
+    edges = (
+        ran.eye.points(pose[None], readings[None], DRAWN_EDGE_PLACES)
+        .pixel[0]
+        .reshape(-1, 2, DRAWN_EDGE_PLACES, 2)
+    )
     ends = machine.ends_at(readings, pose)
     base, platform = apply(T, ends.a), apply(T, ends.b)
     data: list[dict[str, Any]] = []
@@ -302,7 +342,7 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
 def _errors(ran: ControlledHexapod) -> dict[str, Any]:
     """[B] Fig. 10: the norm of e against time."""
     data: list[dict[str, Any]] = []
-    for name, (title, colour, dash) in CURVES.items():
+    for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         runs = ran.trials[name].runs
         share = np.median(runs.error / runs.error[:, :1], axis=0)
         look = {"color": colour, "dash": dash, "width": 2}
@@ -315,10 +355,10 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
 def _beside(ran: ControlledHexapod) -> dict[str, Any]:
     """How far the platform is from where the true geometry has it, against time."""
     ideal = ran.trials["true"].runs
-    points = study_machine().platform_centers()
+    points = hexapod_with_cylinder_legs().platform_centers()
     there = apply(ideal.T_base_platform[:, :, None], points)
     data: list[dict[str, Any]] = []
-    for name, (title, colour, dash) in CURVES.items():
+    for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         here = apply(ran.trials[name].runs.T_base_platform[:, :, None], points)
         off = np.sqrt(np.mean(np.sum((here - there) ** 2, axis=-1), axis=-1))
         look = {"color": colour, "dash": dash, "width": 2}
@@ -335,26 +375,26 @@ def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> d
 # ------------------------------------------------------------------ for programs
 
 
-def _numbers(s: Found, ran: ControlledHexapod, elapsed: float) -> dict[str, Any]:
+def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> dict[str, Any]:
     """Everything for programs, m, px and s."""
     return {
         "runs": s.runs,
         "seed": s.seed,
         "seconds": {"wall": elapsed, "solving": s.solving, "cpu": s.cpu, "workers": s.workers},
-        "paper": {"from_drawing": CAD},
+        "paper": {"from_drawing": CAD_MEDIAN_ERROR},
         "accuracy": [
             {
                 **dict(zip(("view", "case", "method"), key, strict=True)),
                 **{q: _told(s.of(*key)[q].value) for q in ("centre", "depth", "cad", "pixel")},
                 "centre_error": _told(s.of(*key)["centre"].error),
                 "runs": len(s.values("centre", *key)),
-                "prototype": PROTOTYPE.get(key, {}).get("centre"),
+                "prototype": PAPER_B_PROTOTYPE.get(key, {}).get("centre"),
             }
             for key in s.samples
         ],
         "prototype": [
             {"key": f.key, "found": f.found.value, "expected": f.expected, "held": f.held}
-            for f in figures_compared(s)
+            for f in paper_b_figures(s)
         ],
         "control": {
             name: {

@@ -17,9 +17,9 @@ from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.mechanisms.kinematics import forward, on_manifold, readings_at_poses
 from pkmcal.papers.hand_eye import size_of, solve_pairs
-from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
+from pkmcal.papers.inverse_kinematic import PoseFit, PoseFitForm, fit_machine_to_poses, pose_problem
 from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import (
@@ -32,57 +32,71 @@ from pkmcal.studies.estimates import (
     tool_places,
 )
 from pkmcal.studies.paper_c_machine import (
-    BOARD,
-    CAMERA,
+    PAPER_C_BOARD_POSE,
+    PAPER_C_CAMERA_POSE,
     Deviations,
-    Kind,
-    grid,
+    H4ModelKind,
+    measured_volume_grid,
     model,
     table_2_of,
     true_values,
     workspace,
 )
-from pkmcal.studies.paper_c_validation import control_residuals, square, straightness
+from pkmcal.studies.paper_c_validation import control_residuals, square, straightness_along_rulers
 from pkmcal.studies.simulated import (
     Noise,
     SimulatedRuns,
     Viewpoints,
     joint_problem,
     measurements,
-    simulate,
+    simulate_runs,
 )
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-DRAWING, EQ3, EQ5, WHITENED, JOINT, BOUND = (
+PAPER_C_DRAWING, EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND = (
     "drawing", "eq. 3", "eq. 5", "eq. 5 whitened", "joint", "bound",
 )  # fmt: skip
-AXIS = "axis of rotation"
-PLAN: dict[Kind, dict[Kind, tuple[str, ...]]] = {
+ROTATION_AXIS_METHOD = "axis of rotation"
+METHODS_BY_TRUTH: dict[H4ModelKind, dict[H4ModelKind, tuple[str, ...]]] = {
     "design": {
-        "design": (DRAWING, EQ3, EQ5, WHITENED, JOINT, BOUND),
-        "calibration": (EQ5, WHITENED, JOINT),
+        "design": (
+            PAPER_C_DRAWING,
+            EQ3_AS_PRINTED,
+            EQ5_AS_PRINTED,
+            EQ5_WHITENED,
+            PAPER_C_JOINT,
+            PAPER_C_BOUND,
+        ),
+        "calibration": (EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT),
     },
     "calibration": {
-        "design": (DRAWING, EQ3, JOINT),
-        "calibration": (EQ3, EQ5, WHITENED, JOINT, BOUND),
+        "design": (PAPER_C_DRAWING, EQ3_AS_PRINTED, PAPER_C_JOINT),
+        "calibration": (EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND),
     },
-    "rods": {"design": (JOINT,), "calibration": (JOINT,), "rods": (WHITENED, JOINT)},
+    "rods": {
+        "design": (PAPER_C_JOINT,),
+        "calibration": (PAPER_C_JOINT,),
+        "rods": (EQ5_WHITENED, PAPER_C_JOINT),
+    },
 }
 """For each truth the models that are fitted to it, and how."""
-KINDS: tuple[Kind, ...] = tuple(PLAN)
-PRINTED: dict[str, Form] = {EQ3: "joint", EQ5: "implicit"}
+H4_MODEL_KINDS: tuple[H4ModelKind, ...] = tuple(METHODS_BY_TRUTH)
+PRINTED_EQUATION_FORMS: dict[str, PoseFitForm] = {
+    EQ3_AS_PRINTED: "joint",
+    EQ5_AS_PRINTED: "implicit",
+}
 
-BATCH = 20
+PAPER_C_BATCH_RUNS = 20
 RODS_SHARE = 5
 """One run with rods for so many others: it has 82 parameters and takes ten times as long."""
-LARGER = 1.25
+LARGER_WORKSPACE_FACTOR = 1.25
 """Half sizes of the workspace that errors are also told over, by those of the measured volume. The
 errata's prototype does not name its own; this one fits its figures."""
-POSES = 100
+PAPER_C_COMPARED_POSES = 100
 """Poses at which a run's machine is held against the truth."""
-LEAST, SPACE, LINES = 1, 2, 3
+PAPER_C_BOUND_STREAM, COMPARED_POSES_STREAM, RULED_LINES_STREAM = 1, 2, 3
 """Uses of a batch's draws, besides the simulation."""
-QUANTITIES = {
+PAPER_C_QUANTITIES = {
     "shift": Quantity("rms", 1e3, "mm"),
     "turn": Quantity("rms", 1e3, "mrad"),
     "larger_shift": Quantity("rms", 1e3, "mm"),
@@ -107,7 +121,7 @@ class H4ByBoard:
     control: int = 10
 
     doing = "Board poses"
-    quantities = QUANTITIES
+    quantities = PAPER_C_QUANTITIES
 
     @property
     def noise(self) -> Noise:
@@ -116,41 +130,48 @@ class H4ByBoard:
 
     def populations(self, runs: int) -> list[Population]:
         """Each truth; fewer with rods."""
-        out = [Population(kind, runs, BATCH) for kind in KINDS if kind != "rods"]
-        return [*out, Population("rods", max(2, runs // RODS_SHARE), BATCH // 4)]
+        out = [
+            Population(kind, runs, PAPER_C_BATCH_RUNS) for kind in H4_MODEL_KINDS if kind != "rods"
+        ]
+        return [*out, Population("rods", max(2, runs // RODS_SHARE), PAPER_C_BATCH_RUNS // 4)]
 
     def draw(self, batch: Batch) -> SimulatedRuns:
         """True machines and their poses; calibration first, then control."""
         return self.simulated(kind_of(batch.population), batch.runs, batch.generator(0))
 
-    def simulated(self, kind: Kind, runs: int, rng: np.random.Generator) -> SimulatedRuns:
+    def simulated(self, kind: H4ModelKind, runs: int, rng: np.random.Generator) -> SimulatedRuns:
         """The same of one kind of truth."""
         machine = model(kind)
         theta = true_values(kind, self.deviations, runs, rng)
-        order = np.argsort(rng.random((runs, len(grid()))), axis=1)
-        poses = grid()[order]
+        order = np.argsort(rng.random((runs, len(measured_volume_grid()))), axis=1)
+        poses = measured_volume_grid()[order]
         if kind == "rods":  # two rods a forearm tilt the nacelle a little
             poses = on_manifold(machine.layout, theta[:, None], poses).T_base_platform
-        readings = inverse(machine.layout, theta[:, None], poses)
-        station = np.zeros(len(grid()), dtype=int)
-        view = Viewpoints(CAMERA[None], station, T_platform_board=BOARD)
-        return simulate(machine, theta, readings, poses, view, self.noise, rng, self.control)
+        readings = readings_at_poses(machine.layout, theta[:, None], poses)
+        station = np.zeros(len(measured_volume_grid()), dtype=int)
+        view = Viewpoints(PAPER_C_CAMERA_POSE[None], station, T_platform_board=PAPER_C_BOARD_POSE)
+        return simulate_runs(machine, theta, readings, poses, view, self.noise, rng, self.control)
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
         """Every model that is fitted to this truth, by every method that is asked for."""
         kind = kind_of(batch.population)
         return {
             (kind, name, method): fit
-            for name, methods in PLAN[kind].items()
-            for method, fit in _fits(data, name, methods, batch.generator(LEAST)).items()
+            for name, methods in METHODS_BY_TRUTH[kind].items()
+            for method, fit in _fits(
+                data, name, methods, batch.generator(PAPER_C_BOUND_STREAM)
+            ).items()
         }
 
     def judge(
         self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """The tool's errors; where the truth is the paper's machine, its validation as well."""
-        space, lines = batch.generator(SPACE), batch.generator(LINES)
-        near, far = (tool_places(data, workspace(POSES, space, larger)) for larger in (1.0, LARGER))
+        space, lines = batch.generator(COMPARED_POSES_STREAM), batch.generator(RULED_LINES_STREAM)
+        near, far = (
+            tool_places(data, workspace(PAPER_C_COMPARED_POSES, space, larger))
+            for larger in (1.0, LARGER_WORKSPACE_FACTOR)
+        )
         papers = batch.population == "design"
         out: dict[Key, Sample] = {}
         for (kind, name, method), fit in found.items():
@@ -164,43 +185,43 @@ class H4ByBoard:
                 "shift": one.shift, "turn": one.turn,
                 "larger_shift": other.shift, "larger_turn": other.turn,
             }  # fmt: skip
-            if papers and method != BOUND:
+            if papers and method != PAPER_C_BOUND:
                 off = control_residuals(machine, fit, data)
                 values |= {
                     "control_mean": off.mean(axis=1),
                     "control_rms": np.sqrt(np.mean(off**2, axis=1)),
-                    "straightness": straightness(machine, fit.theta, data, lines),
+                    "straightness": straightness_along_rulers(machine, fit.theta, data, lines),
                     "square": square(machine, fit.theta, data),
                 }
             if papers and name == "design":
                 values["table_2"] = table_2_of(machine, fit.theta)
             out[kind, name, method] = Sample(values | fit.told)
-        return out | {("design", AXIS): axis_of_rotation(data)} if papers else out
+        return out | {("design", ROTATION_AXIS_METHOD): axis_of_rotation(data)} if papers else out
 
 
-def kind_of(name: str) -> Kind:
+def kind_of(name: str) -> H4ModelKind:
     """A kind of truth or model by its name."""
-    return next(kind for kind in KINDS if kind == name)
+    return next(kind for kind in H4_MODEL_KINDS if kind == name)
 
 
 def _fits(
-    data: SimulatedRuns, name: Kind, methods: tuple[str, ...], rng: np.random.Generator
+    data: SimulatedRuns, name: H4ModelKind, methods: tuple[str, ...], rng: np.random.Generator
 ) -> dict[str, Fitted]:
     """Every asked method's estimate with one model. Only rods need the drawing as a prior."""
     machine, prior = model(name), name == "rods"
     begin = start(machine, data)
     out: dict[str, Fitted] = {}
-    if DRAWING in methods:
-        out[DRAWING] = drawing(machine, len(data.theta))
-    for method, form in PRINTED.items():
+    if PAPER_C_DRAWING in methods:
+        out[PAPER_C_DRAWING] = drawing(machine, len(data.theta))
+    for method, form in PRINTED_EQUATION_FORMS.items():
         if method in methods:
-            out[method] = fitted(at_poses(machine, data, begin, form, whitened=False))
+            out[method] = estimate_of_pose_fit(at_poses(machine, data, begin, form, whitened=False))
     whitened = at_poses(machine, data, begin, "implicit", whitened=True, use_drawing=prior)
-    if WHITENED in methods:
-        out[WHITENED] = fitted(whitened, whitened=True)
-    out[JOINT] = joint_estimate(machine, data, whitened, use_drawing=prior)
-    if BOUND in methods:
-        out[BOUND] = bound(machine, data, rng)
+    if EQ5_WHITENED in methods:
+        out[EQ5_WHITENED] = estimate_of_pose_fit(whitened, whitened=True)
+    out[PAPER_C_JOINT] = joint_from_pose_fit(machine, data, whitened, use_drawing=prior)
+    if PAPER_C_BOUND in methods:
+        out[PAPER_C_BOUND] = estimate_at_bound(machine, data, rng)
     return out
 
 
@@ -221,7 +242,7 @@ def start(machine: Machine, data: SimulatedRuns) -> State:
 
 
 def at_poses(
-    machine: Machine, data: SimulatedRuns, begin: State, form: Form, *,
+    machine: Machine, data: SimulatedRuns, begin: State, form: PoseFitForm, *,
     whitened: bool, use_drawing: bool = False,
 ) -> PoseFit:  # fmt: skip
     """[C] eq. 3 or 5, as printed or whitened. begin : of :func:`start`."""
@@ -230,10 +251,12 @@ def at_poses(
         machine, measurements(data), seen[:, :n], data.joints[:, :n], begin, form
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
-    return fit_poses(machine, problem, state, noise, data.noise.reading, use_drawing=use_drawing)
+    return fit_machine_to_poses(
+        machine, problem, state, noise, data.noise.reading, use_drawing=use_drawing
+    )
 
 
-def fitted(fit: PoseFit, *, whitened: bool = False) -> Fitted:
+def estimate_of_pose_fit(fit: PoseFit, *, whitened: bool = False) -> Fitted:
     """A fit at measured poses as an estimate, with its rank and how many unknowns it estimates."""
     problem, state = fit.problem, fit.solution.state
     runs, n = problem.readings.shape[:2]
@@ -247,7 +270,7 @@ def fitted(fit: PoseFit, *, whitened: bool = False) -> Fitted:
     return Fitted(problem.theta(state), state.T_camera_base[:, 0], state.T_mount[:, 0], told)
 
 
-def joint_estimate(
+def joint_from_pose_fit(
     machine: Machine, data: SimulatedRuns, begin: PoseFit, *, use_drawing: bool = False
 ) -> Fitted:
     """The joint estimate, from a fit at measured poses."""
@@ -266,17 +289,17 @@ def joint_estimate(
     )  # fmt: skip
 
 
-def bound(machine: Machine, data: SimulatedRuns, rng: np.random.Generator) -> Fitted:
+def estimate_at_bound(machine: Machine, data: SimulatedRuns, rng: np.random.Generator) -> Fitted:
     """A draw from the Cramér-Rao bound at the truth, whose parameters are the machine's."""
     problem = joint_problem(machine, data, default_gauge(machine))
     z = (data.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
     runs, n = len(z), data.count
     state = BatchState(
         z,
-        np.broadcast_to(CAMERA, (runs, 1, 4, 4)),
+        np.broadcast_to(PAPER_C_CAMERA_POSE, (runs, 1, 4, 4)),
         data.T_base_platform[:, :n],
         np.zeros((runs, 1, 1)),
-        np.broadcast_to(BOARD, (runs, 1, 4, 4)),
+        np.broadcast_to(PAPER_C_BOARD_POSE, (runs, 1, 4, 4)),
         np.zeros((runs, n, machine.layout.n_internal)),
     )
     step = drawn_from_bound(problem, state, rng)
@@ -302,13 +325,13 @@ def axis_of_rotation(data: SimulatedRuns) -> Sample:
     )
 
 
-def ranks(study: StudyResult[H4ByBoard]) -> dict[tuple[Kind, str], tuple[int, int]]:
+def ranks(study: StudyResult[H4ByBoard]) -> dict[tuple[H4ModelKind, str], tuple[int, int]]:
     """Rank of the Jacobian with everything free, and how many unknowns are estimated, by model and
     method, each on its own truth.
     """
-    out: dict[tuple[Kind, str], tuple[int, int]] = {}
-    for kind in KINDS[:2]:
-        for method in (EQ3, EQ5, WHITENED):
+    out: dict[tuple[H4ModelKind, str], tuple[int, int]] = {}
+    for kind in H4_MODEL_KINDS[:2]:
+        for method in (EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED):
             rank, count = (study.values(q, kind, kind, method)[0] for q in ("rank", "estimated"))
             out[kind, method] = (int(rank), int(count))
     return out

@@ -7,41 +7,47 @@ import numpy as np
 from pkmcal.outcome import Check
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.paper_c import (
-    AXIS,
-    BOUND,
-    DRAWING,
-    EQ3,
-    EQ5,
-    JOINT,
-    KINDS,
-    WHITENED,
+    EQ3_AS_PRINTED,
+    EQ5_AS_PRINTED,
+    EQ5_WHITENED,
+    H4_MODEL_KINDS,
+    PAPER_C_BOUND,
+    PAPER_C_DRAWING,
+    PAPER_C_JOINT,
+    ROTATION_AXIS_METHOD,
     H4ByBoard,
     largest_side,
     ranks,
 )
-from pkmcal.studies.paper_c_machine import Kind
+from pkmcal.studies.paper_c_machine import H4ModelKind
 from pkmcal.studies.paper_c_validation import Before
 from pkmcal.studies.reproduction import Compared, at_most, compared, prototype_check
-from pkmcal.studies.statistics import ratio
+from pkmcal.studies.statistics import ratio_of_figures
 from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
-LABELS = {
-    DRAWING: "a priori",
-    EQ3: "eq. 3 as printed",
-    EQ5: "eq. 5 as printed",
-    WHITENED: "eq. 5 whitened",
-    JOINT: "joint estimate",
-    BOUND: "Cramér-Rao bound",
+PAPER_C_METHOD_LABELS = {
+    PAPER_C_DRAWING: "a priori",
+    EQ3_AS_PRINTED: "eq. 3 as printed",
+    EQ5_AS_PRINTED: "eq. 5 as printed",
+    EQ5_WHITENED: "eq. 5 whitened",
+    PAPER_C_JOINT: "joint estimate",
+    PAPER_C_BOUND: "Cramér-Rao bound",
 }
-MODELS: dict[str, str] = {"design": "Model 12", "calibration": "Model 31", "rods": "Rods"}
-WHERE: dict[str, str] = {
+PAPER_C_MODEL_LABELS: dict[str, str] = {
+    "design": "Model 12",
+    "calibration": "Model 31",
+    "rods": "Rods",
+}
+TRUE_MACHINE_CLAUSES: dict[str, str] = {
     "design": "the machine is a Model 12",
     "calibration": "the machine is a Model 31",
     "rods": "the machine has rods",
 }
-TRUTHS = {kind: where[0].upper() + where[1:] for kind, where in WHERE.items()}
-BEFORE = Before(26e-3, 0.022)
+TRUE_MACHINE_HEADINGS = {
+    kind: where[0].upper() + where[1:] for kind, where in TRUE_MACHINE_CLAUSES.items()
+}
+NACELLE_ERROR_BEFORE = Before(26e-3, 0.022)
 """[C] IV.C: the nacelle's mean error with the a priori parameters, m and rad."""
 TABLE_3 = {
     "before": ((9.0e-2, 3.5e-2, 7.3e-2, 8.3e-2), (9.0e-2, 3.7e-2, 7.4e-2, 8.3e-2)),
@@ -53,45 +59,45 @@ TABLE_4 = {"before": (1.3e-3, 2.3e-3), "design": (4.9e-4, 5.8e-4), "calibration"
 """[C] Table 4: straightness in two directions, m."""
 SQUARE_BEFORE, SQUARE_AFTER = 5e-3, 0.5e-3
 """[C] IV.D: error of the square's side, m; after, an upper limit."""
-SPREAD = float(np.radians(0.12))
+ROTATION_AXIS_SPREAD = float(np.radians(0.12))
 """[C] IV.B: standard deviation of the angle between the axis and its mean."""
 JOINT_MEANS = (9.4e-2, 3.6e-2, 7.6e-2, 8.5e-2)
 """What Table 2's two columns ask for as "before" in Table 3, rad (errata)."""
 
 _PROTOTYPE: dict[Key, tuple[str, ...]] = {
-    ("design", "design", DRAWING): ("4.5", "9.6"),
-    ("design", "design", EQ3): ("0.070", "0.24"),
-    ("design", "design", JOINT): ("0.052", "0.12"),
-    ("design", "calibration", EQ5): ("0.101", "0.37"),
-    ("design", "calibration", WHITENED): ("0.084", "0.182"),
-    ("design", "calibration", JOINT): ("0.084", "0.185"),
-    ("calibration", "design", EQ3): ("0.254", "2.8"),
-    ("calibration", "calibration", EQ5): ("0.100", "0.37"),
-    ("calibration", "calibration", JOINT): ("0.083", "0.183"),
-    ("calibration", "calibration", BOUND): ("0.083", "0.183"),
-    ("rods", "design", JOINT): ("0.40",),
-    ("rods", "calibration", JOINT): ("0.13",),
-    ("rods", "rods", JOINT): ("0.079",),
+    ("design", "design", PAPER_C_DRAWING): ("4.5", "9.6"),
+    ("design", "design", EQ3_AS_PRINTED): ("0.070", "0.24"),
+    ("design", "design", PAPER_C_JOINT): ("0.052", "0.12"),
+    ("design", "calibration", EQ5_AS_PRINTED): ("0.101", "0.37"),
+    ("design", "calibration", EQ5_WHITENED): ("0.084", "0.182"),
+    ("design", "calibration", PAPER_C_JOINT): ("0.084", "0.185"),
+    ("calibration", "design", EQ3_AS_PRINTED): ("0.254", "2.8"),
+    ("calibration", "calibration", EQ5_AS_PRINTED): ("0.100", "0.37"),
+    ("calibration", "calibration", PAPER_C_JOINT): ("0.083", "0.183"),
+    ("calibration", "calibration", PAPER_C_BOUND): ("0.083", "0.183"),
+    ("rods", "design", PAPER_C_JOINT): ("0.40",),
+    ("rods", "calibration", PAPER_C_JOINT): ("0.13",),
+    ("rods", "rods", PAPER_C_JOINT): ("0.079",),
 }
-PROTOTYPE: dict[Key, dict[str, str]] = {
+PAPER_C_PROTOTYPE: dict[Key, dict[str, str]] = {
     key: dict(zip(("larger_shift", "larger_turn"), figures, strict=False))
     for key, figures in _PROTOTYPE.items()
 }
 """RMSE over the workspace after registration, mm and mrad, by an independent prototype that shares
 no code with this program. Its workspace and its drawn machines are not known."""
-TOLERANCE = 0.15
+PAPER_C_TOLERANCE = 0.15
 """Relative difference from the prototype that fails: its workspace's size is not known, and errors
 grow with it."""
-FOLLOWS_MACHINE: tuple[tuple[Kind, Kind], ...] = (
+FOLLOWS_MACHINE: tuple[tuple[H4ModelKind, H4ModelKind], ...] = (
     ("calibration", "design"), ("rods", "design"), ("rods", "calibration"),
 )  # fmt: skip
 """Truth and model whose errors are those of what the model leaves out: they follow how the machine
 was drawn and, with rods, how far apart these stand, which the paper does not tell."""
-RANKS: dict[tuple[Kind, str], tuple[int, int]] = {
-    ("design", EQ3): (21, 19),
-    ("design", WHITENED): (23, 23),
-    ("calibration", EQ5): (38, 36),
-    ("calibration", WHITENED): (40, 40),
+PAPER_C_RANKS: dict[tuple[H4ModelKind, str], tuple[int, int]] = {
+    ("design", EQ3_AS_PRINTED): (21, 19),
+    ("design", EQ5_WHITENED): (23, 23),
+    ("calibration", EQ5_AS_PRINTED): (38, 36),
+    ("calibration", EQ5_WHITENED): (40, 40),
 }
 """Rank of the Jacobian, and unknowns that are estimated (errata; 36 is the paper's)."""
 OVER_BOUND = 1.03
@@ -101,42 +107,56 @@ TOO_POOR = 1.5
 """chi2 per degree of freedom above which a model is too poor for its data."""
 
 
-def figures_compared(study: StudyResult[H4ByBoard]) -> list[Compared]:
+def paper_c_figures(study: StudyResult[H4ByBoard]) -> list[Compared]:
     """Every figure that the prototype gives; held where the setting leaves it comparable."""
     return compared(
         study,
-        PROTOTYPE,
-        tolerance=lambda _key, _quantity: TOLERANCE,
+        PAPER_C_PROTOTYPE,
+        tolerance=lambda _key, _quantity: PAPER_C_TOLERANCE,
         held=lambda key: key[:2] not in FOLLOWS_MACHINE,
-        named=lambda key, _quantity: f"{MODELS[key[1]]}, {LABELS[key[2]]}, where {WHERE[key[0]]}",
+        named=lambda key, _quantity: (
+            f"{PAPER_C_MODEL_LABELS[key[1]]}, {PAPER_C_METHOD_LABELS[key[2]]}, where"
+            f" {TRUE_MACHINE_CLAUSES[key[0]]}"
+        ),
     )
 
 
-def checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
+def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
     place, turn = start.shift, start.turn
-    before = study.values("control_mean", "design", "design", DRAWING).mean(axis=0)
-    old, new = (largest_side(study, ("design", method)) for method in (DRAWING, EQ3))
+    before = study.values("control_mean", "design", "design", PAPER_C_DRAWING).mean(axis=0)
+    old, new = (
+        largest_side(study, ("design", method)) for method in (PAPER_C_DRAWING, EQ3_AS_PRINTED)
+    )
     every = ranks(study)
-    found = {key: every[key] for key in RANKS}
+    found = {key: every[key] for key in PAPER_C_RANKS}
     told_ranks, wanted = (
         ", ".join(f"{rank} ({count})" for rank, count in values.values())
-        for values in (found, RANKS)
+        for values in (found, PAPER_C_RANKS)
     )
-    axis, dof = study.of("design", AXIS)["chi2"].value, study.values("dof", "design", AXIS)
+    axis, dof = (
+        study.of("design", ROTATION_AXIS_METHOD)["chi2"].value,
+        study.values("dof", "design", ROTATION_AXIS_METHOD),
+    )
     allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
     over = [
-        ratio(*(study.of(kind, kind, method)["larger_shift"] for method in (JOINT, BOUND)))
-        for kind in KINDS[:2]
+        ratio_of_figures(
+            *(
+                study.of(kind, kind, method)["larger_shift"]
+                for method in (PAPER_C_JOINT, PAPER_C_BOUND)
+            )
+        )
+        for kind in H4_MODEL_KINDS[:2]
     ]
-    right = [study.of(kind, kind, JOINT)["chi2"].value for kind in KINDS]
-    poor = [study.of(*pair, JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
+    right = [study.of(kind, kind, PAPER_C_JOINT)["chi2"].value for kind in H4_MODEL_KINDS]
+    poor = [study.of(*pair, PAPER_C_JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
     return (
         Check(
             "mean error of the nacelle with the a priori parameters",
             f"{number(1e3 * place, 1)} mm, {number(turn, 4)} rad",
             "26 mm, 0.022 rad, the paper's",
-            abs(place - BEFORE.shift) < 5e-4 and abs(turn - BEFORE.turn) < 1e-3,
+            abs(place - NACELLE_ERROR_BEFORE.shift) < 5e-4
+            and abs(turn - NACELLE_ERROR_BEFORE.turn) < 1e-3,
         ),
         Check(
             "Table 3, means before, 10⁻² rad",
@@ -150,7 +170,12 @@ def checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
             "4 to 6 mm, and below 0.5 mm",
             4e-3 < old < 6e-3 and new < SQUARE_AFTER,
         ),
-        Check("ranks, Models 12 and 31 (unknowns estimated)", told_ranks, wanted, found == RANKS),
+        Check(
+            "ranks, Models 12 and 31 (unknowns estimated)",
+            told_ranks,
+            wanted,
+            found == PAPER_C_RANKS,
+        ),
         Check(
             "χ² per degree of freedom of one axis of rotation, mean",
             number(axis, 3),
@@ -173,11 +198,11 @@ def checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
         at_most(
             "model with rods on a machine with rods 0.3 mm apart",
             "mm",
-            study.of("rods", "rods", JOINT)["larger_shift"].times(1e3),
+            study.of("rods", "rods", PAPER_C_JOINT)["larger_shift"].times(1e3),
             MOST_RODS,
             3,
         ),
         prototype_check(
-            figures_compared(study), f"within {TOLERANCE:.0%}, Monte-Carlo error aside"
+            paper_c_figures(study), f"within {PAPER_C_TOLERANCE:.0%}, Monte-Carlo error aside"
         ),
     )

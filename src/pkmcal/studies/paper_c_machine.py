@@ -17,18 +17,20 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import look_at, pose, rotation
 from pkmcal.mechanisms import Machine, load_mechanism
 
-Kind = Literal["design", "calibration", "rods"]
-MIDDLE = np.array([0.0, 0.0, -0.45])
-HALF = np.array([0.1, 0.1, 0.075, np.radians(20.0)])
+H4ModelKind = Literal["design", "calibration", "rods"]
+MEASURED_VOLUME_MIDDLE = np.array([0.0, 0.0, -0.45])
+MEASURED_VOLUME_HALF = np.array([0.1, 0.1, 0.075, np.radians(20.0)])
 """Half of the measured volume ([C] IV.A), m and rad."""
 ROD_DRAWING = 1e-3, 0.035
 """Tolerances of lengths (m) and angles (rad, 2 degrees) of the machine with rods, which needs a
 drawing: about 59 of its parameters are better known than by this one."""
-SIGNS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+NACELLE_CORNER_SIGNS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 """(s, t) of the nacelle's four corners, errata [C]."""
-CAMERA = look_at(np.array([0.03, -0.02, 0.15]), MIDDLE, np.array([1.0, 0.0, 0.0]))
+PAPER_C_CAMERA_POSE = look_at(
+    np.array([0.03, -0.02, 0.15]), MEASURED_VOLUME_MIDDLE, np.array([1.0, 0.0, 0.0])
+)
 """T_camera_base: about along the axis of rotation, [C] III.C."""
-BOARD = pose(rotation(np.array([3.05, 0.05, 0.08])), np.array([0.04, -0.03, 0.03]))
+PAPER_C_BOARD_POSE = pose(rotation(np.array([3.05, 0.05, 0.08])), np.array([0.04, -0.03, 0.03]))
 """T_platform_board."""
 
 
@@ -44,7 +46,7 @@ class Table2(NamedTuple):
 
 
 A_PRIORI = Table2(0.06, 0.26, 0.14, 0.48, (0, 3.1416, 4.7124, 4.7124), (0, 0, 0, 0))
-IDENTIFIED = Table2(
+IDENTIFIED_TABLE_2 = Table2(
     0.0610, 0.26, 0.1413, 0.4876,
     (-0.0015, 3.1016, 4.6807, 4.6859), (-0.0662, -0.0080, -0.0476, -0.0561),
 )  # fmt: skip
@@ -61,7 +63,7 @@ class Deviations(NamedTuple):
 
 
 @cache
-def model(kind: Kind) -> Machine:
+def model(kind: H4ModelKind) -> Machine:
     """The catalogue's H4 with one of its models; of rods, drawn as well as ROD_DRAWING says."""
     machine = load_mechanism("h4", model=kind)
     if kind != "rods":
@@ -76,7 +78,7 @@ def table_2_values(machine: Machine, table: Table2) -> Array:
     """Parameters (P,) of the H4 with a column of Table 2; Q = q - q0, so ``angle`` is -q0."""
     names = machine.parameters.index
     out = machine.parameters.drawing.copy()
-    for j, (s, _) in enumerate(SIGNS):
+    for j, (s, _) in enumerate(NACELLE_CORNER_SIGNS):
         leg, alpha = f"legs[{j + 1}]", table.alpha[j]
         out[names(f"{leg}.platform.hinge.x")] = s * table.h
         out[names(f"{leg}.base.center.x")] = s * table.h
@@ -96,7 +98,7 @@ def table_2_of(machine: Machine, theta: Array) -> Array:
     def of(name: str) -> Array:
         return theta[..., index(name)]
 
-    legs = [f"legs[{j + 1}]" for j in range(len(SIGNS))]
+    legs = [f"legs[{j + 1}]" for j in range(len(NACELLE_CORNER_SIGNS))]
     fields = ("platform.hinge.x", "base.arm", "base.radial", "length.constant")
     alpha = [np.arctan2(-of(f"{p}.base.axis.x"), of(f"{p}.base.axis.y")) for p in legs]
     wrapped = [np.mod(a + 0.5, 2 * np.pi) - 0.5 for a in alpha]
@@ -104,12 +106,12 @@ def table_2_of(machine: Machine, theta: Array) -> Array:
     return np.stack([*sizes, *wrapped, *(-of(f"{p}.base.angle") for p in legs)], axis=-1)
 
 
-def true_values(kind: Kind, off: Deviations, runs: int, rng: np.random.Generator) -> Array:
+def true_values(kind: H4ModelKind, off: Deviations, runs: int, rng: np.random.Generator) -> Array:
     """True parameters (B, P) of the model of that kind."""
     machine = model(kind)
     table = machine.parameters
     if kind == "design":
-        return np.tile(table_2_values(machine, IDENTIFIED), (runs, 1))
+        return np.tile(table_2_values(machine, IDENTIFIED_TABLE_2), (runs, 1))
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
     sigma = np.select([kinds == "axis", kinds == "angle"], [off.axis, 0.0], off.length)
     if kind == "rods":  # hinges and bars true: but for their rods, forearms are parallelograms
@@ -118,7 +120,7 @@ def true_values(kind: Kind, off: Deviations, runs: int, rng: np.random.Generator
         sigma = np.where(still, 0.0, sigma)
     values = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
     for leg, motor in enumerate(machine.layout.actuated, start=1):
-        values[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED.q0[motor]
+        values[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
     return _paired(machine, values, off.rods, rng) if kind == "rods" else values
 
 
@@ -142,14 +144,14 @@ def schoenflies(x: Array) -> Array:
     return pose(rotation(turn), x[..., :3])
 
 
-def grid() -> Array:
+def measured_volume_grid() -> Array:
     """The 81 poses of [C] IV.A, (81, 4, 4)."""
-    steps = [np.linspace(-half, half, 3) for half in HALF]
+    steps = [np.linspace(-half, half, 3) for half in MEASURED_VOLUME_HALF]
     x = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 4)
-    return schoenflies(x + np.append(MIDDLE, 0.0))
+    return schoenflies(x + np.append(MEASURED_VOLUME_MIDDLE, 0.0))
 
 
 def workspace(count: int, rng: np.random.Generator, larger: float = 1.0) -> Array:
     """Random poses (count, 4, 4) in the measured volume, or in a larger one about its middle."""
-    x = larger * HALF * rng.uniform(-1, 1, (count, 4))
-    return schoenflies(x + np.append(MIDDLE, 0.0))
+    x = larger * MEASURED_VOLUME_HALF * rng.uniform(-1, 1, (count, 4))
+    return schoenflies(x + np.append(MEASURED_VOLUME_MIDDLE, 0.0))

@@ -11,58 +11,58 @@ from pkmcal.outcome import Outcome, Row, Table
 from pkmcal.pages.plots import bars, plane, trace
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
-    AXIS,
-    BOUND,
-    DRAWING,
-    EQ3,
-    EQ5,
-    JOINT,
-    LARGER,
-    PLAN,
-    WHITENED,
+    EQ3_AS_PRINTED,
+    EQ5_AS_PRINTED,
+    EQ5_WHITENED,
+    LARGER_WORKSPACE_FACTOR,
+    METHODS_BY_TRUTH,
+    PAPER_C_BOUND,
+    PAPER_C_DRAWING,
+    PAPER_C_JOINT,
+    ROTATION_AXIS_METHOD,
     H4ByBoard,
     largest_side,
     ranks,
 )
 from pkmcal.studies.paper_c_expected import (
-    BEFORE,
-    LABELS,
-    MODELS,
-    PROTOTYPE,
-    SPREAD,
+    NACELLE_ERROR_BEFORE,
+    PAPER_C_METHOD_LABELS,
+    PAPER_C_MODEL_LABELS,
+    PAPER_C_PROTOTYPE,
+    ROTATION_AXIS_SPREAD,
     SQUARE_AFTER,
     SQUARE_BEFORE,
     TABLE_3,
     TABLE_4,
-    TRUTHS,
-    checks,
-    figures_compared,
+    TRUE_MACHINE_HEADINGS,
+    paper_c_checks,
+    paper_c_figures,
 )
-from pkmcal.studies.paper_c_machine import A_PRIORI, IDENTIFIED
+from pkmcal.studies.paper_c_machine import A_PRIORI, IDENTIFIED_TABLE_2
 from pkmcal.studies.paper_c_validation import Before, before
 from pkmcal.studies.reproduction import Column, Options, Words, accuracy_rows, deg, mm
-from pkmcal.studies.statistics import each_rms, ratio, rms
+from pkmcal.studies.statistics import each_rms, ratio_of_figures, rms_over_runs
 from pkmcal.wording import number
 
-ANGLES = ("α₁", "α₂", "α₃", "α₄", "q₀₁", "q₀₂", "q₀₃", "q₀₄")
-REMARKS = ("models", "floor", "axis", "apart")
+TABLE_2_ANGLE_HEADS = ("α₁", "α₂", "α₃", "α₄", "q₀₁", "q₀₂", "q₀₃", "q₀₄")
+PAPER_C_REMARKS = ("models", "floor", "axis", "apart")
 """The last where there is something to tell."""
-VALIDATED = (
-    ("Before", ("design", DRAWING), "before"),
-    ("Model 12, eq. 3", ("design", EQ3), "design"),
-    ("Model 31, eq. 5", ("calibration", EQ5), "calibration"),
+VALIDATION_TABLE_ROWS = (
+    ("Before", ("design", PAPER_C_DRAWING), "before"),
+    ("Model 12, eq. 3", ("design", EQ3_AS_PRINTED), "design"),
+    ("Model 31, eq. 5", ("calibration", EQ5_AS_PRINTED), "calibration"),
 )
 """Rows of Tables 3 and 4: their name, model and method, and which of the paper's."""
 
-Found = StudyResult[H4ByBoard]
+H4ByBoardStudy = StudyResult[H4ByBoard]
 
 
 def reproduce(options: Options) -> Outcome:
     """The whole reproduction."""
-    return reproduced(run(H4ByBoard(), options.runs, options.seed, options.told))
+    return paper_c_outcome(run(H4ByBoard(), options.runs, options.seed, options.told))
 
 
-def reproduced(found: Found) -> Outcome:
+def paper_c_outcome(found: H4ByBoardStudy) -> Outcome:
     """The reproduction that a study gives."""
     start = before()
     words = _words(found, start)
@@ -80,7 +80,14 @@ def reproduced(found: Found) -> Outcome:
                     "Mean error with the a priori parameters",
                     ("", "mm", "rad"),
                     (
-                        Row("The paper", (mm(BEFORE.shift, 0), number(BEFORE.turn, 3)), "paper"),
+                        Row(
+                            "The paper",
+                            (
+                                mm(NACELLE_ERROR_BEFORE.shift, 0),
+                                number(NACELLE_ERROR_BEFORE.turn, 3),
+                            ),
+                            "paper",
+                        ),
                         Row("Found", (mm(start.shift, 1), number(start.turn, 4))),
                     ),
                 ),
@@ -93,25 +100,30 @@ def reproduced(found: Found) -> Outcome:
             words.part("ranks", _ranks_table(found)),
             words.part("how"),
         ),
-        checks=checks(found, start),
-        remarks=[name for name in REMARKS if words.values.get(name, True)],
+        checks=paper_c_checks(found, start),
+        remarks=[name for name in PAPER_C_REMARKS if words.values.get(name, True)],
         numbers=_numbers(found, start),
     )
 
 
-def _words(s: Found, start: Before) -> Words:
+def _words(s: H4ByBoardStudy, start: Before) -> Words:
     """All that is said, with the figures that it names; what is apart from the prototype, too."""
-    apart = [f for f in figures_compared(s) if not f.held and not f.tolerable]
+    apart = [f for f in paper_c_figures(s) if not f.held and not f.tolerable]
     right, setting = ("calibration", "calibration"), s.setting
     return Words.of(
         "c",
         s,
         before_mm=1e3 * start.shift,
         before_rad=start.turn,
-        over_bound=ratio(*(s.of(*right, m)["larger_shift"] for m in (JOINT, BOUND))).value,
-        line=1e3 * rms(s.values("straightness", "design", "calibration", EQ5)[:, :2]).value,
+        over_bound=ratio_of_figures(
+            *(s.of(*right, m)["larger_shift"] for m in (PAPER_C_JOINT, PAPER_C_BOUND))
+        ).value,
+        line=1e3
+        * rms_over_runs(
+            s.values("straightness", "design", "calibration", EQ5_AS_PRINTED)[:, :2]
+        ).value,
         apart="; ".join(f"{f.name} {f.found.value:.3g} for {f.expected:g} {f.unit}" for f in apart),
-        larger=LARGER,
+        larger=LARGER_WORKSPACE_FACTOR,
         noise_mm=1e3 * setting.shift,
         noise_deg=float(np.degrees(setting.turn)),
         noise_urad=1e6 * setting.joint_noise,
@@ -123,7 +135,7 @@ def _words(s: Found, start: Before) -> Words:
 # ------------------------------------------------------------------ tables
 
 
-def _accuracy_tables(s: Found) -> list[Table]:
+def _accuracy_tables(s: H4ByBoardStudy) -> list[Table]:
     """Every estimator's error over the workspace, beside the prototype's."""
     columns = [
         *(Column(name, 3, 3) for name in ("shift", "turn", "larger_shift", "larger_turn")),
@@ -132,25 +144,30 @@ def _accuracy_tables(s: Found) -> list[Table]:
     heads = ("", "mm", "mrad", "mm*", "mrad*", "χ²")
     note = "* over a workspace a quarter larger; χ² per degree of freedom."
     out: list[Table] = []
-    for kind, models in PLAN.items():
+    for kind, models in METHODS_BY_TRUTH.items():
         rows: list[Row] = []
         for name, methods in models.items():
             for method in methods:
-                key, title = (kind, name, method), f"{MODELS[name]}, {LABELS[method]}"
-                rows += accuracy_rows(s, key, title, columns, PROTOTYPE.get(key), errors=False)
-        out.append(Table(TRUTHS[kind], heads, tuple(rows), note))
+                key, title = (
+                    (kind, name, method),
+                    f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}",
+                )
+                rows += accuracy_rows(
+                    s, key, title, columns, PAPER_C_PROTOTYPE.get(key), errors=False
+                )
+        out.append(Table(TRUE_MACHINE_HEADINGS[kind], heads, tuple(rows), note))
     return out
 
 
-def _tables_2(s: Found) -> tuple[Table, Table]:
+def _tables_2(s: H4ByBoardStudy) -> tuple[Table, Table]:
     """[C] Table 2: sizes and angles."""
     printed = [
         (name, np.array([t.h, t.arm, t.radius, t.rod, *t.alpha, *t.q0]))
-        for name, t in (("a priori", A_PRIORI), ("identified", IDENTIFIED))
+        for name, t in (("a priori", A_PRIORI), ("identified", IDENTIFIED_TABLE_2))
     ]
     equation, best = (
         (name, s.values("table_2", "design", "design", method))
-        for name, method in (("equation 3", EQ3), ("joint estimate", JOINT))
+        for name, method in (("equation 3", EQ3_AS_PRINTED), ("joint estimate", PAPER_C_JOINT))
     )
 
     def rows(of: slice, places: int, *found: tuple[str, Array]) -> tuple[Row, ...]:
@@ -167,26 +184,26 @@ def _tables_2(s: Found) -> tuple[Table, Table]:
     sizes, angles = rows(slice(4), 5, equation, best), rows(slice(4, None), 4, equation)
     return (
         Table("Table 2: sizes, m", ("", "h", "arm", "R", "forearm"), sizes),
-        Table("Table 2: angles, rad", ("", *ANGLES), angles, brief=False),
+        Table("Table 2: angles, rad", ("", *TABLE_2_ANGLE_HEADS), angles, brief=False),
     )
 
 
-def _control_mean(s: Found, model_and_method: tuple[str, str]) -> Array:
+def _control_mean(s: H4ByBoardStudy, model_and_method: tuple[str, str]) -> Array:
     """Means (4,) of the motors' residuals; after a calibration they have no sign of their own, so
     their root mean square over the runs.
     """
     found = s.values("control_mean", "design", *model_and_method)
-    return found.mean(axis=0) if model_and_method[1] == DRAWING else each_rms(found)
+    return found.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(found)
 
 
-def _table_3(s: Found) -> Table:
+def _table_3(s: H4ByBoardStudy) -> Table:
     """[C] Table 3."""
 
     def two_digits(values: Any) -> tuple[str, ...]:
         return tuple(f"{1e3 * v:.2g}".replace("-", "\N{MINUS SIGN}") for v in values)
 
     rows: list[Row] = []
-    for label, which, key in VALIDATED:
+    for label, which, key in VALIDATION_TABLE_ROWS:
         ours = (_control_mean(s, which), each_rms(s.values("control_rms", "design", *which)))
         for what, paper, found in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
             rows.append(Row(f"{label}, {what}: the paper", two_digits(paper), "paper"))
@@ -195,10 +212,13 @@ def _table_3(s: Found) -> Table:
     return Table("Table 3: residuals of the motors, mrad", heads, tuple(rows))
 
 
-def _table_4(s: Found) -> Table:
+def _table_4(s: H4ByBoardStudy) -> Table:
     """[C] Table 4."""
     rows: list[Row] = []
-    for label, which, key in (*VALIDATED, ("Model 31, joint", ("calibration", JOINT), "")):
+    for label, which, key in (
+        *VALIDATION_TABLE_ROWS,
+        ("Model 31, joint", ("calibration", PAPER_C_JOINT), ""),
+    ):
         if key:
             one, two = TABLE_4[key]
             rows.append(Row(f"{label}: the paper", (mm(one, 2), mm(two, 2), "", ""), "paper"))
@@ -213,35 +233,45 @@ def _table_4(s: Found) -> Table:
     )
 
 
-def _square_table(s: Found) -> Table:
+def _square_table(s: H4ByBoardStudy) -> Table:
     """[C] IV.D."""
-    old = mm(largest_side(s, ("design", DRAWING)), 2)
+    old = mm(largest_side(s, ("design", PAPER_C_DRAWING)), 2)
     rows = [Row("The paper", (mm(SQUARE_BEFORE, 0), f"< {1e3 * SQUARE_AFTER:g}"), "paper")]
-    rows += [Row(label, (old, mm(largest_side(s, which)))) for label, which, _ in VALIDATED[1:]]
+    rows += [
+        Row(label, (old, mm(largest_side(s, which))))
+        for label, which, _ in VALIDATION_TABLE_ROWS[1:]
+    ]
     heads = ("", "before", "after")
     return Table("Largest error of the square's sides, mm", heads, tuple(rows))
 
 
-def _axis_table(s: Found) -> Table:
+def _axis_table(s: H4ByBoardStudy) -> Table:
     """[C] IV.B: the axis of rotation and its spread."""
-    a = s.samples["design", AXIS].values
+    a = s.samples["design", ROTATION_AXIS_METHOD].values
 
     def row(name: str, found: float, noise: float) -> Row:
         return Row(name, (deg(found, 3), deg(noise, 3)))
 
     rows = (
-        Row("The paper, standard deviation", (deg(SPREAD, 2), ""), "paper"),
-        row("Pairs of poses, root mean square", rms(a["spread"]).value, rms(a["expected"]).value),
-        row("Single poses off the axis", rms(a["tilt"]).value, 2**0.5 * s.setting.turn),
+        Row("The paper, standard deviation", (deg(ROTATION_AXIS_SPREAD, 2), ""), "paper"),
+        row(
+            "Pairs of poses, root mean square",
+            rms_over_runs(a["spread"]).value,
+            rms_over_runs(a["expected"]).value,
+        ),
+        row("Single poses off the axis", rms_over_runs(a["tilt"]).value, 2**0.5 * s.setting.turn),
     )
     return Table("Spread of the axis, °", ("", "found", "by noise alone"), rows)
 
 
-def _ranks_table(s: Found) -> Table:
+def _ranks_table(s: H4ByBoardStudy) -> Table:
     """[C] III.C: what can be identified."""
     unknowns = {"design": 24, "calibration": 46}
     rows = [
-        Row(f"{MODELS[name]}, {LABELS[method]}", (str(unknowns[name]), str(rank), str(count)))
+        Row(
+            f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}",
+            (str(unknowns[name]), str(rank), str(count)),
+        )
         for (name, method), (rank, count) in ranks(s).items()
     ]
     return Table("Ranks", ("", "unknowns", "rank", "estimated"), tuple(rows))
@@ -250,7 +280,7 @@ def _ranks_table(s: Found) -> Table:
 # ------------------------------------------------------------------ plots
 
 
-def _accuracy_plot(s: Found) -> dict[str, Any]:
+def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
     """The tool's error over the larger workspace by truth, model and method, mm; the prototype's
     beside it, whose workspace fits that one.
     """
@@ -258,18 +288,20 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
     places: list[int] = []
     labels: list[str] = []
     printed: dict[int, float] = {}
-    for kind, models in PLAN.items():
+    for kind, models in METHODS_BY_TRUTH.items():
         errors: dict[int, float] = {}
         for name, method in ((name, m) for name, methods in models.items() for m in methods):
             place = len(labels) + len(data)  # a gap between machines
-            labels.append(f"{MODELS[name]}, {LABELS[method]}")
+            labels.append(f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}")
             places.append(place)
             errors[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
-            known = PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+            known = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
             if known:
                 printed[place] = float(known)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
-        lying = bars(TRUTHS[kind], errors.values(), errors, color=colour)  # so names can be read
+        lying = bars(
+            TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour
+        )  # so names can be read
         data.append({**lying, "orientation": "h", "width": 0.8})
     marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
     data.append(
@@ -286,12 +318,12 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _residual_plot(s: Found) -> dict[str, Any]:
+def _residual_plot(s: H4ByBoardStudy) -> dict[str, Any]:
     """[C] Table 3 after the calibration: root mean square residuals of the motors, mrad."""
     data: list[dict[str, Any]] = []
     colours = {"design": "--drawing", "calibration": "--calibrated"}
     motors = [f"q{sign}" for sign in "₁₂₃₄"]
-    for label, which, key in VALIDATED[1:]:
+    for label, which, key in VALIDATION_TABLE_ROWS[1:]:
         ours = 1e3 * each_rms(s.values("control_rms", "design", *which))
         paper = 1e3 * np.array(TABLE_3[key][1])
         data += [
@@ -306,14 +338,14 @@ def _residual_plot(s: Found) -> dict[str, Any]:
 # ------------------------------------------------------------------ for programs
 
 
-def _numbers(s: Found, start: Before) -> dict[str, Any]:
+def _numbers(s: H4ByBoardStudy, start: Before) -> dict[str, Any]:
     """Everything for programs, m and rad."""
-    axis = s.samples["design", AXIS].values
+    axis = s.samples["design", ROTATION_AXIS_METHOD].values
     validated = [
         (name, method)
-        for name, methods in PLAN["design"].items()
+        for name, methods in METHODS_BY_TRUTH["design"].items()
         for method in methods
-        if method != BOUND
+        if method != PAPER_C_BOUND
     ]
     return {
         "runs": s.runs,
@@ -321,14 +353,14 @@ def _numbers(s: Found, start: Before) -> dict[str, Any]:
         "seconds": {"wall": s.wall, "workers": s.workers},
         "before": start._asdict(),
         "paper": {
-            "before": BEFORE._asdict(),
+            "before": NACELLE_ERROR_BEFORE._asdict(),
             "table_3": {k: {"mean": v[0], "rms": v[1]} for k, v in TABLE_3.items()},
             "table_4": TABLE_4,
             "square": {"before": SQUARE_BEFORE, "after": SQUARE_AFTER},
         },
         "accuracy": [
             _accuracy(s, kind, name, method)
-            for kind, models in PLAN.items()
+            for kind, models in METHODS_BY_TRUTH.items()
             for name, methods in models.items()
             for method in methods
         ],
@@ -337,7 +369,7 @@ def _numbers(s: Found, start: Before) -> dict[str, Any]:
                 "mean": s.values("table_2", "design", "design", method).mean(axis=0).tolist(),
                 "std": s.values("table_2", "design", "design", method).std(axis=0).tolist(),
             }
-            for method in (EQ3, WHITENED, JOINT)
+            for method in (EQ3_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT)
         },
         "validation": {
             ", ".join(which): {
@@ -349,18 +381,18 @@ def _numbers(s: Found, start: Before) -> dict[str, Any]:
             for which in validated
         },
         "axis": {
-            "spread": rms(axis["spread"]).value,
-            "expected": rms(axis["expected"]).value,
-            "chi2_per_dof": s.of("design", AXIS)["chi2"].value,
+            "spread": rms_over_runs(axis["spread"]).value,
+            "expected": rms_over_runs(axis["expected"]).value,
+            "chi2_per_dof": s.of("design", ROTATION_AXIS_METHOD)["chi2"].value,
         },
         "ranks": {", ".join(key): rank for key, rank in ranks(s).items()},
     }
 
 
-def _accuracy(s: Found, *key: str) -> dict[str, Any]:
+def _accuracy(s: H4ByBoardStudy, *key: str) -> dict[str, Any]:
     """One method's figures, with the prototype's, mm and mrad, where it has any."""
     found = s.of(*key)
-    chi2, printed = found["chi2"].value, PROTOTYPE.get(key)
+    chi2, printed = found["chi2"].value, PAPER_C_PROTOTYPE.get(key)
     figures = [printed.get(name) for name in ("larger_shift", "larger_turn")] if printed else None
     return {
         **dict(zip(("truth", "model", "method"), key, strict=True)),

@@ -13,12 +13,12 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse as inverted
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import forward, inverse
+from pkmcal.mechanisms.kinematics import forward, readings_at_poses
 from pkmcal.papers.measured_platform import taken
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.paper_c_machine import (
-    IDENTIFIED,
-    MIDDLE,
+    IDENTIFIED_TABLE_2,
+    MEASURED_VOLUME_MIDDLE,
     model,
     schoenflies,
     table_2_values,
@@ -26,13 +26,13 @@ from pkmcal.studies.paper_c_machine import (
 )
 from pkmcal.studies.simulated import SimulatedRuns
 
-SIDE = 0.1
+VALIDATION_SQUARE_SIDE = 0.1
 """[C] IV.D: the square's side, m."""
-RULERS = (0.2, 0.4)
+RULED_LINE_LENGTHS = (0.2, 0.4)
 """The ruled line's length, m; the paper does not tell it, and errors grow as its square."""
-RULES = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-POINTS = 21
-POSES = 400
+RULED_LINE_DIRECTIONS = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+RULED_LINE_POINTS = 21
+ERROR_BEFORE_POSES = 400
 """Of the workspace, that the error before is the mean of."""
 
 
@@ -47,7 +47,7 @@ def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Arr
         seen = data.T_camera_board[:, n:]
         poses = inverted(fit.T_camera_base)[:, None] @ seen @ inverted(fit.T_mount)[:, None]
         poses = taken(machine.layout.motion, poses).pose
-    return inverse(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
+    return readings_at_poses(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
 
 
 class Before(NamedTuple):
@@ -60,32 +60,36 @@ class Before(NamedTuple):
 def before() -> Before:
     """The drawing's poses against the true ones at the same readings, in the machine's frame."""
     machine = model("design")
-    poses = workspace(POSES, np.random.default_rng(0))
-    readings = inverse(machine.layout, table_2_values(machine, IDENTIFIED), poses)
+    poses = workspace(ERROR_BEFORE_POSES, np.random.default_rng(0))
+    readings = readings_at_poses(machine.layout, table_2_values(machine, IDENTIFIED_TABLE_2), poses)
     found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
     shift = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
     turn = rotation_vector(found[:, :3, :3] @ poses[:, :3, :3].mT)
     return Before(float(shift.mean()), float(np.linalg.norm(turn, axis=1).mean()))
 
 
-def straightness(
+def straightness_along_rulers(
     machine: Machine, theta: Array, data: SimulatedRuns, rng: np.random.Generator
 ) -> Array:
     """[C] Table 4: root mean square distance (B, 4) of poses along a ruler from their best line.
 
-    Two directions of each of RULERS. The tool is led along the true line; poses come from the
-    readings by the machine (B, P).
+    Two directions of each of RULED_LINE_LENGTHS. The tool is led along the true line; poses come
+    from the readings by the machine (B, P).
     """
     out: list[Array] = []
-    for way in [length * rule for length in RULERS for rule in RULES]:
-        along = np.linspace(-0.5, 0.5, POINTS)[:, None] * way
-        poses = schoenflies(np.concatenate([MIDDLE + along, np.zeros((POINTS, 1))], axis=1))
-        readings = inverse(data.machine.layout, data.theta[:, None], poses)
+    for way in [length * rule for length in RULED_LINE_LENGTHS for rule in RULED_LINE_DIRECTIONS]:
+        along = np.linspace(-0.5, 0.5, RULED_LINE_POINTS)[:, None] * way
+        poses = schoenflies(
+            np.concatenate(
+                [MEASURED_VOLUME_MIDDLE + along, np.zeros((RULED_LINE_POINTS, 1))], axis=1
+            )
+        )
+        readings = readings_at_poses(data.machine.layout, data.theta[:, None], poses)
         readings = readings + data.noise.reading * rng.normal(size=readings.shape)
         found = forward(machine.layout, theta[..., None, :], readings, poses).T_base_platform
         points = found[..., :3, 3]
         s = np.linalg.svd(points - points.mean(axis=-2, keepdims=True), compute_uv=False)
-        out.append(np.sqrt(np.sum(s[..., 1:] ** 2, axis=-1) / POINTS))
+        out.append(np.sqrt(np.sum(s[..., 1:] ** 2, axis=-1) / RULED_LINE_POINTS))
     return np.stack(out, axis=-1)
 
 
@@ -94,10 +98,12 @@ def square(machine: Machine, theta: Array, data: SimulatedRuns) -> Array:
 
     It asks for the corners by its inverse kinematics; the true machine goes where that leads.
     """
-    corners = MIDDLE + SIDE / 2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    corners = MEASURED_VOLUME_MIDDLE + VALIDATION_SQUARE_SIDE / 2 * np.array(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+    )
     poses = schoenflies(np.concatenate([corners, np.zeros((4, 1))], axis=1))
-    readings = inverse(machine.layout, theta[..., None, :], poses)
+    readings = readings_at_poses(machine.layout, theta[..., None, :], poses)
     went = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
     points = went[..., :3, 3]
     sides = np.linalg.norm(np.roll(points, -1, axis=-2) - points, axis=-1)
-    return sides - SIDE
+    return sides - VALIDATION_SQUARE_SIDE

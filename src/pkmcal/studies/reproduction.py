@@ -16,15 +16,15 @@ from typing import Any, NamedTuple
 
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.studies.engine import StudyResult, Told
+from pkmcal.studies.engine import StudyProgress, StudyResult
 from pkmcal.studies.statistics import Summary
-from pkmcal.studies.tasks import Key, Setting
+from pkmcal.studies.tasks import Key, StudySetting
 from pkmcal.wording import brief, count, number
 
-PAPERS = ("a", "b", "c")
+REPRODUCED_PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """A prototype's figures as it prints them, by what was estimated how and by quantity."""
-ASIDE = ", its Monte-Carlo error aside"
+MONTE_CARLO_ASIDE = ", its Monte-Carlo error aside"
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class Options:
     seed: int = 0
     long: bool = False
     photographs: bool = False
-    told: Told = lambda _text, _share: None
+    told: StudyProgress = lambda _text, _share: None
 
-    def within(self, first: float, last: float) -> Told:
+    def within(self, first: float, last: float) -> StudyProgress:
         """The same telling, of a part of the work."""
         return lambda text, share: self.told(text, first + (last - first) * share)
 
 
-def reproduce(paper: str, options: Options) -> Outcome:
+def reproduce_paper(paper: str, options: Options) -> Outcome:
     """One paper's figures beside ours. paper : its letter, small."""
     found: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
     if found.verdict.usable or options.runs >= Options.runs:
@@ -57,7 +57,7 @@ def reproduce(paper: str, options: Options) -> Outcome:
     return replace(found, verdict=replace(found.verdict, advice=advice))
 
 
-class Shown(float):
+class ShownNumber(float):
     """A number in a text: ``{:3}`` with three decimals, ``{:~}`` with two digits."""
 
     def __format__(self, spec: str) -> str:
@@ -88,8 +88,8 @@ class Words:
             for key, accuracy in study.accuracy.items()
         }
         known: dict[str, Any] = {
-            "found": {m: {q: Shown(s.value) for q, s in a.items()} for m, a in shown.items()},
-            "error": {m: {q: Shown(s.error) for q, s in a.items()} for m, a in shown.items()},
+            "found": {m: {q: ShownNumber(s.value) for q, s in a.items()} for m, a in shown.items()},
+            "error": {m: {q: ShownNumber(s.error) for q, s in a.items()} for m, a in shown.items()},
             "setting": study.setting,
             "runs": study.runs,
             "seed": study.seed,
@@ -97,7 +97,7 @@ class Words:
         }
         times = {"wall": study.wall, "solving": study.solving, "cpu": study.cpu}
         for name, value in {**times, **values}.items():
-            known[name] = Shown(value) if isinstance(value, float) else value
+            known[name] = ShownNumber(value) if isinstance(value, float) else value
         document = read_yaml(Path(__file__).with_name(f"paper_{letter}.yaml")).data
         return cls(letter, document, known)
 
@@ -193,7 +193,7 @@ def accuracy_rows(
     """One method's figures in the quantities' units, their Monte-Carlo errors where asked for, and
     what an independent prototype ``printed``.
     """
-    setting: Setting = study.setting
+    setting: StudySetting = study.setting
     found = [
         (column, study.accuracy[key][column.quantity].times(quantity.factor))
         for column in columns
@@ -289,7 +289,7 @@ def at_most(what: str, unit: str, found: Summary, most: float, places: int) -> C
     return Check(
         what,
         f"{number(found.value, places)} ± {number(found.error, places)}{space}{unit}",
-        f"≤ {most:g}{space}{unit}{ASIDE}",
+        f"≤ {most:g}{space}{unit}{MONTE_CARLO_ASIDE}",
         found.value - 2 * found.error <= most,
     )
 

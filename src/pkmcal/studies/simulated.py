@@ -78,7 +78,7 @@ def spread_evenly(rng: np.random.Generator, shape: tuple[int, ...], sigma: float
     return rng.uniform(-1, 1, shape) * np.sqrt(3) * sigma
 
 
-def simulate(
+def simulate_runs(
     machine: Machine,
     theta: Array,
     readings: Array,

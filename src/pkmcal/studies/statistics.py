@@ -32,7 +32,7 @@ def mean(values: Array) -> Summary:
     return Summary(float(values.mean()), float(values.std() / np.sqrt(len(values))))
 
 
-def rms(errors: Array) -> Summary:
+def rms_over_runs(errors: Array) -> Summary:
     """Root mean square over runs, and over coordinates where a run has several."""
     squares = np.square(errors).reshape(len(errors), -1).mean(axis=1)
     value = float(np.sqrt(squares.mean()))
@@ -45,7 +45,7 @@ def each_rms(errors: Array) -> Array:
     return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
-def ratio(found: Summary, bound: Summary) -> Summary:
+def ratio_of_figures(found: Summary, bound: Summary) -> Summary:
     """One figure over another, as if their errors were independent."""
     value = found.value / bound.value
     return Summary(value, value * float(np.hypot(found.error / found.value,
@@ -64,4 +64,7 @@ def covered(errors: Array, sigma: Array, share: float = 0.95) -> Array:
     return np.sum(inside, axis=axes) / np.maximum(np.sum(known, axis=axes), 1)
 
 
-STATISTICS: Mapping[Statistic, Callable[[Array], Summary]] = {"rms": rms, "mean": mean}
+SUMMARIES_BY_STATISTIC: Mapping[Statistic, Callable[[Array], Summary]] = {
+    "rms": rms_over_runs,
+    "mean": mean,
+}

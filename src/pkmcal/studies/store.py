@@ -25,13 +25,13 @@ from pkmcal.arrays import Array
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.files import alone_in, check_regular, json_text, plain, write_bytes, write_text
+from pkmcal.files import alone_in, check_regular, json_text, json_value, write_bytes, write_text
 from pkmcal.mechanisms import Machine
-from pkmcal.studies.tasks import Batch, Done, Key, Sample, Setting
+from pkmcal.studies.tasks import Batch, Key, Sample, SolvedBatch, StudySetting
 
-FOLDER = "batches"
-DESCRIPTION = "study.json"
-SEPARATOR = "/"
+BATCHES_FOLDER = "batches"
+STUDY_DESCRIPTION_FILE = "study.json"
+ARRAY_NAME_SEPARATOR = "/"
 """Between what names an array in a batch's file."""
 
 
@@ -44,15 +44,15 @@ class Store:
     @classmethod
     @contextmanager
     def opened(
-        cls, out: Path, told: str, settings: Sequence[Setting], seed: int
+        cls, out: Path, told: str, settings: Sequence[StudySetting], seed: int
     ) -> Generator[Store]:
         """The store in a results folder, made or found there, for this process alone.
 
         told : the study in words. Raises InputError where it holds finished batches of another
         study, and while another process works in it.
         """
-        folder = out / FOLDER
-        path = folder / DESCRIPTION
+        folder = out / BATCHES_FOLDER
+        path = folder / STUDY_DESCRIPTION_FILE
         own = {"study": told, "seed": seed, "pkmcal": version("pkmcal")}
         own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
         with alone_in(folder, "study"):
@@ -72,7 +72,7 @@ class Store:
                 left.unlink(missing_ok=True)
             yield cls(folder)
 
-    def load(self, cell: int, number: int, batch: Batch) -> Done | None:
+    def load(self, cell: int, number: int, batch: Batch) -> SolvedBatch | None:
         """A finished batch; None where it is still to be done, or has another number of runs."""
         try:
             path = self._path(cell, number)
@@ -87,15 +87,17 @@ class Store:
             return None
         parts: dict[Key, dict[str, dict[str, Array]]] = {}
         for name, array in arrays.items():
-            *key, kind, quantity = name.split(SEPARATOR)
+            *key, kind, quantity = name.split(ARRAY_NAME_SEPARATOR)
             own = parts.setdefault(tuple(key), {"values": {}, "sigma": {}})
             own[kind][quantity] = array
-        return Done({key: Sample(p["values"], p["sigma"]) for key, p in parts.items()}, wall, cpu)
+        return SolvedBatch(
+            {key: Sample(p["values"], p["sigma"]) for key, p in parts.items()}, wall, cpu
+        )
 
-    def save(self, cell: int, number: int, done: Done) -> None:
+    def save(self, cell: int, number: int, done: SolvedBatch) -> None:
         """Keep a batch."""
         arrays = {
-            SEPARATOR.join((*key, kind, quantity)): array
+            ARRAY_NAME_SEPARATOR.join((*key, kind, quantity)): array
             for key, sample in done.samples.items()
             for kind, those in (("values", sample.values), ("sigma", sample.sigma))
             for quantity, array in those.items()
@@ -118,9 +120,9 @@ def digest(settings: Any, seed: int) -> str:
 def plainly(value: Any) -> Any:
     """A setting as plain data: all that its numbers depend on."""
     if isinstance(value, Machine):
-        return {"machine": plain(value.to_document()), "model": list(value.parameters.fixed)}
+        return {"machine": json_value(value.to_document()), "model": list(value.parameters.fixed)}
     if isinstance(value, Camera | Board):
-        return plain(value.document() if isinstance(value, Camera) else value.document)
+        return json_value(value.document() if isinstance(value, Camera) else value.document)
     if is_dataclass(value):
         own = {field.name: plainly(getattr(value, field.name)) for field in fields(value)}
         return {"kind": type(value).__name__, **own}
@@ -128,7 +130,7 @@ def plainly(value: Any) -> Any:
         return {str(key): plainly(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plainly(item) for item in value]
-    return plain(value)
+    return json_value(value)
 
 
 def _description(path: Path) -> dict[str, Any]:

@@ -15,10 +15,17 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict, note
 from pkmcal.pages.plots import plane, trace
-from pkmcal.studies.calibrations import ESTIMATE
+from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.engine import StudyResult
-from pkmcal.studies.findings import HELD, PROMISE, SHARES, CellFindings, Gain, SweepResult
-from pkmcal.studies.sweep import Setting, Value, in_words
+from pkmcal.studies.findings import (
+    COVERAGE_INTERVALS,
+    COVERAGE_TOLERANCE,
+    PROMISED_COVERAGE,
+    CellFindings,
+    Gain,
+    SweepResult,
+)
+from pkmcal.studies.sweep import SweptSetting, Value, in_words
 from pkmcal.wording import amount, brief, count, decimals, number
 
 MOST_LINES = 8
@@ -27,7 +34,7 @@ MOST_TICKS = 8
 """Values that an axis names; of more, as many as it chooses."""
 MANY_FAILED = 0.1
 """Share of failed runs from which a combination is named."""
-HOW = (
+STUDY_METHOD_TEXT = (
     "Each run draws a machine from the drawing's tolerances, measures it with the noise that is"
     " stated, and calibrates it as pkmcal calibrate does: from the drawing, robust, with the scale"
     " of the noise and the tubes' shading found from the data. Some runs share a plan of stations"
@@ -39,7 +46,7 @@ HOW = (
     " decided by the drawing. Not simulated are wrong edges, other things in the picture, bending,"
     " play and errors of the lens: these cost accuracy, and no simulation knows how much.",
 )
-HOW_PAPER = (
+PAPER_STUDY_METHOD_TEXT = (
     "Each run draws a hexapod, measures the axes of its legs with the noise of [A] Table 1, and"
     " calibrates it by the joint estimate from the corrected four steps, without the drawing as"
     " knowledge. The tool's error is that of the platform's pose at ten random readings, in frames"
@@ -70,11 +77,15 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
         parts=(
             Part("accuracy", "Accuracy", tables=(_table(study),), plots=_curves(study)),
             _honesty(study),
-            Part("how", "How it was found", text=HOW_PAPER if paper else HOW),
+            Part(
+                "how",
+                "How it was found",
+                text=PAPER_STUDY_METHOD_TEXT if paper else STUDY_METHOD_TEXT,
+            ),
         ),
         findings=tuple(note(text) for text in study.subject.warnings),
         closing=f"{count(study.runs * len(study.found), 'run')} in {seconds}.",
-        document=document_of(study),
+        document=study_document(study),
         texts={table: runs_bytes(study, table)},
     )
 
@@ -108,7 +119,8 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     gain = sure[0]
     return (
         f"{text} Most is gained by {_name(gain.name)}: from"
-        f" {shown(study, gain.name, gain.worst)} to {shown(study, gain.name, gain.best)} the tool's"
+        f" {value_with_unit(study, gain.name, gain.worst)} to"
+        f" {value_with_unit(study, gain.name, gain.best)} the tool's"
         f" error falls from {amount(gain.before, 'm')} to {amount(gain.after, 'm')}"
         f" ({brief(gain.times)} times)."
     )
@@ -119,7 +131,7 @@ def _reason(cell: CellFindings) -> str:
     tool, own = 100 * cell.covered_tool.value, 100 * cell.covered.value
     return (
         f"{where}95 % intervals hold {own:.1f} % of the parameters and {tool:.1f} % of the tool's"
-        f" poses; {100 * (PROMISE - HELD):.0f} % is the least."
+        f" poses; {100 * (PROMISED_COVERAGE - COVERAGE_TOLERANCE):.0f} % is the least."
     )
 
 
@@ -132,7 +144,7 @@ def _name(name: str) -> str:
     return name.replace("_", " ")
 
 
-def shown(study: SweepResult, name: str, value: Value) -> str:
+def value_with_unit(study: SweepResult, name: str, value: Value) -> str:
     """A value with its unit."""
     unit = study.subject.names[name].unit
     text = value if isinstance(value, str) else f"{value:g}"
@@ -310,10 +322,10 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
 
 def _held(study: SweepResult) -> Plot:
     """Intervals that hold against their promise, all combinations together."""
-    x = 100 * SHARES
+    x = 100 * COVERAGE_INTERVALS
     used = [cell for cell in study.found if np.isfinite(cell.held).all()]
     own, tool = (
-        100 * np.mean(shares, axis=0) if used else np.full(len(SHARES), np.nan)
+        100 * np.mean(shares, axis=0) if used else np.full(len(COVERAGE_INTERVALS), np.nan)
         for shares in ([cell.held for cell in used], [cell.held_tool for cell in used])
     )
     line = {"color": "--quiet", "dash": "dash"}
@@ -336,7 +348,7 @@ def _held(study: SweepResult) -> Plot:
 # ------------------------------------------------------------------ for programs
 
 
-def document_of(study: SweepResult) -> dict[str, Any]:
+def study_document(study: SweepResult) -> dict[str, Any]:
     """Everything for programs, m and rad; nothing of how long it took, so that the same study is
     the same file.
     """
@@ -367,7 +379,7 @@ def _cell(cell: CellFindings) -> dict[str, Any]:
     for name in ("position_95", "orientation_95", "position_sigma", "orientation_sigma", "chi2"):
         out[name] = getattr(cell, name)
     out["intervals"] = {
-        "promised": SHARES, "parameters": cell.held, "tool": cell.held_tool,
+        "promised": COVERAGE_INTERVALS, "parameters": cell.held, "tool": cell.held_tool,
     }  # fmt: skip
     out["covered_by_parameter"] = dict(
         zip(cell.parameters, cell.by_parameter.tolist(), strict=True)
@@ -375,7 +387,7 @@ def _cell(cell: CellFindings) -> dict[str, Any]:
     return out | {"deviations_hold": cell.honest}
 
 
-COLUMNS = (
+RUN_TABLE_COLUMNS = (
     "position", "orientation", "position_sigma", "orientation_sigma", "worst_parameter",
     "worst_parameter_error", "worst_parameter_sigma", "covered", "covered_tool", "chi2", "scale",
     "steps", "failed",
@@ -384,28 +396,30 @@ COLUMNS = (
 
 
 def runs_table(study: SweepResult) -> dict[str, list[Any]]:
-    """One row a run, by column: what is varied, ``run``, then COLUMNS."""
-    out: dict[str, list[Any]] = {name: [] for name in (*study.varied, "run", *COLUMNS)}
+    """One row a run, by column: what is varied, ``run``, then RUN_TABLE_COLUMNS."""
+    out: dict[str, list[Any]] = {name: [] for name in (*study.varied, "run", *RUN_TABLE_COLUMNS)}
     for cell, result in zip(study.cells, study.results, strict=True):
         own = _runs_of(result, [name for name, _ in cell.setting.parameters])
         for name in study.varied:
             out[name] += [cell.values[name]] * study.runs
         out["run"] += list(range(study.runs))
-        for name in COLUMNS:
+        for name in RUN_TABLE_COLUMNS:
             out[name] += own[name]
     return out
 
 
-def _runs_of(result: StudyResult[Setting], names: list[str]) -> dict[str, list[Any]]:
+def _runs_of(result: StudyResult[SweptSetting], names: list[str]) -> dict[str, list[Any]]:
     """Columns of one combination. The worst parameter is that with the largest error in stated
     deviations.
     """
-    sample = result.samples[ESTIMATE]
+    sample = result.samples[JOINT_ESTIMATE_KEY]
     values: Mapping[str, Array] = sample.values
     errors, sigma = values["parameters"], sample.sigma["parameters"]
     worst = np.argmax(np.nan_to_num(np.abs(errors) / sigma), axis=1)
     row = np.arange(len(worst))
-    out: dict[str, list[Any]] = {name: values[name].tolist() for name in COLUMNS if name in values}
+    out: dict[str, list[Any]] = {
+        name: values[name].tolist() for name in RUN_TABLE_COLUMNS if name in values
+    }
     out["worst_parameter"] = [names[k] for k in worst]
     out["worst_parameter_error"] = errors[row, worst].tolist()
     out["worst_parameter_sigma"] = sigma[row, worst].tolist()

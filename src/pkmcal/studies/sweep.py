@@ -31,15 +31,15 @@ from pkmcal.studies.capture import Design
 from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.wording import listed
 
-PAPER = "a"
+STUDIED_PAPER = "a"
 MOST_CELLS = 500
-SIZE = (1024, 768)
+BUILT_IN_CAMERA_SIZE = (1024, 768)
 """Pixels of the built-in cameras."""
 MIRROR_FOCAL, MIRROR_XI = 0.35, 1.0
 """Focal length of the built-in mirror, in the image's height: a parabola shows all to 110 degrees
 from its axis."""
 Value = float | int | str
-Setting = SimulatedCalibrations | JointByAxes
+SweptSetting = SimulatedCalibrations | JointByAxes
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Varied:
     words: tuple[str, ...] = ()
 
 
-NAMES: Mapping[str, Varied] = {
+DESIGN_NAMES_VARIED: Mapping[str, Varied] = {
     "resolution": Varied("width of the photographs", "px", 64, 20000, whole=True),
     "focal": Varied("focal length", "px", 10, 1e6),
     "distance": Varied("from the camera to the machine's middle", "m", 1e-3, 1e3),
@@ -74,7 +74,7 @@ NAMES: Mapping[str, Varied] = {
     "observe": Varied("what is seen", words=("legs", "board", "legs+board")),
     "camera": Varied("pinhole, mirror, or a camera's file", words=("pinhole", "mirror")),
 }
-OF_PAPER: Mapping[str, Varied] = {
+PAPER_NAMES_VARIED: Mapping[str, Varied] = {
     "configurations": Varied("photographs from each place", "", 5, 1000, whole=True),
     "legs": Varied("legs that each camera sees", "", 3, 6, whole=True),
     "axis_noise": Varied("noise of an axis, times Table 1", "", 1e-3, 1e3),
@@ -96,7 +96,7 @@ class StudySubject:
     @property
     def names(self) -> Mapping[str, Varied]:
         """What can be varied."""
-        return OF_PAPER if isinstance(self.design, JointByAxes) else NAMES
+        return PAPER_NAMES_VARIED if isinstance(self.design, JointByAxes) else DESIGN_NAMES_VARIED
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Cell:
     """One combination. values : of what is varied, by name. setting : what is simulated."""
 
     values: Mapping[str, Value]
-    setting: Setting
+    setting: SweptSetting
 
 
 def in_words(values: Mapping[str, Value]) -> str:
@@ -120,7 +120,7 @@ def subject_of(origin: str) -> StudySubject:
 
     Raises InputError where it is none of these.
     """
-    if origin == PAPER:
+    if origin == STUDIED_PAPER:
         return StudySubject("the joint calibration of [A] 4.3", JointByAxes())
     folder = session_folder(origin)
     if folder is not None:
@@ -132,12 +132,12 @@ def subject_of(origin: str) -> StudySubject:
             "there is nothing of this name to study",
             found=origin,
             expected=closest(origin, catalogue())
-            or f"a session's folder, a mechanism file, the paper {PAPER}, or"
+            or f"a session's folder, a mechanism file, the paper {STUDIED_PAPER}, or"
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)
     check_drawable(machine)
-    return StudySubject(machine.name, Design(machine, (camera_of_size(SIZE),)))
+    return StudySubject(machine.name, Design(machine, (camera_of_size(BUILT_IN_CAMERA_SIZE),)))
 
 
 def _of_session(session: Session) -> StudySubject:
@@ -309,13 +309,13 @@ def _design(design: Design, values: Mapping[str, Value]) -> Design:
 def _camera(name: str) -> Camera:
     """A built-in camera, or one of a file."""
     if name == "pinhole":
-        return camera_of_size(SIZE)
+        return camera_of_size(BUILT_IN_CAMERA_SIZE)
     if name == "mirror":
-        width, height = SIZE
+        width, height = BUILT_IN_CAMERA_SIZE
         focal = MIRROR_FOCAL * height
         centre = [(width - 1) / 2, (height - 1) / 2]
         parameters = np.array([focal, focal, *centre, MIRROR_XI, 0.0, 0.0, 0.0, 0.0])
-        return camera_models()["unified"](SIZE, parameters)
+        return camera_models()["unified"](BUILT_IN_CAMERA_SIZE, parameters)
     return load_camera(Path(name))
 
 

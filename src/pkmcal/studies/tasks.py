@@ -1,8 +1,8 @@
 """What a study is made of: settings, batches of runs, and the work on one of them.
 
-A :class:`Setting` says how machines, configurations and measurements are drawn, which estimators
-are tried, and how far off each is. A batch carries the seeds of all that is drawn for it, and
-depends on nothing else, so it may be done anywhere.
+A :class:`StudySetting` says how machines, configurations and measurements are drawn, which
+estimators are tried, and how far off each is. A batch carries the seeds of all that is drawn for
+it, and depends on nothing else, so it may be done anywhere.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Sample:
     sigma: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
 
-class Setting(Protocol):
+class StudySetting(Protocol):
     """What is studied: a frozen dataclass. quantities : those that are summed up over the runs.
     doing : what it does, in words.
     """
@@ -95,12 +95,12 @@ class Setting(Protocol):
 class Job(NamedTuple):
     """One batch of one setting: all that a worker needs. name : what errors say it is."""
 
-    setting: Setting
+    setting: StudySetting
     batch: Batch
     name: str = ""
 
 
-class Done(NamedTuple):
+class SolvedBatch(NamedTuple):
     """A batch's samples, and seconds of its solving: on the clock and of the processor."""
 
     samples: Mapping[Key, Sample]
@@ -108,13 +108,13 @@ class Done(NamedTuple):
     cpu: float
 
 
-Finished = Callable[[int, Done], None]
+Finished = Callable[[int, SolvedBatch], None]
 """Called with a task's number as soon as it is done, from one thread at a time."""
 Runner = Callable[[Sequence[Job], Finished], int]
 """Does all tasks in any order, and returns how many workers it had."""
 
 
-def work(task: Job) -> Done:
+def work(task: Job) -> SolvedBatch:
     """A batch drawn, solved and judged, on one thread."""
     from threadpoolctl import threadpool_limits
 
@@ -126,6 +126,6 @@ def work(task: Job) -> Done:
             began, used = time.perf_counter(), time.thread_time()
             found = setting.solve(batch, data)
             wall, cpu = time.perf_counter() - began, time.thread_time() - used
-            return Done(setting.judge(batch, data, found), wall, cpu)
+            return SolvedBatch(setting.judge(batch, data, found), wall, cpu)
     except PkmcalError as error:
         raise (error.located(task.name) if task.name else error) from None

@@ -22,12 +22,12 @@ from contextlib import suppress
 from typing import IO, Any
 
 from pkmcal.errors import ResultError
-from pkmcal.studies.tasks import Done, Finished, Job, work
+from pkmcal.studies.tasks import Finished, Job, SolvedBatch, work
 
-DEATHS = 3
+MOST_DEATHS_A_BATCH = 3
 """Workers that one batch may cost before the study gives up."""
-SIZE = struct.Struct("<Q")
-POLL = 0.5
+MESSAGE_SIZE_FORMAT = struct.Struct("<Q")
+INTERRUPT_POLL_INTERVAL = 0.5
 """Seconds between looks for Ctrl-C, which some systems do not let through to a waiting thread."""
 
 
@@ -51,7 +51,7 @@ def on_cores(tasks: Sequence[Job], finished: Finished) -> int:
     try:
         for thread in threads:
             while thread.is_alive():
-                thread.join(POLL)
+                thread.join(INTERRUPT_POLL_INTERVAL)
     finally:
         pool.stop()
         for thread in threads:
@@ -96,7 +96,7 @@ class _Pool:
             self.failure = self.failure or error
         self.stop()
 
-    def done(self, number: int, result: Done) -> None:
+    def done(self, number: int, result: SolvedBatch) -> None:
         """Hand on what came of a task."""
         with self.lock:
             self.finished(number, result)
@@ -134,11 +134,11 @@ class _Pool:
         if self.stopped.is_set():
             return None
         self.deaths[number] += 1
-        if self.deaths[number] < DEATHS:
+        if self.deaths[number] < MOST_DEATHS_A_BATCH:
             return number
         raise ResultError(
             "processes that work on the study are killed again and again",
-            found=f"{DEATHS} of them, at one batch",
+            found=f"{MOST_DEATHS_A_BATCH} of them, at one batch",
             next_step="Look whether there is enough memory; what is finished is kept",
         )
 
@@ -193,21 +193,21 @@ def _asked(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
 
 def _send(stream: IO[bytes], message: Any) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    stream.write(SIZE.pack(len(content)) + content)
+    stream.write(MESSAGE_SIZE_FORMAT.pack(len(content)) + content)
     stream.flush()
 
 
 def _received(stream: IO[bytes]) -> bytes | None:
     """The next message; None at the end, and where one breaks off."""
-    head = stream.read(SIZE.size)
-    if len(head) < SIZE.size:
+    head = stream.read(MESSAGE_SIZE_FORMAT.size)
+    if len(head) < MESSAGE_SIZE_FORMAT.size:
         return None
-    (size,) = SIZE.unpack(head)
+    (size,) = MESSAGE_SIZE_FORMAT.unpack(head)
     content = stream.read(size)
     return content if len(content) == size else None
 
 
-def serve(source: IO[bytes], target: IO[bytes]) -> None:
+def answer_tasks(source: IO[bytes], target: IO[bytes]) -> None:
     """Do tasks until their source ends; an error is an answer, too."""
     while (message := _received(source)) is not None:
         try:
@@ -217,13 +217,13 @@ def serve(source: IO[bytes], target: IO[bytes]) -> None:
         _send(target, answer)
 
 
-def main() -> None:
+def run_worker() -> None:
     """A worker's whole life. Ctrl-C is for the study's own process, which then ends this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as target:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is no answer
-        serve(sys.stdin.buffer, target)
+        answer_tasks(sys.stdin.buffer, target)
 
 
 if __name__ == "__main__":
-    main()
+    run_worker()

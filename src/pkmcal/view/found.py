@@ -17,22 +17,22 @@ from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
 from pkmcal.pages.drawn import (
-    CURVE,
-    KEPT,
-    across,
+    EDGE_CURVE_POINTS,
+    KEPT_EDGE_WEIGHT,
     edge_name,
     measured_curves,
+    offsets_across_curves,
     own_edges,
     polyline,
     residual_words,
     straightened,
 )
-from pkmcal.view.overlay import placed
+from pkmcal.view.overlay import placed_by_hand
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Pane, Viewed
 from pkmcal.wording import count, number
 
-SIGMAS = 2.0
+MIDDLE_EDGE_SIGMAS = 2.0
 """Standard deviations, of drawing and search, within which the middle edge has to lie."""
 
 
@@ -48,7 +48,7 @@ def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
     board's corners, and all that in words.
     """
-    pane = placed(viewed, look)
+    pane = placed_by_hand(viewed, look)
     said: list[str] = []
     out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": said, "median": None}
     if "legs" in viewed.station(look.station).observe and len(tubes_of(pane.machine)):
@@ -82,7 +82,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         tip = f"{edge_name(*place).capitalize()}: {shift} px outward"
         quiet = False
         if (of := judged.get(place)) is not None:
-            quiet = of.weight < KEPT
+            quiet = of.weight < KEPT_EDGE_WEIGHT
             tip += f"; {residual_words(of.shift, of.tilt, of.weight)}"
         if place in reasons:
             quiet, tip = True, f"{tip}; {reasons[place]}"
@@ -122,11 +122,11 @@ def _judged(
 
 
 def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
-    """Measured edges as curves (n, CURVE, 2) px, and how far outward (n,) px of the machine's own
-    they lie in the middle.
+    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and how far outward (n,) px of the
+    machine's own they lie in the middle.
     """
     if not len(edges):
-        return np.zeros((0, CURVE, 2)), np.zeros(0)
+        return np.zeros((0, EDGE_CURVE_POINTS, 2)), np.zeros(0)
     machine, one = pane.machine, np.zeros(len(edges), dtype=int)
     pose, joints = pane.T_base_platform[None], pane.joints[None]
     axes = legs_in_camera(machine, pane.T_camera_base, pose, joints)
@@ -137,8 +137,8 @@ def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
     # outward of the leg: away from where its axis is seen
     a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
     axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
-    middle = CURVE // 2
-    normal, off = across(drawn, measured)
+    middle = EDGE_CURVE_POINTS // 2
+    normal, off = offsets_across_curves(drawn, measured)
     outward = np.sign(dot(normal[:, middle], drawn[:, middle] - axis))
     return measured, outward * off[:, middle]
 
@@ -153,7 +153,7 @@ def _missed(
     those of which a part would be in the picture.
     """
     tubes = tubes_of(pane.machine)
-    pixel = _contours(pane, CURVE).pixel
+    pixel = _contours(pane, EDGE_CURVE_POINTS).pixel
     seen = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
     now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
     out: list[dict[str, Any]] = []
@@ -192,7 +192,7 @@ def _words(
     tolerance = pane.machine.document.tolerance.center
     gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
-    near = median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
+    near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     # other things' edges lie near by chance, too, though not most of them
     verdict = "It fits" if near and seen > missed else "It may fit" if near else "It does not fit"
     # the search goes by whole pixels

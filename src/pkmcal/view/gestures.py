@@ -15,14 +15,14 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, pose, rotation
 
-PIN = 2.0
+PINNED_JOINT_SIGMA = 2.0
 """Pixels (standard deviation) to which a hand puts a joint."""
-SPREAD = np.array([*np.full(3, np.radians(6.0)), 0.1, *np.full(2, np.radians(6.0))])
+HAND_POSE_SPREAD = np.array([*np.full(3, np.radians(6.0)), 0.1, *np.full(2, np.radians(6.0))])
 """Standard deviations of a pose by hand about which three joints or more move: aim and roll, the
 distance's share, turns. It only decides what the joints leave open."""
-ROUNDS = 4
+PINNING_ROUNDS = 4
 """Times that the pose by hand is replaced by what was found, so that it pulls at nothing else."""
-LOST = 1e3
+UNSEEN_JOINT_PIXELS = 1e3
 """Pixels by which a joint that has no picture counts as off."""
 
 
@@ -31,7 +31,9 @@ def aimed(camera: Camera, T_camera_base: Array, start: Array, end: Array) -> Arr
     return _about_camera(_shortest(camera, start, end)) @ T_camera_base
 
 
-def turned(camera: Camera, T_camera_base: Array, points: Array, start: Array, end: Array) -> Array:
+def turned_as_ball(
+    camera: Camera, T_camera_base: Array, points: Array, start: Array, end: Array
+) -> Array:
     """The machine turned about its middle as a ball that is rolled by its near side.
 
     points : (n, 3) of the machine, base frame, m; the ball holds them.
@@ -63,10 +65,10 @@ def pinned(
 ) -> Array:
     """The pose that brings joints to their places in photographs of one station.
 
-    points : as :func:`turned`. pins : (n, 3) joint centres, base frame, each as its photograph's
-    configuration has it. pixels : (n, 2). One joint aims the camera; two also roll and bring
-    nearer, both exactly; from three on least squares move all six freedoms, near T_camera_base
-    where the joints leave them open.
+    points : as :func:`turned_as_ball`. pins : (n, 3) joint centres, base frame, each as its
+    photograph's configuration has it. pixels : (n, 2). One joint aims the camera; two also roll and
+    bring nearer, both exactly; from three on least squares move all six freedoms, near
+    T_camera_base where the joints leave them open.
     """
     if len(pins) == 1:
         seen = camera.project(apply(T_camera_base, pins[0]))
@@ -74,17 +76,17 @@ def pinned(
     from scipy.optimize import least_squares
 
     count = 4 if len(pins) == 2 else 6
-    spread = SPREAD[:count]
+    spread = HAND_POSE_SPREAD[:count]
 
     def misfit(moved: Callable[[Array], Array]) -> Callable[[Array], Array]:
         def rows(x: Array) -> Array:
             seen = camera.project(apply(moved(x * spread), pins))
-            off = np.nan_to_num(seen - pixels, nan=LOST).ravel() / PIN
+            off = np.nan_to_num(seen - pixels, nan=UNSEEN_JOINT_PIXELS).ravel() / PINNED_JOINT_SIGMA
             return off if count == 4 else np.concatenate([off, x])
 
         return rows
 
-    for _ in range(1 if count == 4 else ROUNDS):
+    for _ in range(1 if count == 4 else PINNING_ROUNDS):
         moved = _motion(T_camera_base, points)
         with np.errstate(over="ignore"):  # of a pixel that is kilometres away
             x = least_squares(misfit(moved), np.zeros(count)).x

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-NAMES = ("127.0.0.1", "localhost")
-REFUSED = "This page opens with the whole address that pkmcal view printed, token included.\n"
-HEADERS = {
+LOOPBACK_HOST_NAMES = ("127.0.0.1", "localhost")
+REFUSED_REQUEST_TEXT = (
+    "This page opens with the whole address that pkmcal view printed, token included.\n"
+)
+VIEW_RESPONSE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; style-src 'self';"
     " script-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'none'",
@@ -32,7 +34,7 @@ class Guard:
     def __init__(self, app: ASGIApp, token: str, port: int) -> None:
         self._app = app
         self._token = token.encode("ascii")
-        self._hosts = {f"{name}:{port}".encode("ascii") for name in NAMES}
+        self._hosts = {f"{name}:{port}".encode("ascii") for name in LOOPBACK_HOST_NAMES}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As ASGI has it."""
@@ -43,13 +45,13 @@ class Guard:
             await self._app(scope, receive, send)
             return
         if scope["type"] != "http" or not self._allowed(scope):
-            response = PlainTextResponse(REFUSED, 403, HEADERS)
+            response = PlainTextResponse(REFUSED_REQUEST_TEXT, 403, VIEW_RESPONSE_HEADERS)
             await response(scope, receive, send)
             return
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
+                MutableHeaders(scope=message).update(VIEW_RESPONSE_HEADERS)
             await send(message)
 
         await self._app(scope, receive, with_headers)

@@ -8,7 +8,7 @@ from threading import Lock
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import with_numbers, write_bytes
-from pkmcal.session.load import FILE, Station
+from pkmcal.session.load import SESSION_FILE_NAME, Station
 from pkmcal.view.overlay import place_of
 
 
@@ -16,7 +16,7 @@ class PoseFile:
     """session.yaml as it was read when the page was opened, and written since."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = (folder / FILE).resolve()
+        self._path = (folder / SESSION_FILE_NAME).resolve()
         self._known = self._path.read_bytes()
         self._lock = Lock()
 
@@ -30,7 +30,7 @@ class PoseFile:
         if station.handheld:
             raise InputError(
                 "a camera that is held by hand has no one pose to be written",
-                where=f"{FILE}, {'.'.join(keys[:2])}",
+                where=f"{SESSION_FILE_NAME}, {'.'.join(keys[:2])}",
                 next_step="Every such photograph is placed when you calibrate",
             )
         with self._lock:
@@ -47,8 +47,10 @@ class PoseFile:
                     " there once more",
                 )
             entry = place_of(T_camera_base)
-            changed = with_numbers(now.decode("utf-8"), FILE, keys, entry).encode("utf-8")
+            changed = with_numbers(now.decode("utf-8"), SESSION_FILE_NAME, keys, entry).encode(
+                "utf-8"
+            )
             if changed != now:
                 write_bytes(self._path, changed)
             self._known = changed
-        return f"The pose of {station.name} is in {FILE}; nothing else in it changed."
+        return f"The pose of {station.name} is in {SESSION_FILE_NAME}; nothing else in it changed."

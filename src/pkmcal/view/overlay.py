@@ -13,12 +13,12 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.pages.drawn import CURVE, Drawn, laid_over, polyline, straightened
-from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
-from pkmcal.view.requests import LookRequest, pose_of
+from pkmcal.pages.drawn import EDGE_CURVE_POINTS, Drawn, machine_laid_over, polyline, straightened
+from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned_as_ball
+from pkmcal.view.requests import LookRequest, requested_pose
 from pkmcal.view.viewed import Pane, Viewed
 
-DIGITS = 4
+STATION_PLACE_DECIMALS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
 
 
@@ -28,10 +28,10 @@ def pane_of(viewed: Viewed, look: LookRequest) -> Pane:
     return take(look.station, look.photograph)
 
 
-def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+def overlay_after_gesture(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose after the gesture, and what it lays over the photograph, in pixels."""
-    pane = placed(viewed, look)
-    edges, spots = laid_over(
+    pane = placed_by_hand(viewed, look)
+    edges, spots = machine_laid_over(
         pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
     )
     lines = [*edges, *_bare_limbs(pane)]
@@ -62,9 +62,9 @@ def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     }
 
 
-def placed(viewed: Viewed, look: LookRequest) -> Pane:
+def placed_by_hand(viewed: Viewed, look: LookRequest) -> Pane:
     """The same, before the camera as the hand put it there."""
-    pane, T_camera_base = pane_of(viewed, look), pose_of(look)
+    pane, T_camera_base = pane_of(viewed, look), requested_pose(look)
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
@@ -78,7 +78,7 @@ def placed(viewed: Viewed, look: LookRequest) -> Pane:
             case "aim":
                 T_camera_base = aimed(camera, T_camera_base, start, end)
             case "turn":
-                T_camera_base = turned(camera, T_camera_base, points, start, end)
+                T_camera_base = turned_as_ball(camera, T_camera_base, points, start, end)
             case "roll":
                 T_camera_base = rolled(camera, T_camera_base, points, start, end)
             case "distance":
@@ -91,7 +91,7 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """A pose as session.yaml has it, with as many digits as are written there."""
     from pkmcal.simulation.placement import StationPlace
 
-    return StationPlace.of(T_camera_base).rounded(DIGITS)
+    return StationPlace.of(T_camera_base).rounded(STATION_PLACE_DECIMALS)
 
 
 def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
@@ -111,7 +111,7 @@ def _bare_limbs(pane: Pane) -> list[Drawn]:
         return []
     a, b = (part[bare, None] for part in pane.points)
     pixel = pane.camera.project(
-        apply(pane.T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
+        apply(pane.T_camera_base, a + np.linspace(0, 1, EDGE_CURVE_POINTS)[:, None] * (b - a))
     )
     whole = np.isfinite(pixel).all(axis=(1, 2))
     seen = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)

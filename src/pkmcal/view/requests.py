@@ -11,11 +11,11 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, validate
+from pkmcal.files import Document, Schema, validated_document
 
 Pixel = tuple[float, float]
-Row4 = tuple[float, float, float, float]
-Shown = Literal["drawing", "calibration"]
+RequestedPoseRow = tuple[float, float, float, float]
+ShownMachine = Literal["drawing", "calibration"]
 """Which machine is laid over: the drawing's at the session's poses, or the calibrated one."""
 
 
@@ -44,14 +44,16 @@ class LookRequest(Schema):
 
     station: int
     photograph: int
-    shown: Shown = "drawing"
-    pose: tuple[Row4, Row4, Row4, Row4] | None = None
+    shown: ShownMachine = "drawing"
+    pose: tuple[RequestedPoseRow, RequestedPoseRow, RequestedPoseRow, RequestedPoseRow] | None = (
+        None
+    )
     gesture: Gesture | None = None
     pins: tuple[Pin, ...] = ()
     anywhere: bool = False
 
 
-def checked(body: bytes) -> LookRequest:
+def checked_request(body: bytes) -> LookRequest:
     """A request of the page. Raises InputError for anything else."""
     try:
         data = json.loads(body)
@@ -59,10 +61,10 @@ def checked(body: bytes) -> LookRequest:
         raise InputError("the request is not valid JSON", where="the page") from None
     if not isinstance(data, dict):
         raise InputError("the request is no JSON object", where="the page")
-    return validate(Document(Path("the page"), "the page", data, {}), LookRequest)
+    return validated_document(Document(Path("the page"), "the page", data, {}), LookRequest)
 
 
-def pose_of(look: LookRequest) -> Array | None:
+def requested_pose(look: LookRequest) -> Array | None:
     """T_camera_base (4, 4) that a request gives, if it does. Raises InputError for another map."""
     if look.pose is None:
         return None

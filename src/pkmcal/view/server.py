@@ -9,11 +9,11 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import plain
+from pkmcal.files import json_value
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
-from pkmcal.view.overlay import overlay, placed
-from pkmcal.view.requests import LookRequest, checked
+from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
+from pkmcal.view.requests import LookRequest, checked_request
 from pkmcal.view.viewed import Viewed
 
 if TYPE_CHECKING:
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
 TOKEN_BYTES = 24
-LOOPBACK = "127.0.0.1"
-BACKLOG = 64
-CLOSING = 2
+LOOPBACK_ADDRESS = "127.0.0.1"
+CONNECTIONS_WAITING = 64
+ANSWER_TIME_AT_CLOSING = 2
 """Seconds that answers under way have when the program is ended."""
 
 
-def listening(port: int) -> socket.socket:
+def listening_socket(port: int) -> socket.socket:
     """A socket on the loopback, of a free port where ``port`` is 0. Raises InputError where the
     port is taken.
     """
@@ -36,7 +36,7 @@ def listening(port: int) -> socket.socket:
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((LOOPBACK, port))
+        found.bind((LOOPBACK_ADDRESS, port))
     except OSError as error:
         found.close()
         raise InputError(
@@ -44,7 +44,7 @@ def listening(port: int) -> socket.socket:
             where="--port",
             next_step="Name another port, or leave --port out for a free one",
         ) from None
-    found.listen(BACKLOG)
+    found.listen(CONNECTIONS_WAITING)
     return found
 
 
@@ -67,19 +67,19 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return found(viewed, look)
 
     def fit(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        from pkmcal.view.fit import fitted
+        from pkmcal.view.fit import recognised_overlay
 
-        return fitted(viewed, look)
+        return recognised_overlay(viewed, look)
 
     def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        pose = placed(viewed, look).T_camera_base
+        pose = placed_by_hand(viewed, look).T_camera_base
         return {"said": kept.write(viewed.station(look.station), pose)}
 
     def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
-            return await _answered(lambda: answer(viewed, checked(body)))
+            return await _answered(lambda: answer(viewed, checked_request(body)))
 
         return endpoint
 
@@ -88,7 +88,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
 
     async def page(_request: Request) -> Response:
-        return await _answered(lambda: HTMLResponse(page_html(viewed)))
+        return await _answered(lambda: HTMLResponse(view_page_html(viewed)))
 
     async def script(_request: Request) -> Response:
         return Response(_template("view.js"), media_type="text/javascript")
@@ -105,7 +105,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         *(
             Route(f"/{name}", asked(answer), methods=["POST"])
             for name, answer in (
-                ("overlay", overlay), ("found", found), ("fit", fit), ("save", save),
+                ("overlay", overlay_after_gesture), ("found", found), ("fit", fit), ("save", save),
             )
         ),
     ]  # fmt: skip
@@ -131,10 +131,10 @@ async def _answered(work: Callable[[], Any]) -> Response:
             next_step="Report it",
         )
         return JSONResponse(said.as_dict(), 500)
-    return done if isinstance(done, Response) else JSONResponse(plain(done))
+    return done if isinstance(done, Response) else JSONResponse(json_value(done))
 
 
-def serve(app: Guard, found: socket.socket) -> None:
+def serve_until_interrupted(app: Guard, found: socket.socket) -> None:
     """Answer until the program is interrupted."""
     from contextlib import suppress
 
@@ -142,13 +142,13 @@ def serve(app: Guard, found: socket.socket) -> None:
 
     config = uvicorn.Config(
         app, log_config=None, log_level="critical", access_log=False, lifespan="off", ws="none",
-        timeout_graceful_shutdown=CLOSING, server_header=False,
+        timeout_graceful_shutdown=ANSWER_TIME_AT_CLOSING, server_header=False,
     )  # fmt: skip
     with suppress(KeyboardInterrupt):  # Ctrl-C is how this ends
         uvicorn.Server(config).run(sockets=[found])
 
 
-def page_html(viewed: Viewed) -> str:
+def view_page_html(viewed: Viewed) -> str:
     """The page itself; photographs and overlays are asked for by it."""
     from pkmcal.pages.page import environment
 

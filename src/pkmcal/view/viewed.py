@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from pkmcal.calibration.saved import SavedCalibration
     from pkmcal.observe.evidence import StationView
 
-KEPT = 16
+DECODED_PHOTOGRAPHS_KEPT = 16
 """Decoded photographs that are kept: those that one goes back and forth between."""
-WIDEST = 1600
+WIDEST_VIEWED_PICTURE = 1600
 """px; a screen shows no more of a telephone's picture beside two columns."""
-QUALITY = 88
+VIEWED_JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Viewed:
     def __init__(self, session: Session, calibration: Path | None) -> None:
         self.session = session
         self.calibration = calibration
-        self.image = lru_cache(KEPT)(self._image)
-        self.corners = lru_cache(KEPT)(self._corners)
+        self.image = lru_cache(DECODED_PHOTOGRAPHS_KEPT)(self._image)
+        self.corners = lru_cache(DECODED_PHOTOGRAPHS_KEPT)(self._corners)
         self.start = cache(self._start)
         self.views: dict[int, StationView] = {}
 
@@ -90,7 +90,7 @@ class Viewed:
         """A photograph at a size for the screen."""
         from pkmcal.pages.jpegs import coded, narrowed
 
-        return coded(narrowed(self.image(s, k), WIDEST), QUALITY)
+        return coded(narrowed(self.image(s, k), WIDEST_VIEWED_PICTURE), VIEWED_JPEG_QUALITY)
 
     def drawn(self, s: int, k: int) -> Pane:
         """The drawing's machine before a station's camera."""

@@ -33,7 +33,7 @@ BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, 
 Centre = Annotated[Point, Field(description="a point [x, y, z] in metres")]
 
 
-FOLDED = "its side bars lie on each other"
+FOLDED_BARS_CLAUSE = "its side bars lie on each other"
 """Where the platform has turned by a right angle."""
 
 
@@ -67,7 +67,7 @@ class Bar(PlatformCarrier):
     body: ClassVar = "bar"
     floats: ClassVar = True
     most_turn: ClassVar = np.pi / 2
-    in_the_way: ClassVar = FOLDED
+    in_the_way: ClassVar = FOLDED_BARS_CLAUSE
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
@@ -149,7 +149,7 @@ class HingedBar(PlatformCarrier):
     ways: ClassVar = ("center",)
     turns: ClassVar = True
     most_turn: ClassVar = np.pi / 2
-    in_the_way: ClassVar = FOLDED
+    in_the_way: ClassVar = FOLDED_BARS_CLAUSE
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")

@@ -28,16 +28,16 @@ from pkmcal.errors import InputError
 from pkmcal.files import Metres, Radians, Schema
 from pkmcal.geometry.rigid import apply, dot, skew
 
-SHORTEST = 1e-6
+SHORTEST_AXIS_LENGTH = 1e-6
 """An axis shorter than this is a row of zeros, not a direction."""
-STEPS = 40
+READING_NEWTON_STEPS = 40
 """Newton's for a reading; from mid-range they take five."""
-ROUNDING = 1e-15
-CLOSED = 1e-9
+ROD_LENGTH_ROUNDING = 1e-15
+ROD_CLOSED_SHARE = 1e-9
 """Of a rod's length, what is left when its reading is found, and what may be at most: where the
 rod stands square to the motion, only half of the digits can be had."""
-TINY = 1e-30
-PLANAR = ("planar", "planar-translation")
+COMPLEX_STEP_SIZE = 1e-30
+PLANAR_MOTIONS = ("planar", "planar-translation")
 """Motions in planes z = const of the base frame."""
 IN_PLANE = 1e-6
 """Metres out of a plane, and radians off its normal, that rounding in a file explains."""
@@ -49,7 +49,7 @@ axes do so, the limb does not twist between them."""
 
 def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
     length = hypot(*axis)
-    if length < SHORTEST:
+    if length < SHORTEST_AXIS_LENGTH:
         raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
     if abs(length - 1) < 1e-12:  # read back what was written, to the last digit
         return axis
@@ -95,7 +95,7 @@ class NamedMotion(NamedTuple):
 
     columns : (n, m) changes of the carrier's n parameters. one, several : what is open, of one leg
     and of several; together : of all legs, where only some combinations are open. Sentences without
-    a full stop, with the places that :class:`pkmcal.identify.motions.Motion` lists.
+    a full stop, with the places that :class:`pkmcal.identify.motions.NamedChanges` lists.
     """
 
     columns: Array
@@ -117,7 +117,7 @@ class Site(NamedTuple):
     @property
     def planar(self) -> bool:
         """Whether the machine moves in planes z = const."""
-        return self.motion in PLANAR
+        return self.motion in PLANAR_MOTIONS
 
 
 class Chain(NamedTuple):
@@ -281,16 +281,16 @@ class BaseCarrier(Carrier, ABC):
         shape = np.broadcast_shapes(parameters.shape[:-1], point_b.shape[:-1], near.shape)
         q, off = np.array(np.broadcast_to(near, shape), dtype=float), np.full(shape, np.inf)
         with np.errstate(all="ignore"):  # what is out of reach goes anywhere
-            for _ in range(STEPS):
+            for _ in range(READING_NEWTON_STEPS):
                 a, by_reading = cls.place(parameters, q)
                 line = point_b - a
                 off = (dot(line, line) - length**2) / (2 * length)
                 slope = -dot(line, by_reading) / length
-                step = np.where(np.abs(off) > ROUNDING * length, off / slope, 0.0)
+                step = np.where(np.abs(off) > ROD_LENGTH_ROUNDING * length, off / slope, 0.0)
                 if not step.any():
                     break
                 q = q - step
-        return np.where(np.abs(off) <= CLOSED * length, q, np.nan)
+        return np.where(np.abs(off) <= ROD_CLOSED_SHARE * length, q, np.nan)
 
     @classmethod
     def skeleton(cls, parameters: Array, readings: Array) -> Array:
@@ -365,8 +365,8 @@ def complex_steps(function: Callable[[Array], Array], parameters: Array) -> Arra
     """Derivatives (..., m, n) of a function (..., m) of parameters (..., n), exact to rounding."""
     columns: list[Array] = []
     for step in np.eye(parameters.shape[-1]):
-        moved: Any = parameters + 1j * TINY * step
-        columns.append(function(moved).imag / TINY)
+        moved: Any = parameters + 1j * COMPLEX_STEP_SIZE * step
+        columns.append(function(moved).imag / COMPLEX_STEP_SIZE)
     return np.stack(columns, axis=-1)
 
 

@@ -27,10 +27,10 @@ from pkmcal.mechanisms.carriers.contract import (
     vectors,
 )
 
-UP = np.array([0.0, 0.0, 1.0])
-SLANTED = 1e-3
+CRANK_VERTICAL = np.array([0.0, 0.0, 1.0])
+SLANTED_FROM_AXIS = 1e-3
 """A direction nearer to the axis than this (rad) shows no angle about it."""
-ZERO = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")
+CRANK_ZERO_KINDS = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")
 
 
 class CrankDocument(Schema):
@@ -88,7 +88,7 @@ class Crank(BaseCarrier):
         ParameterKind("angle", "rad", "angle", label="crank angle", part="zero"),
         ParameterKind("along", "m", "center", label="place along the crank axis"),
         ParameterKind("radial", "m", "center", label="crank axis distance"),
-        *ZERO,
+        *CRANK_ZERO_KINDS,
     )
 
     @classmethod
@@ -96,7 +96,7 @@ class Crank(BaseCarrier):
         """The direction from which the crank's angle counts is one."""
         super().check(node, site)
         direction = node.zero if node.zero is not None else (0.0, 0.0, 1.0)
-        if np.linalg.norm(np.cross(direction, node.axis)) > SLANTED:
+        if np.linalg.norm(np.cross(direction, node.axis)) > SLANTED_FROM_AXIS:
             return
         if node.zero is None:
             raise InputError(
@@ -234,14 +234,14 @@ def _frame(parameters: Array) -> _Frame:
     """The crank's own axes and how they change with its parameters."""
     axis, zero = parameters[..., 3:6], parameters[..., 10:13]
     drawn = np.isfinite(zero[..., :1])
-    zero = np.where(drawn, zero, UP)
+    zero = np.where(drawn, zero, CRANK_VERTICAL)
     v = axis / np.sqrt(dot(axis, axis))[..., None]
     high = dot(zero, v)[..., None]
     raw = np.where(drawn, zero - high * v, cross(v, zero))
     n = np.sqrt(dot(raw, raw))[..., None]
     e0 = raw / n
     side = cross(v, e0)
-    twist = np.where(drawn, -high * side, cross(UP, side)) / n
+    twist = np.where(drawn, -high * side, cross(CRANK_VERTICAL, side)) / n
     return _Frame(v, e0, side, twist, n, drawn)
 
 

@@ -45,7 +45,10 @@ class Slider(BaseCarrier):
     schema: ClassVar = SliderDocument
     shared: ClassVar = ("axis",)
     held_in_plane: ClassVar = ("axis.z",)
-    parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("axis", "1", "axis"))
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("axis", "1", "axis"),
+    )
 
     @classmethod
     def check(cls, node: SliderDocument, site: Site) -> None:

@@ -17,11 +17,11 @@ import numpy as np
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import csv_text, entries, read_text, staged_folder
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
-from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 
-Seen = Literal["legs", "board", "both", "readings"]
-SEEN: tuple[Seen, ...] = ("legs", "board", "both", "readings")
-TEMPLATE = Path(__file__).parent / "session"
+SeenChoice = Literal["legs", "board", "both", "readings"]
+SEEN_CHOICES: tuple[SeenChoice, ...] = ("legs", "board", "both", "readings")
+SESSION_TEMPLATE_FOLDER = Path(__file__).parent / "session"
 TO_FILL = {
     "mechanism.yaml": "write the drawing of your machine into it",
     "cameras/front.yaml": "write the calibration of your camera into it",
@@ -30,9 +30,9 @@ TO_FILL = {
     "board.yaml": "write down which board it is, and measure its squares",
 }
 """What a person still has to do in each file."""
-PLACES = ("front", "left", "right", "back")
-OBSERVE = {"legs": "legs", "board": "board", "both": "[legs, board]"}
-BOARD = """\
+STARTER_PLACE_NAMES = ("front", "left", "right", "back")
+OBSERVE_ENTRY_VALUES = {"legs": "legs", "board": "board", "both": "[legs, board]"}
+STARTER_BOARD_TEXT = """\
 # The board on the platform: a ChArUco board printed on something stiff and flat. Other kinds, and
 # what each key means: docs/files.md, board.yaml.
 type: charuco
@@ -42,7 +42,7 @@ marker: {marker:<17} # the side of a marker
 dictionary: DICT_5X5_100
 tolerance: 0.1 %          # how well you measured: paper changes its size by as much
 """
-SQUARE, SQUARES = 30, range(8, 31)
+STARTER_SQUARE_SIDE, STARTER_SQUARE_CHOICES = 30, range(8, 31)
 """mm, of the board's squares as they are, and as they can be asked for."""
 ON_PLATFORM = """\
 
@@ -50,31 +50,31 @@ board:
   file: board.yaml
   fixed_to: platform          # it must not move on it; where it sits need not be known
 """
-MOVED = """\
+MOVED_STATION_TEXT = """\
   {name}:
     camera: cameras/front.yaml  # the same camera, moved there later
     images: images/{name}/{{configuration}}.png
     observe: {observe}
 """
-ALONE = """\
+READINGS_ALONE_TEXT = """\
 # No stations: this machine has more readings than freedoms, and they alone tell its geometry.
 # Spread the configurations over all that it reaches.
 """
-UNITS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
+EXAMPLE_UNIT_FACTORS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
 """Units of example readings by the mark in a column's head."""
-LEGS = " - The machine stands still."
+LEGS_SEEN_TEXT = " - The machine stands still."
 BOARD_SEEN = """\
  - The machine stands still. The board sharp, whole in the picture, neither white nor black, and
    not always seen from the same side.
 """
-DRIVES = """\
+DRIVE_NOISE_TEXT = """\
   # Standard deviation of a reading: about a third of the encoder's repeatability.
   noise: 0.001 deg
 """
 
 
 def write_session(
-    folder: Path | str, machine: str | None = None, seen: Seen | None = None, places: int = 1
+    folder: Path | str, machine: str | None = None, seen: SeenChoice | None = None, places: int = 1
 ) -> tuple[str, ...]:
     """Write a session into a new or empty folder; returns its files.
 
@@ -105,11 +105,14 @@ def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
 
 
 def session_texts(
-    machine: str | None = None, seen: Seen | None = None, places: int = 1
+    machine: str | None = None, seen: SeenChoice | None = None, places: int = 1
 ) -> dict[str, str]:
     """The session's files by their names, as of :func:`write_session`."""
-    files = sorted(path for path in TEMPLATE.rglob("*") if path.is_file())
-    texts = {path.relative_to(TEMPLATE).as_posix(): path.read_text("utf-8") for path in files}
+    files = sorted(path for path in SESSION_TEMPLATE_FOLDER.rglob("*") if path.is_file())
+    texts = {
+        path.relative_to(SESSION_TEMPLATE_FOLDER).as_posix(): path.read_text("utf-8")
+        for path in files
+    }
     turns = False
     if machine is not None:
         drawn = load_mechanism(machine)
@@ -132,7 +135,7 @@ def session_texts(
         texts["board.yaml"] = board_text()
     where_to = texts.pop("images/front/README.txt")
     if seen == "board":
-        where_to = where_to[: where_to.index(LEGS)] + BOARD_SEEN
+        where_to = where_to[: where_to.index(LEGS_SEEN_TEXT)] + BOARD_SEEN
     if seen == "readings":
         del texts["cameras/front.yaml"]
         return texts
@@ -141,13 +144,16 @@ def session_texts(
     return texts
 
 
-def board_text(square: int = SQUARE) -> str:
+def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
     """board.yaml of the example, with squares of so many millimetres."""
-    return BOARD.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
+    return STARTER_BOARD_TEXT.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
 
 
 def _places(count: int) -> list[str]:
-    return [*PLACES, *(f"place{k + 1}" for k in range(len(PLACES), count))][:count]
+    return [
+        *STARTER_PLACE_NAMES,
+        *(f"place{k + 1}" for k in range(len(STARTER_PLACE_NAMES), count)),
+    ][:count]
 
 
 def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> str:
@@ -157,7 +163,7 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
     poses = np.repeat(machine.home()[None], 2, axis=0)
     lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
     # along the last of its motions that is no turn, by a part of its size
-    motions = MOTIONS[machine.document.motion]
+    motions = MOTION_DIRECTIONS[machine.document.motion]
     slide = next(c for c in motions.T[::-1] if not c[:3].any())[3:]
     poses[1, :3, 3] += slide * np.abs(lengths).max() / 30
     rows = machine.inverse(poses)
@@ -166,22 +172,28 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
         f"{name} [deg]" if unit == "rad" else name
         for name, unit in zip(machine.joint_names, machine.joint_units, strict=True)
     ]
-    rows *= [next((k for mark, k in UNITS.items() if head.endswith(mark)), 1.0) for head in heads]
+    rows *= [
+        next((k for mark, k in EXAMPLE_UNIT_FACTORS.items() if head.endswith(mark)), 1.0)
+        for head in heads
+    ]
     return csv_text(heads, ["0001", "0002"], rows.round(4))
 
 
-def _session(text: str, hexapod: bool, turns: bool, seen: Seen, places: int) -> str:
+def _session(text: str, hexapod: bool, turns: bool, seen: SeenChoice, places: int) -> str:
     """The starter session.yaml for another machine, another thing that is seen, more places."""
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
-        text = text[:start] + DRIVES + text[end:]
+        text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
     if seen == "readings":
-        return text[: text.index("# One entry")] + ALONE
+        return text[: text.index("# One entry")] + READINGS_ALONE_TEXT
     start, end = text.index("    observe: legs"), text.index("#  left:")
-    first = f"    observe: {OBSERVE[seen]}\n"
+    first = f"    observe: {OBSERVE_ENTRY_VALUES[seen]}\n"
     if seen == "legs":
         first += text[start:end].partition("\n")[2]
-    moved = [MOVED.format(name=n, observe=OBSERVE[seen]) for n in _places(places)[1:]]
+    moved = [
+        MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[seen])
+        for n in _places(places)[1:]
+    ]
     rest = text[end:] if places == 1 and seen == "legs" and hexapod else ""
     board = "" if seen == "legs" else ON_PLATFORM
     return text[:start] + first + "".join(moved) + rest + board
@@ -224,8 +236,8 @@ def _of_the_drawing(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
 def _examples(name: str) -> tuple[str, ...]:
     """Every text that a file of a new session can begin as."""
     if name == "board.yaml":
-        return tuple(board_text(square) for square in SQUARES)
-    template = (TEMPLATE / name).read_text("utf-8")
+        return tuple(board_text(square) for square in STARTER_SQUARE_CHOICES)
+    template = (SESSION_TEMPLATE_FOLDER / name).read_text("utf-8")
     if name == "mechanism.yaml":
         return template, *(read_text(path) for path in catalogue().values())
     if name == "joints.csv":
@@ -233,6 +245,8 @@ def _examples(name: str) -> tuple[str, ...]:
     if name == "session.yaml":
         return tuple(
             _session(template, *given)
-            for given in product((True, False), (True, False), SEEN, range(1, len(PLACES) + 1))
+            for given in product(
+                (True, False), (True, False), SEEN_CHOICES, range(1, len(STARTER_PLACE_NAMES) + 1)
+            )
         )
     return (template,)
