@@ -3,8 +3,4 @@
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.cameras.files import load_camera
 
-__all__ = [
-    "Camera",
-    "camera_models",
-    "load_camera",
-]
+__all__ = ["Camera", "camera_models", "load_camera"]

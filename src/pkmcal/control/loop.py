@@ -52,12 +52,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.wording import named
 
-__all__ = [
-    "GoalPhotograph",
-    "Status",
-    "Step",
-    "VisualServo",
-]
+__all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
 
 GOAL_READING_TOLERANCE = 5e-4
 """Reading (m or rad) by which the machine may still be off at the goal: one photograph of 640x480
