@@ -123,8 +123,8 @@ def result(case: Case) -> Shot:
 def outward(case: Case) -> Array:
     """Pixels by which each edge lies outward."""
     session, found = case.session, case.result
-    camera = shown.camera_numbers(session)
-    return shown.outward_shift(found.observation.edges, found.estimate, session.joints, camera)
+    edges, cameras = found.observation.edges, session.camera_of_station
+    return shown.outward_shift(edges, found.estimate, session.joints, cameras)
 
 
 def report(case: Case) -> Shot:
