@@ -46,7 +46,7 @@ LEAST_CORNERS_FOUND = 6
 WHOLE_CHESSBOARD_SHARE = 0.75
 """Share of a chessboard's corners that must look like corners: what is found there is the whole
 board, or something else."""
-FULL_SIZE_ONLY_WIDTH = 1000
+WIDEST_AT_FULL_SIZE_ONLY = 1000
 """px; pictures wider than this are tried at half their size as well."""
 STRAIGHT_ENOUGH = 0.35
 """Share of a square by which a corner may lie off the middle of its two neighbours' line."""
@@ -243,7 +243,7 @@ def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
     if quick:
         return
     yield cv2.createCLAHE(3.0, (8, 8)).apply(image), 1.0
-    if image.shape[1] > FULL_SIZE_ONLY_WIDTH:
+    if image.shape[1] > WIDEST_AT_FULL_SIZE_ONLY:
         yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0
 

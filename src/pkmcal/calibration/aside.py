@@ -176,8 +176,7 @@ def _check(n: int, left: int, total: int, what: str) -> None:
             "there are too few configurations to hold any out",
             found=f"{count(total, 'pose')} seen",
             expected=f"{2 * FEWEST_LEFT_TO_CALIBRATE} at least; configurations whose readings"
-            f" are equal within their"
-            " noise are of one pose",
+            " are equal within their noise are of one pose",
             next_step="Photograph more configurations",
         )
     raise InputError(

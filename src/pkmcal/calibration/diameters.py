@@ -3,8 +3,8 @@
 Thick tubes of half the width are found in the photographs all the same: their edges lie on what is
 seen inside of the right ones, and the camera at another distance. A search in the picture does not
 tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
-joint estimate: with the drawing's radii few edges are found, which disagree with the machine beyond
-what is accepted of any result; with half of them there are more, and they agree.
+joint estimate: with the drawing's radii few edges are found, which disagree with the machine, now
+and then by no more than is accepted of a result; with half of them there are more, and they agree.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from pkmcal.observe.diagnose import diameters
 def check_radii(
     seen: SeenSession, estimate: Estimate | None, refine_camera: bool, seed: int
 ) -> None:
-    """Raise `InputError` where nothing comes of the photographs that may be used, and more of their
-    edges agree with a machine of half the radii.
+    """Raise `InputError` where edges disagree with the machine more than with one whose mistake is
+    put right, and more of them agree with a machine of half the radii.
 
     estimate : with the drawing's radii, None where there is none. refine_camera : whether it
     estimated the cameras. seed : of the search for the stations.
     """
-    bad = estimate is None or estimate.statistics.noise_scale > TOO_NOISY
+    agree = CURED_MISFIT_SHARE * TOO_NOISY
+    bad = estimate is None or estimate.statistics.noise_scale > agree
     if not bad or not seen.photographs:
         return
     thinner = replace(seen.session, machine=_of_half_the_radii(seen.session.machine))
@@ -48,7 +49,7 @@ def check_radii(
     except PkmcalError:  # it is not found in these photographs, or not known by them
         return
     found = turns.estimate
-    cured = found.statistics.noise_scale <= CURED_MISFIT_SHARE * TOO_NOISY
+    cured = found.statistics.noise_scale <= agree
     kept = 0.0 if estimate is None else estimate.edge_weights.sum()
     if cured and found.edge_weights.sum() > kept:
         raise diameters(seen.session.document["mechanism"])

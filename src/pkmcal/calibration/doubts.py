@@ -635,8 +635,7 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
                 )
                 said = (
                     f"The boards {BOARDS_TURN_WORDS[found.hypothesis]} but for {off:.3f}°, where"
-                    f" their stated"
-                    f" noise alone gives {noise:.3f}°."
+                    f" their stated noise alone gives {noise:.3f}°."
                 )
             out.append((doubt, f"{session.station_names[s]}: {said}"))
     return out

@@ -465,12 +465,8 @@ def part_of(study: RepeatStudy) -> Part:
     rows = [Row(leg.station, (str(leg.leg), *_cells(leg))) for leg in study.legs]
     rows.append(Row("median", ("", *_cells(study.middle))))
     rows.append(Row("upper bound", ("", *_cells(study.bound))))
-    paper = (
-        _degrees(PAPER_AXIS_NOISE.psi),
-        _degrees(PAPER_AXIS_NOISE.theta),
-        _mm(PAPER_AXIS_NOISE.x),
-        _mm(PAPER_AXIS_NOISE.z),
-    )
+    noise = PAPER_AXIS_NOISE
+    paper = (_degrees(noise.psi), _degrees(noise.theta), _mm(noise.x), _mm(noise.z))
     rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
     columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
     table = Table(

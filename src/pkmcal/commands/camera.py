@@ -136,8 +136,7 @@ def photographs(images: list[Path]) -> list[Path]:
                     "the folder holds no photographs",
                     where=str(path),
                     expected=f"some in it ({', '.join(sorted(IMAGE_FILE_ENDINGS))}), or a"
-                    f" session.yaml that"
-                    " names them",
+                    " session.yaml that names them",
                 )
             out += inside
         elif path.is_file():

@@ -100,10 +100,8 @@ def _make_room(out: Path) -> None:
     standing = entries(out)
     if not standing:
         return
-    if not (out / DEMO_SESSION_NAME / "truth.json").is_file() or set(standing) - {
-        DEMO_SESSION_NAME,
-        DEMO_CALIBRATION_NAME,
-    }:
+    ours = {DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME}
+    if not (out / DEMO_SESSION_NAME / "truth.json").is_file() or set(standing) - ours:
         raise InputError(
             "the folder for the demonstration holds something else",
             where=str(out),

@@ -24,7 +24,7 @@ from pkmcal.simulation.edges import EdgeNoise
 
 IMAGES_A_GOAL = 24
 """Images of each goal; the standard deviation over all goals is then good to a few percent."""
-ARRIVED_WAY_SHARE = 0.02
+ARRIVED_WAY_LEFT = 0.02
 """Part of the way at which a platform counts as arrived, as control engineers have it."""
 LEAST_WAY = 5e-4
 """m, of the platform's joints, within which a goal is reached however short the way was."""
@@ -278,8 +278,7 @@ def simulate_servo_runs(
 @dataclass(frozen=True)
 class _Now:
     """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in
-    ``RUN_ENDS``,
-    -1 for none yet. last : (R,) sample at which it came.
+    ``RUN_ENDS``, -1 for none yet. last : (R,) sample at which it came.
     """
 
     poses: Array
@@ -419,12 +418,12 @@ def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[
     n = max(1, round(FINAL_RUN_SHARE * error.shape[1]))
     e, w = error[:, -n:].mean(axis=1), way[:, -n:].mean(axis=1)
     before = way[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
-    near = np.maximum(ARRIVED_WAY_SHARE * way[:, 0], LEAST_WAY)
+    near = np.maximum(ARRIVED_WAY_LEFT * way[:, 0], LEAST_WAY)
     arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_WAY_SHARE * way[:, 0]))
     shaken = w < floor
     # what an exponential of this gain would still go in that time, were the control not at rest
     rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
-    alike = e < ARRIVED_WAY_SHARE * error[:, 0]
+    alike = e < ARRIVED_WAY_LEFT * error[:, 0]
     worse = w > way[:, 0]
     return [_end(*case) for case in zip(arrived, shaken, alike, rest, worse, strict=True)]
 

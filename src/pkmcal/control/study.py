@@ -20,7 +20,7 @@ from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, s
 from pkmcal.control.image import Eye
 from pkmcal.control.seen import SeenMachine, seen_machine
 from pkmcal.control.simulation import (
-    ARRIVED_WAY_SHARE,
+    ARRIVED_WAY_LEFT,
     End,
     LoopSettings,
     ServoRuns,
@@ -186,7 +186,7 @@ class Trials:
 
     overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
     largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
-    s after which the platform is within ARRIVED_WAY_SHARE of its way, NaN where it never is. astray
+    s after which the platform is within ARRIVED_WAY_LEFT of its way, NaN where it never is. astray
     : (R,) m, root mean square of the platform's joints, by which the platform left the way that it
     takes with the true geometry, at most.
     """
@@ -337,10 +337,10 @@ def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
 
 
 def _settling(runs: ServoRuns) -> Array:
-    """Time (R,) after which the platform stays within ARRIVED_WAY_SHARE of its way; NaN where
+    """Time (R,) after which the platform stays within ARRIVED_WAY_LEFT of its way; NaN where
     never.
     """
-    far = runs.way > ARRIVED_WAY_SHARE * runs.way[:, :1]
+    far = runs.way > ARRIVED_WAY_LEFT * runs.way[:, :1]
     n = far.shape[1]
     after = n - np.argmax(far[:, ::-1], axis=1)
     after = np.where(far.any(axis=1), after, 0)

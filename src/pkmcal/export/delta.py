@@ -52,7 +52,7 @@ UNWARNED_TOOL_ERROR = 0.05
 MOST_TOOL_ERROR = 5.0
 """mm at the tool beyond which the parameters describe another machine."""
 UNTOLD_SCALE_DIFFERENCE = 1e-9
-"""Difference of a scale from 1 that is told: beyond the digits of the files."""
+"""Difference of a scale from 1 beyond which it is told: beyond the digits of the files."""
 TOOL_ROUNDING = 2e-6
 """m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")

@@ -62,13 +62,13 @@ SCALE_CORRECTION_ADVICE = "Divide its SCALE in the INI file, steps or counts per
 
 @final
 class LinuxCnc(Exporter):
-    """LINUXCNC_HAL_FILE and LINUXCNC_INI_FILE lines for hexapods and ideal deltas."""
+    """HAL and INI lines for hexapods and ideal deltas."""
 
     name: ClassVar = "linuxcnc"
     title: ClassVar = "LinuxCNC: kinematics' HAL pins and INI words"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """A LINUXCNC_HAL_FILE file and words for the INI file."""
+        """A HAL file and words for the INI file."""
         if source.machine.document.motion == "translation":
             fit = _fit(source)
             return {

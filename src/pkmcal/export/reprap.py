@@ -87,10 +87,10 @@ def _linear(fit: Fit) -> list[str]:
         "M669 K3 ; linear delta",
         f"M665 L{_three(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
         f" B{firmware_length(MM_A_METRE * reach(fit.delta))}"
-        f" {_letters(corrections, firmware_angle)} ; L rods, R radius, H homed height, B print"
-        f" radius",
-        f"M666 {_letters(heights - homed, firmware_length)} A0 B0 ; endstop adjustments, mm; no"
-        f" tilt",
+        f" {_letters(corrections, firmware_angle)}"
+        " ; L rods, R radius, H homed height, B print radius",
+        f"M666 {_letters(heights - homed, firmware_length)} A0 B0"
+        " ; endstop adjustments, mm; no tilt",
     ]
 
 
@@ -110,14 +110,13 @@ def _rotary(fit: Fit) -> list[str]:
     high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
     return [
         f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)}"
-        f" R{firmware_length(fit.radius)}"
-        f" A{firmware_angle(lowest)}:{firmware_angle(largest)}"
+        f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(largest)}"
         f" B{firmware_length(MM_A_METRE * reach(delta))}"
         f" {_letters(corrections, firmware_angle)} ; U arms, L rods, H bearings' heights, R radius",
-        f"M666 {_letters(homed - largest, firmware_angle)} ; homed angles beyond A's larger one,"
-        f" degrees",
-        f"; M208 Z{firmware_length(max(low, 0.0))}:{firmware_length(high)} ; Z of the workspace"
-        f" at most; set your own",
+        f"M666 {_letters(homed - largest, firmware_angle)}"
+        " ; homed angles beyond A's larger one, degrees",
+        f"; M208 Z{firmware_length(max(low, 0.0))}:{firmware_length(high)}"
+        " ; Z of the workspace at most; set your own",
         "; M92: microsteps per degree of the arm, on X, Y and Z",
     ]
 

@@ -123,9 +123,8 @@ def _launch(source: MachineSource) -> str:
         )
     about = source.header(
         f"Transforms from {ROS_BASE_FRAME} (the machine's base frame) to each camera's optical"
-        f" frame:"
-        " z forward, x right, y down. Metres; quaternions x y z w, which turn camera coordinates"
-        " into base coordinates.",
+        " frame: z forward, x right, y down. Metres; quaternions x y z w, which turn camera"
+        " coordinates into base coordinates.",
         *(_sigma(source)),
     )
     return commented(about, "#") + "launch:\n" + "".join(nodes)

@@ -25,13 +25,12 @@ from pkmcal.export.bodies import (
 from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.home import SAME_HINGE_DIFFERENCE
 from pkmcal.export.markup import comment, document, file_name, numbers_text
-from pkmcal.export.sdf_read import SDF_NAMESPACE, read_sdf
+from pkmcal.export.sdf_read import SDF_MODEL_FRAME, SDF_NAMESPACE, read_sdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw
 from pkmcal.outcome import Finding, Level
 
 SDF_VERSION = "1.11"
 """The first with joints that follow others (``mimic``)."""
-SDF_MODEL_FRAME = "__model__"
 CONVENTIONS = (
     "Units: m, rad. The model's frame is the machine's base frame, the link 'platform' has the"
     " platform frame; its pose is T_base_platform at home, where all is drawn.",

@@ -13,7 +13,7 @@ from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, inverse, pose
 
 SDF_NAMESPACE = "urn:pkmcal"
-SDF_READ_MODEL_FRAME, SDF_WORLD_FRAME = "__model__", "world"
+SDF_MODEL_FRAME, SDF_WORLD_FRAME = "__model__", "world"
 SDF_JOINT_AXES = {"revolute": ("axis",), "prismatic": ("axis",), "universal": ("axis", "axis2")}
 LOOP_JOINT_ENDING = "_loop"
 
@@ -78,7 +78,7 @@ class _Links:
 
     def drawn(self, name: str) -> Array:
         """Where a link or a frame is drawn, (4, 4), in the model's frame."""
-        if name in ("", SDF_READ_MODEL_FRAME, SDF_WORLD_FRAME):
+        if name in ("", SDF_MODEL_FRAME, SDF_WORLD_FRAME):
             return np.eye(4)
         if name in self.frames:
             return self.drawn(self.frames[name].attrib["attached_to"]) @ _pose(self.frames[name])
@@ -131,7 +131,7 @@ class _Links:
         for tag in SDF_JOINT_AXES.get(node.attrib["type"], ()):
             xyz = node.find(f"{tag}/xyz")
             axis = np.array([] if xyz is None else (xyz.text or "").split(), dtype=float)
-            if xyz is not None and xyz.get("expressed_in") == SDF_READ_MODEL_FRAME:
+            if xyz is not None and xyz.get("expressed_in") == SDF_MODEL_FRAME:
                 axis = at[:3, :3].T @ axis
             out.append(ReadJoint(name, kind, axis, len(self.key), ref))
             self.key.append(ref)

@@ -19,8 +19,8 @@ NUMBERS_WORTH_CALLS = 100
 """Numbers below which calls cost more than arithmetic."""
 CYCLIC_PAIRS = ((1, 2), (2, 0), (0, 1))
 CROSS_PRODUCT_SIGNS = -skew(np.eye(3))
-"""The cross product's signs: ``(a x b)_i`` is the sum of ``CROSS_PRODUCT_SIGNS[i, j, k] a_j
-b_k``."""
+"""The cross product's signs: ``(a x b)_i`` is the sum of
+``CROSS_PRODUCT_SIGNS[i, j, k] a_j b_k``."""
 
 
 def batch_last(array: Array) -> Array:

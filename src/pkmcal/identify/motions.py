@@ -214,9 +214,8 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
         turn = np.concatenate([frames[:, [axis, 6 + axis]], shifts], axis=1)
         text = (
             f"the turn of the base frame about {AXIS_LETTERS[axis]} {{is}}: the axes and places"
-            f" of all base"
-            " joints can turn together, and the camera or tracker with them; nothing that the"
-            " mechanism file holds stops it"
+            " of all base joints can turn together, and the camera or tracker with them; nothing"
+            " that the mechanism file holds stops it"
         )
         yield NamedChanges(s.legs, turn, text, convention=True)
 

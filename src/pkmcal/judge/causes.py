@@ -35,8 +35,7 @@ class Cause:
     (P + C, k), then of the cameras' magnification; or of all columns of
     :class:`~pkmcal.judge.held.Evidence`. sizes : (k,) usual ones: a drawing's tolerance,
     USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
-    nothing for a ratio.
-    camera, station : numbers in the session.
+    nothing for a ratio. camera, station : numbers in the session.
     """
 
     part: str

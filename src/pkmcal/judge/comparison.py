@@ -50,9 +50,8 @@ class Promise:
     common : (m,) what each reading is off in all configurations alike, m or rad, and common_sigma :
     (m,) its standard deviation; common_chance : of all of them being zero. usual, steady : whether
     residuals, and what they have in common, are not larger than promised but for
-    ALLOWED_RESIDUAL_EXCESS.
-    expected : (n, m) standard deviations that are promised, by_noise : (n, m) the part of the
-    photographs' and the readings' noise, m or rad.
+    ALLOWED_RESIDUAL_EXCESS. expected : (n, m) standard deviations that are promised, by_noise :
+    (n, m) the part of the photographs' and the readings' noise, m or rad.
     """
 
     chi2: float

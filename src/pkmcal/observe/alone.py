@@ -165,14 +165,8 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
     direction = sphere(CAMERA_DIRECTIONS)
     look = frame_of(-direction)
     # what is looked up: each place in the picture is a shift of the maps
-    steps = [
-        np.arange(
-            -int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE),
-            int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE) + 1,
-            CHART_STRIDE_CELLS,
-        )
-        for n in chart.size
-    ]
+    reach = [int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE) for n in chart.size]
+    steps = [np.arange(-cells, cells + 1, CHART_STRIDE_CELLS) for cells in reach]
     windows = _windows(chart.rarity, steps)
     values: list[Array] = []
     shifts: list[Integers] = []
@@ -192,11 +186,8 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
     row, place = np.unravel_index(order, value.shape)
     step, shift = row // PICTURE_PLACES_A_TURN, best[row, place]
     dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
-    x, y, zero = (
-        dx * MAP_CELL_SIZE / chart.scale,
-        dy * MAP_CELL_SIZE / chart.scale,
-        np.zeros(len(order)),
-    )
+    x, y = (d * MAP_CELL_SIZE / chart.scale for d in (dx, dy))
+    zero = np.zeros(len(order))
     tilt = rotation(np.stack([-y, x, zero], axis=-1))
     roll = rotation(
         np.stack([zero, zero, 2 * np.pi / SIGHT_LINE_TURNS * (step % SIGHT_LINE_TURNS)], axis=-1)

@@ -108,8 +108,7 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         " machine's would",
         next_step=(
             f"Take more photographs from there, {USUAL_PHOTOGRAPHS} are usual: of so few it"
-            f" cannot be said"
-            " whether anything is mixed up. If there are more, check"
+            " cannot be said whether anything is mixed up. If there are more, check"
             if few
             else "Check"
         )

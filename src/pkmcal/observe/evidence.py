@@ -358,9 +358,8 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
     """The pose (4, 4) with the most evidence near another."""
-    return settle_by_evidence(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[
-        0
-    ][0]
+    every = view.few(len(view.configuration))
+    return settle_by_evidence(view, T_camera_base[None], every, 8, 8)[0][0]
 
 
 def evidence_from(view: StationView, places: Array) -> float:

@@ -184,12 +184,8 @@ def _on_chart(rays: Array, width: float) -> Array:
     """Cells (..., 2) of unit rays (..., 3) in the chart's frame, from its middle."""
     away = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
     angle = np.arctan2(away, rays[..., 2])
-    return (
-        rays[..., :2]
-        * (angle / np.maximum(away, 1e-12) * (CHART_HALF_CELLS / CHART_HALF_WIDTHS / width))[
-            ..., None
-        ]
-    )
+    cells = CHART_HALF_CELLS / CHART_HALF_WIDTHS / width
+    return rays[..., :2] * (angle / np.maximum(away, 1e-12) * cells)[..., None]
 
 
 def _chart_tables(
@@ -250,10 +246,8 @@ def _scores(
     limit = n // 2 - np.abs(SIGHT_LINE_SHIFTS).max() - 1
     out = np.empty((len(places), SIGHT_LINE_TURNS, len(SIGHT_LINE_SHIFTS)), dtype=np.float32)
     for turn in range(SIGHT_LINE_TURNS):
-        cos, sin = (
-            np.cos(2 * np.pi / SIGHT_LINE_TURNS * turn),
-            np.sin(2 * np.pi / SIGHT_LINE_TURNS * turn),
-        )
+        angle = 2 * np.pi / SIGHT_LINE_TURNS * turn
+        cos, sin = np.cos(angle), np.sin(angle)
         column, row = (
             np.rint(np.clip(v, -limit, limit)).astype(np.intp) + n // 2
             for v in (cos * x - sin * y, sin * x + cos * y)
@@ -271,12 +265,8 @@ def _shifted(chart: Integers) -> Array:
     """Distances (cells, SIGHT_LINE_SHIFTS) by every line of sight, at each cell of charts (K,
     EDGE_DIRECTIONS, n, n) with a border: what is looked up together lies together.
     """
-    around = (
-        (0, 0),
-        (0, 0),
-        (CHART_BORDER_CELLS, CHART_BORDER_CELLS),
-        (CHART_BORDER_CELLS, CHART_BORDER_CELLS),
-    )
+    border = (CHART_BORDER_CELLS, CHART_BORDER_CELLS)
+    around = ((0, 0), (0, 0), border, border)
     flat = np.pad(chart, around, constant_values=CHART_DISTANCE_CUT).astype(np.float32).ravel()
     step = (
         SIGHT_LINE_SHIFTS[:, 1] * (chart.shape[-1] + 2 * CHART_BORDER_CELLS)

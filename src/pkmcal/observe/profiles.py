@@ -236,10 +236,8 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
 
     curves : of :func:`residual_curves`.
     """
-    step, half = (
-        EDGE_SHIFTS[1] - EDGE_SHIFTS[0],
-        round(OWN_EDGE_WINDOW / (EDGE_SHIFTS[1] - EDGE_SHIFTS[0])),
-    )
+    step = EDGE_SHIFTS[1] - EDGE_SHIFTS[0]
+    half = round(OWN_EDGE_WINDOW / step)
     middle = np.rint((about - EDGE_SHIFTS[0]) / step).astype(int)
     middle = np.clip(middle, half, len(EDGE_SHIFTS) - 1 - half)
     near = middle[:, None] + np.arange(-half, half + 1)

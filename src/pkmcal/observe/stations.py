@@ -267,9 +267,8 @@ def evidence_nearby(
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
     ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 10, 8, 6, 5))
     if count > NEARBY_PLACES_SETTLED:
-        order = np.argsort(score(view, ends, few, 5).reshape(-1, count), axis=1)[
-            :, :NEARBY_PLACES_SETTLED
-        ]
+        told = score(view, ends, few, 5).reshape(-1, count)
+        order = np.argsort(told, axis=1)[:, :NEARBY_PLACES_SETTLED]
         kept = (order + count * np.arange(len(legs))[:, None]).ravel()
         ends, view = ends[kept], view.guess(kept)
     evidence = settle_by_evidence(view, ends, few, 5, 3)[1]

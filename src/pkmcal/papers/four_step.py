@@ -154,9 +154,8 @@ def solve_from_centres(
     weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         # distances leave a translating platform turned against the base frame
-        rot = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])[
-            ..., :3, :3
-        ].mean(axis=1)
+        laid = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])
+        rot = laid[..., :3, :3].mean(axis=1)
         platform = platform @ nearest_rotation(rot).mT
     T = poses_laying_items(platform[:, None], b, weight, motion=legs.motion)
     if legs.planar:  # the platform frame keeps the height that the drawing gives it

@@ -125,8 +125,8 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
             f"{named(names[b])}",
             found="no configurations that show enough of both at once",
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
-            next_step=f"photograph the same configurations from more stations, or"
-            f" {USE_JOINT_METHOD}",
+            next_step=f"photograph the same configurations from more stations,"
+            f" or {USE_JOINT_METHOD}",
         )
     _needs_poses(legs, seen & posed[:, None])
 

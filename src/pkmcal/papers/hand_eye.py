@@ -242,8 +242,7 @@ def start_from_poses(
         raise InputError(
             what=f"nothing ties station {lost[0] + 1} of {n_stations} to the machine",
             expected=f"a board on the platform in {LEAST_PAIR_CONFIGURATIONS} configurations, a"
-            f" board that another"
-            " station also sees, or a rough pose",
+            " board that another station also sees, or a rough pose",
             next_step="give the station's pose: in session.yaml",
         )
     return State(

@@ -62,7 +62,7 @@ def seen_platform(
 
 
 def taken(motion: Array, whole: Array) -> Taken:
-    """A pose as the machine can take it; motion (6, d) of ``MOTIONS``.
+    """A pose as the machine can take it; motion (6, d) of ``MOTION_DIRECTIONS``.
 
     Of the turn, ``R = Exp(s) R_own``: R_own about z where the machine turns about z alone (s is
     then horizontal), none where it does not turn. Places that it cannot take are off as they are.

@@ -37,7 +37,7 @@ errors are the same, however often it is counted.
 EXCHANGE_GAIN_ROUNDING = 1e-6
 """Relative gain below which an exchange is rounding."""
 LEAST_DIRECTION_INFORMATION = 1e-6
-"""CandidateRows, in tolerances^-2, that a direction has at least for the logarithm of O1: a drawing
+"""Information, in tolerances^-2, that a direction has at least for the logarithm of O1: a drawing
 knows it a million times better."""
 
 ToldShare = Callable[[float], None]

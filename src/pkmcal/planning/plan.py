@@ -405,11 +405,10 @@ def _free_way(
 def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
     """(n,) whether on the way to each, motors moving evenly, the machine is lost or legs touch."""
     before = np.concatenate([home[None], joints[:-1]])
-    share = (np.arange(POSES_BETWEEN_CONFIGURATIONS) + 0.5)[
-        :, None, None
-    ] / POSES_BETWEEN_CONFIGURATIONS
+    n = POSES_BETWEEN_CONFIGURATIONS
+    share = (np.arange(n) + 0.5)[:, None, None] / n
     between = (before + share * (joints - before)).reshape(-1, joints.shape[1])
-    found = machine.forward_result(between, np.tile(poses, (POSES_BETWEEN_CONFIGURATIONS, 1, 1)))
+    found = machine.forward_result(between, np.tile(poses, (n, 1, 1)))
     good = found.converged.copy()
     at = np.flatnonzero(good)
     good[at] = usable(machine, found.T_base_platform[at], between[at])

@@ -114,13 +114,12 @@ def _check_saved(text: str, label: str) -> None:
             ),
             where=f"{label}, line {n + 1}",
             found=shown(line),
-            expected=f"'{SAVED_LINE_MARK} ' before each line below SAVE_CONFIG's header, and no"
-            f" other",
+            expected=f"'{SAVED_LINE_MARK} ' before each line below SAVE_CONFIG's header,"
+            " and no other",
             next_step="Put the header back"
             if marked
             else f"Put '{SAVED_LINE_MARK} ' before it, remove it if it is empty, or move it"
-            f" above the header;"
-            " then restart Klipper",
+            " above the header; then restart Klipper",
         )
 
 

@@ -297,8 +297,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     used = sum(provenance.used_photographs(session, observation))
     parts = [
         f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT_EDGE_WEIGHT))} of"
-        f" them given less "
-        "than half their weight"
+        " them given less than half their weight"
         for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
         if len(weights)
     ]

@@ -19,7 +19,7 @@ from pkmcal.pages.jpegs import JPEG_THREADS, jpeg
 from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
-CAMERA_ARROW_LENGTH = 0.05
+VIEW_RESIDUAL_ARROW_LENGTH = 0.05
 """Length of a large residual's arrow as a share of the picture's width."""
 ANGLE_STEP = 5.0
 """degrees of the angle from the axis that one bar of the histogram holds."""
@@ -56,7 +56,7 @@ def outcome_of(
     and forms.
     """
     c = calibration
-    wanted = CAMERA_ARROW_LENGTH * c.camera.image_size[0]
+    wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
     factor = charts.enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
@@ -193,8 +193,8 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How much of the picture was tested?",
             ((f"{covered:.0f}", "%"),),
-            f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners; elsewhere the lens"
-            f" is extrapolated",
+            f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners;"
+            " elsewhere the lens is extrapolated",
         ),
     )
 
@@ -258,7 +258,7 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = charts.enlargement(np.linalg.norm(means, axis=-1), CAMERA_ARROW_LENGTH * width)
+    factor = charts.enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     drawn = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),

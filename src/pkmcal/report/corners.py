@@ -1,4 +1,4 @@
-"""BoardCorners of a board in photographs: found, and as the calibrated machine expects them."""
+"""Corners of a board in photographs: found, and as the calibrated machine expects them."""
 
 from __future__ import annotations
 

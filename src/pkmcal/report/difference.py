@@ -12,11 +12,10 @@ from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
 from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT, coloured, space_layout
-from pkmcal.report.watch import chance_text
+from pkmcal.report.watch import NOTHING_KNOWN_SIGN, chance_text
 from pkmcal.report.workspace import middle_and_worst
 from pkmcal.wording import SHOWN_UNITS, brief, count, decimals, number
 
-NO_DIFFERENCE_SIGN = "–"
 CHANGES_ON_TERMINAL = 8
 """Changes that a terminal shows."""
 
@@ -107,7 +106,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
     for name, off, sigma in kinds:
         known = np.isfinite(off)
         if known.any():
-            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NO_DIFFERENCE_SIGN
+            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NOTHING_KNOWN_SIGN
             rows.append(Row(name, (*middle_and_worst(off), by_chance)))
     columns = ("At the same readings", "median", "worst", "by chance, 1σ")
     note = (
@@ -174,7 +173,7 @@ def _row(d: MachineDifference, k: int) -> Row:
             number(value, places),
             number(value + change, places),
             number(change, places, signed=True),
-            brief(sigma) if sigma > 0 else NO_DIFFERENCE_SIGN,
+            brief(sigma) if sigma > 0 else NOTHING_KNOWN_SIGN,
             chance,
         ),
         mark=Level.DOUBTFUL if k in d.significant else None,

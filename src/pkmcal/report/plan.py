@@ -181,8 +181,7 @@ def _order(found: MeasurementPlan) -> Part:
         tuple(rows),
         f"The way from home is the shortest that was found. Rank: if fewer are wanted, those up to"
         f" a rank are the best so many from each place. {PLAN_TABLE_FILE} holds the readings in"
-        f" metres and"
-        " radians; measured readings replace them.",
+        " metres and radians; measured readings replace them.",
         brief=False,
         words=(1,),
     )
@@ -296,8 +295,8 @@ def _places(found: MeasurementPlan) -> Part:
         ("position, m", "looks at, m", "tool from there alone"),
         tuple(rows),
         "Base frame. Chosen as a set: two places that see the same badly do not help each other."
-        f" {PLAN_PLACES_FILE} holds them as session.yaml wants them; to a few centimetres is"
-        f" enough.",
+        f" {PLAN_PLACES_FILE} holds them as session.yaml wants them;"
+        " to a few centimetres is enough.",
         words=(0, 1),
     )
     return Part("places", "Where to put the camera", tables=(table,))

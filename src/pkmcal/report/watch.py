@@ -155,8 +155,7 @@ def legs_table(w: Watch) -> Table:
         " machine that did not change, all tests allowed for. Zero off by: if nothing else"
         " changed. Found from: the smallest change of that zero, and of the joints in the direction"
         f" seen best and worst, that has a {DETECTION_POWER:.0%} probability to be found. A leg"
-        f" that changed"
-        " moves the tests of the others, too.",
+        " that changed moves the tests of the others, too.",
         first=6,
     )
 

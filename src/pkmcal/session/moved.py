@@ -24,12 +24,10 @@ def movement_departures(
     station, name : its number and name. used : configurations of which it measured something, in
     their order. what : stands there.
     """
-    times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * FEWEST_BESIDE_MOVEMENT + 1)
-    for k in np.unique(
-        np.linspace(
-            FEWEST_BESIDE_MOVEMENT, len(used) - FEWEST_BESIDE_MOVEMENT, max(times, 0)
-        ).astype(int)
-    ).tolist():
+    few = FEWEST_BESIDE_MOVEMENT
+    times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * few + 1)
+    moments = np.linspace(few, len(used) - few, max(times, 0)).astype(int)
+    for k in np.unique(moments).tolist():
         before, after = (configurations[int(used[k + d])] for d in (-1, 0))
 
         def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:

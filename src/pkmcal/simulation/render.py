@@ -416,18 +416,11 @@ def _borders(label: Integers, light: Array) -> Booleans:
 
 
 def _tiles(height: int, width: int) -> Integers:
-    """Pixel numbers (tiles, RAY_BUNDLE_SIDE^2) of square tiles; the last ones repeat the
-    border's.
-    """
-    y = (
-        np.arange(height + -height % RAY_BUNDLE_SIDE)
-        .clip(max=height - 1)
-        .reshape(-1, RAY_BUNDLE_SIDE)
-    )
-    x = np.arange(width + -width % RAY_BUNDLE_SIDE).clip(max=width - 1).reshape(-1, RAY_BUNDLE_SIDE)
-    return (y[:, None, :, None] * width + x[None, :, None, :]).reshape(
-        -1, RAY_BUNDLE_SIDE * RAY_BUNDLE_SIDE
-    )
+    """Pixel numbers (tiles, pixels of one) of square tiles; the last ones repeat the border's."""
+    side = RAY_BUNDLE_SIDE
+    y = np.arange(height + -height % side).clip(max=height - 1).reshape(-1, side)
+    x = np.arange(width + -width % side).clip(max=width - 1).reshape(-1, side)
+    return (y[:, None, :, None] * width + x[None, :, None, :]).reshape(-1, side * side)
 
 
 def _chunks(rows: Integers) -> list[Integers]:

@@ -127,8 +127,8 @@ def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
         Check(
             "joint over linear: right edges, then jointly 0.1 px outside, and a radius 1 % wrong",
             ", ".join(number(found.value, 2) for found in joint.values()),
-            f"≤ {MOST_JOINT_OVER_LINEAR[MIRROR_VIEW]} by the mirror, ≤"
-            f" {MOST_JOINT_OVER_LINEAR[PERSPECTIVE_VIEW]} by the camera{MONTE_CARLO_ASIDE}",
+            f"≤ {MOST_JOINT_OVER_LINEAR[MIRROR_VIEW]} by the mirror,"
+            f" ≤ {MOST_JOINT_OVER_LINEAR[PERSPECTIVE_VIEW]} by the camera{MONTE_CARLO_ASIDE}",
             all(
                 r.value - 2 * r.error <= MOST_JOINT_OVER_LINEAR[view]
                 for (view, _), r in joint.items()

@@ -115,8 +115,8 @@ def paper_c_figures(study: StudyResult[H4ByBoard]) -> list[Compared]:
         tolerance=lambda _key, _quantity: PAPER_C_TOLERANCE,
         held=lambda key: key[:2] not in FOLLOWS_MACHINE,
         named=lambda key, _quantity: (
-            f"{PAPER_C_MODEL_LABELS[key[1]]}, {PAPER_C_METHOD_LABELS[key[2]]}, where"
-            f" {TRUE_MACHINE_CLAUSES[key[0]]}"
+            f"{PAPER_C_MODEL_LABELS[key[1]]}, {PAPER_C_METHOD_LABELS[key[2]]},"
+            f" where {TRUE_MACHINE_CLAUSES[key[0]]}"
         ),
     )
 
