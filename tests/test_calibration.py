@@ -143,10 +143,8 @@ def test_diameters_for_radii_are_named_where_the_machine_was_recognised(demo, st
 @pytest.mark.parametrize("seed", [1, 3])
 def test_diameters_are_named_where_few_edges_happen_to_agree(tmp_path, seed):
     """Of 384 edges 67 and 55 were found here, which disagreed by no more than is accepted."""
-    machine, settings = (
-        pkmcal.load_mechanism("gough-stewart"),
-        Settings(stations=2, configurations=8),
-    )
+    machine = pkmcal.load_mechanism("gough-stewart")
+    settings = Settings(stations=2, configurations=8)
     simulate_session(tmp_path, machine, camera_of_size((640, 480)), settings, seed=101)
     session = load_session(tmp_path)
     thick = of_twice_the_radii(session.machine)

@@ -229,10 +229,8 @@ def genhexkins(hal: str, pose: Array) -> Array:
     pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in ("base", "platform")}
     for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
-    (sa, sb, sc), (ca, cb, cc) = (
-        np.sin(pose[:, 3:].T / DEGREES_A_RADIAN),
-        np.cos(pose[:, 3:].T / DEGREES_A_RADIAN),
-    )
+    angle = pose[:, 3:].T / DEGREES_A_RADIAN
+    (sa, sb, sc), (ca, cb, cc) = np.sin(angle), np.cos(angle)
     rows = [
         [cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa],
         [sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa],

@@ -81,10 +81,8 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     """
     system = _system(machine, measurements)
     now = system.start
-    weight, scale = (
-        final_weights(_distance(system, now) * ONE_RESIDUAL_FACTOR) * system.used,
-        LEAST_SCALE,
-    )
+    weight = final_weights(_distance(system, now) * ONE_RESIDUAL_FACTOR) * system.used
+    scale = LEAST_SCALE
     shading = np.full(system.unknowns.n_lines, SHIFT_SIGMA)
     for _ in range(MOST_VARIANCE_ROUNDS):
         now, half = _solved(system, now, weight, scale, shading)

@@ -67,10 +67,7 @@ def neighbours(
     low, high = machine.joint_ranges.T
     if np.isfinite(machine.joint_ranges).all():
         step = NEIGHBOUR_RANGE_SHARE * (high - low)
-        ends = (
-            low + READING_RANGE_SHARES[0] * (high - low),
-            low + READING_RANGE_SHARES[1] * (high - low),
-        )
+        ends = [low + share * (high - low) for share in READING_RANGE_SHARES]
         wanted = np.clip(joints + rng.uniform(-1, 1, joints.shape) * step, *ends)
         found = machine.forward_result(wanted, poses)
         poses = found.T_base_platform[found.converged]

@@ -351,11 +351,8 @@ def guide_parts(
     """
     foot, away, ball = drives.foot[j], drives.away[j], float(balls[j])
     along, across, deep = (ball * size for size in CARRIAGE_HALF_SIZE)
-    width, spare, back = (
-        RAIL_HALF_WIDTH * ball,
-        1.2 * along,
-        ball + 2 * deep + RAIL_HALF_WIDTH * ball,
-    )
+    width, spare = RAIL_HALF_WIDTH * ball, 1.2 * along
+    back = ball + 2 * deep + width
     way = drives.ways[j]
     rails: list[Box] = []
     if len(way) == 2:

@@ -48,19 +48,10 @@ CONTROLLED_MACHINE_SEED = 2006
 """Seed of that machine."""
 
 MIRROR_VIEW, PERSPECTIVE_VIEW = "mirror", "perspective"
-PLAIN_REGRESSION, HUBER_REGRESSION, TUKEY_REGRESSION, LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION = (
-    "plain",
-    "huber",
-    "tukey",
-    "least-median",
-    "robust",
-)
-SCALED_BY_RATIO, SCALED_BY_SIMILARITY, PAPER_B_JOINT, PAPER_B_DRAWING = (
-    "eq. 16",
-    "similarity",
-    "joint",
-    "drawing",
-)
+PLAIN_REGRESSION, HUBER_REGRESSION, TUKEY_REGRESSION = "plain", "huber", "tukey"
+LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION = "least-median", "robust"
+SCALED_BY_RATIO, SCALED_BY_SIMILARITY = "eq. 16", "similarity"
+PAPER_B_JOINT, PAPER_B_DRAWING = "joint", "drawing"
 PAPER_B_REGRESSIONS: tuple[linear.RegressionMethod, ...] = (
     PLAIN_REGRESSION,
     HUBER_REGRESSION,
@@ -136,11 +127,8 @@ class HexapodByLegs:
         """A true machine a run, its configurations, and the edges that are seen."""
         rng = batch.generator(0)
         if batch.population == CONTROLLED_POPULATION:
-            truth, view, case = (
-                controlled_machine(),
-                views_by_name()[PERSPECTIVE_VIEW],
-                PAPER_B_CASES["right"],
-            )
+            truth, view = controlled_machine(), views_by_name()[PERSPECTIVE_VIEW]
+            case = PAPER_B_CASES["right"]
             return [seen(truth, view, case, rng) for _ in range(batch.runs)]
         where, _, name = batch.population.partition(", ")
         view, case = views_by_name()[where], PAPER_B_CASES[name]

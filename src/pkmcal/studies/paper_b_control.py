@@ -45,11 +45,8 @@ class ControlledHexapod(NamedTuple):
 
 def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     """The same way with every estimate. centres : (R, L, 3) of [B] 14, camera frame, a run each."""
-    machine, view, drawing = (
-        controlled_machine(),
-        views_by_name()[PERSPECTIVE_VIEW],
-        hexapod_with_cylinder_legs(),
-    )
+    machine, drawing = controlled_machine(), hexapod_with_cylinder_legs()
+    view = views_by_name()[PERSPECTIVE_VIEW]
     true = seen_machine(machine, view.T_camera_base)
     eye = Eye.of(true, view.camera)
     runs = len(centres)

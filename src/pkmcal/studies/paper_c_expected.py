@@ -125,27 +125,20 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
     """What must hold, or the reproduction has failed."""
     place, turn = start.shift, start.turn
     before = study.values("control_mean", "design", "design", PAPER_C_DRAWING).mean(axis=0)
-    old, new = (
-        largest_side(study, ("design", method)) for method in (PAPER_C_DRAWING, EQ3_AS_PRINTED)
-    )
+    old = largest_side(study, ("design", PAPER_C_DRAWING))
+    new = largest_side(study, ("design", EQ3_AS_PRINTED))
     every = ranks(study)
     found = {key: every[key] for key in PAPER_C_RANKS}
     told_ranks, wanted = (
         ", ".join(f"{rank} ({count})" for rank, count in values.values())
         for values in (found, PAPER_C_RANKS)
     )
-    axis, dof = (
-        study.of("design", ROTATION_AXIS_METHOD)["chi2"].value,
-        study.values("dof", "design", ROTATION_AXIS_METHOD),
-    )
+    axis = study.of("design", ROTATION_AXIS_METHOD)["chi2"].value
+    dof = study.values("dof", "design", ROTATION_AXIS_METHOD)
     allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
+    compared = (PAPER_C_JOINT, PAPER_C_BOUND)
     over = [
-        ratio_of_figures(
-            *(
-                study.of(kind, kind, method)["larger_shift"]
-                for method in (PAPER_C_JOINT, PAPER_C_BOUND)
-            )
-        )
+        ratio_of_figures(*(study.of(kind, kind, method)["larger_shift"] for method in compared))
         for kind in H4_MODEL_KINDS[:2]
     ]
     right = [study.of(kind, kind, PAPER_C_JOINT)["chi2"].value for kind in H4_MODEL_KINDS]
