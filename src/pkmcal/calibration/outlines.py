@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import lines
-from pkmcal.identify.bundle import SHADING_FREEDOM
+from pkmcal.identify.line_shading import SHADING_FREEDOM
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Score
 from pkmcal.measurements import Departure, Effect, Measurements

@@ -24,6 +24,7 @@ from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.kinds import EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.noise import (
     LARGEST_NOISE_STEP,
     LEAST_NOISE_FREEDOM,
@@ -63,11 +64,6 @@ SCALE_CHANGE = 1e-3
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found; and of the edges'
 noise."""
-SHADING_FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
-some five deviations off, and costs clean ones little."""
-SHADING_WEIGHINGS = 5
-"""Rounds of weights and their common deviation, before the next solution."""
 
 
 @dataclass(frozen=True)
@@ -322,36 +318,12 @@ def _pose_scale(fit: BatchResult) -> Array:
     return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
 
-def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
-    """Standard deviation (B, n) px of each line's shading, by restricted maximum likelihood.
-
-    shift : (B, n) px, as estimated with the deviations sigma (B, n) px. told : (B, n) what the data
-    left of its variance, 1 where they say nothing of it. least : (B or 1, 1) what all have at
-    least. Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded
-    alike, and some show a highlight's border for their own, pixels off. Each line's variance is s^2
-    / w with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little,
-    Taylor 1989), x^2 the square expected of its shift. The common s^2 is the fixed point of the
-    weighted sum of squares over the number of shifts that the data tell: a line counts by what its
-    variance has become less than the prior's (MacKay 1992).
-    """
-    left = np.minimum(told, 1.0)
-    count = np.sum(1 - left, axis=1, keepdims=True)
-    square = shift**2
-    expected = square + sigma**2 * left
-    common = np.median(sigma, axis=1, keepdims=True) ** 2
-    weight = np.ones_like(square)
-    for _ in range(SHADING_WEIGHINGS):
-        weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
-        total = np.sum(weight * square, axis=1, keepdims=True)
-        common = np.maximum(total / np.maximum(count, 1e-9), np.square(least))
-    return np.maximum(np.sqrt(common / weight), least)
-
-
 def _shading_of(fit: BatchResult, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
     problem, unit = fit.info.problem, fit.info.problem.data.shading
-    variance = np.diagonal(fit.info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
-    return common_shading(unit * fit.info.state.shading, variance, unit, least)
+    lines = problem.unknowns.shading
+    covariance = unit[..., None] * fit.info.covariance[:, lines, lines] * unit[:, None]
+    return common_shading(unit * fit.info.state.shading, covariance, unit, least)
 
 
 @dataclass(frozen=True)

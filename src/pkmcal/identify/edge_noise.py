@@ -35,6 +35,8 @@ from pkmcal.solver.strips import Eliminated, Strips, eliminated
 
 TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
+LEAST_TILT_SHADING = 1e-3
+"""px; practically nothing, but a step of factors can leave it."""
 STATED_NOISE_WORTH = 5.0
 """Edges that the stated noise is worth when their own is found."""
 MOST_EDGE_NOISE_ROUNDS = 60
@@ -57,17 +59,14 @@ def edge_noise(
     tube, found = info.problem.blocks.tube, list[tuple[Array, ...]]()
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
+        begin = tuple(part[:, number] for part in before.parts)
         if not own.any():
-            found.append(
-                (before.scale[:, number], before.shading[:, number], before.tails[:, number])
-            )
+            found.append(begin)
             continue
-        begin = before.scale[:, number], before.shading[:, number]
         tails = before.tails[None, :, number] if same_tails else TAILS_TRIED[:, None]
-        squares = along[:, own], rest[:, own], size[:, own]
-        found.append(_student(*squares, weight[:, own], *begin, tails))
-    scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
-    return EdgeScatter(scale, shading, tails)
+        squares = np.stack([along[:, own], rest[:, own]])
+        found.append(_student(squares, size[:, own], weight[:, own], begin, tails))
+    return EdgeScatter(*(np.stack(part, axis=-1) for part in zip(*found, strict=True)))
 
 
 def _squares(info: Information) -> tuple[Array, Array, Array]:
@@ -93,8 +92,8 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
         square = square[:, :, :-1]
         size = shift_squares(part.blocks, data)
         weight = np.where(data.weight > 0, data.weight, 1.0)
-        along = square[..., 0] * (data.scale**2 + data.own**2 * size) / weight
-        rest = square[..., 1] * data.scale**2 / weight
+        along = square[..., 0] * (data.scale[..., 0] ** 2 + data.own**2 * size) / weight
+        rest = square[..., 1] * data.scale[..., 1] ** 2 / weight
         squares.append(np.stack([along, rest, np.broadcast_to(size, along.shape)]))
     along, rest, size = np.concatenate(squares, axis=2)
     return along, rest, size
@@ -130,63 +129,60 @@ def _taken_up(strips: Strips, found: Eliminated, half: Array) -> Array:
 
 
 def _student(
-    along: Array,
-    rest: Array,
-    size: Array,
-    weight: Array,
-    scale: Array,
-    shading: Array,
-    tried: Array,
-) -> tuple[Array, Array, Array]:
-    """Scale, shading and tails (B,) of n edges, all (B, n), by their likelihood.
+    squares: Array, size: Array, weight: Array, begin: tuple[Array, ...], tried: Array
+) -> tuple[Array, ...]:
+    """Scale, shading of shift and of tilt, and tails, (B,) each, of n edges by their likelihood.
 
-    scale, shading : (B,) where the search begins. tried : (V, B or 1) tails; for each of them
-    weights and the two variances in turns: with fixed weights these are components of the variances
-    of two normal variables, a step of Fisher's scoring each.
+    squares : (2, B, n) of shift and of tilt, size and weight (B, n). begin : where the search
+    begins, (B,) each. tried : (V, B or 1) tails; for each of them weights and the three variances
+    in turns: with fixed weights these are components of the variances of two normal variables, a
+    step of Fisher's scoring each.
     """
     from scipy.special import gammaln
 
-    tails, norm = tried[..., None], worth(tried)
-    least, count = OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
-    of_rest, square = weight * rest, size**2
-
-    def total(each: Array, times: Array) -> Array:
-        """Sums (V, B) over the edges of products (V, B, n) and (B, n)."""
-        return np.einsum("vbn,bn->vb", each, times)
+    tails, norm, each = tried[..., None], worth(tried), squares[:, None]
+    least = np.array([OWN_SHADING, LEAST_TILT_SHADING])[:, None, None] ** 2 / norm
+    count, square = np.sum(weight, axis=-1), size**2
 
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
-        """One step of the two variances."""
-        s, t = a[..., None] + b[..., None] * size, a[..., None]
-        trust = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)
+        """One step of the variances a (V, B) and b (2, V, B)."""
+        s = a[..., None] + b[..., None] * size  # (2, V, B, n) of shift and of tilt
+        trust = (tails + NUMBERS_AN_EDGE) / (tails + np.sum(each / s, axis=0))
         of_s = weight / s**2
-        left = (trust * along - s) * of_s
+        left = (trust * each - s) * of_s
         # the stated noise counts as some edges more
-        by_a = np.sum(left, axis=-1) + (total(trust, of_rest) - count * a) / a**2
-        by_a += STATED_NOISE_WORTH * (1 - a) / a**2
-        by_b = total(left, size)
-        aa, ab = np.sum(of_s, axis=-1) + (count + STATED_NOISE_WORTH) / a**2, total(of_s, size)
-        bb = total(of_s, square) + EDGE_SCATTER_FLOOR
-        det = aa * bb - ab**2
-        det = np.where(det > EDGE_SCATTER_FLOOR * aa * bb, det, np.inf)
-        new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
-        # a shading at its least is known: the scale goes on alone
-        new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
-        new_a = np.clip(new_a, a / LARGEST_VARIANCE_FACTOR, a * LARGEST_VARIANCE_FACTOR)
+        by_a = np.sum(left, axis=(0, -1)) + STATED_NOISE_WORTH * (1 - a) / a**2
+        aa = np.sum(of_s, axis=(0, -1)) + STATED_NOISE_WORTH / a**2
+        by_b, ab = np.sum(left * size, axis=-1), np.sum(of_s * size, axis=-1)
+        bb = np.sum(of_s * square, axis=-1) + EDGE_SCATTER_FLOOR
+        held = np.zeros(b.shape, dtype=bool)
+        for _ in range(2):  # a shading at its least is known: the others go on alone
+            found = np.where(held, least - b, by_b / bb)
+            share = np.where(held, 0.0, ab / bb)
+            det = aa - np.sum(share * ab, axis=0)
+            det = np.where(det > EDGE_SCATTER_FLOOR * aa, det, np.inf)
+            step = (by_a - np.sum(ab * found, axis=0)) / det
+            new = b + found - share * step
+            held = new <= least
+        new_a = np.clip(a + step, a / LARGEST_VARIANCE_FACTOR, a * LARGEST_VARIANCE_FACTOR)
         return new_a, np.maximum(
-            np.clip(new_b, b / LARGEST_VARIANCE_FACTOR, b * LARGEST_VARIANCE_FACTOR), least
+            np.clip(new, b / LARGEST_VARIANCE_FACTOR, b * LARGEST_VARIANCE_FACTOR), least
         )
 
+    scale, *shading, _ = begin
     a = scale**2 / norm
-    b = np.broadcast_to(shading**2 / norm, a.shape)
+    b = np.maximum(np.stack(shading)[:, None] ** 2 / norm, least)
     for _ in range(MOST_EDGE_NOISE_ROUNDS):
         before, (a, b) = (a, b), scored(a, b)
         change = max(np.abs(new / old - 1).max() for new, old in zip((a, b), before, strict=True))
         if change < VARIANCE_FOUND_CHANGE:
             break
-    s, t = a[..., None] + b[..., None] * size, a[..., None]
-    distance = along / s + rest / t
+    s = a[..., None] + b[..., None] * size
+    distance = np.sum(each / s, axis=0)
     cost = np.sum(
-        weight * (np.log(s * t) + (tails + NUMBERS_AN_EDGE) * np.log1p(distance / tails)) / 2,
+        weight
+        * (np.log(s).sum(axis=0) + (tails + NUMBERS_AN_EDGE) * np.log1p(distance / tails))
+        / 2,
         axis=-1,
     )
     constant = (
@@ -195,7 +191,6 @@ def _student(
         - NUMBERS_AN_EDGE / 2 * np.log(tried)
     )
     cost = cost - constant * count
-    best, run = np.argmin(cost, axis=0), np.arange(len(scale))
-    factor = (norm * np.ones_like(a))[best, run]
-    found = np.broadcast_to(tried, a.shape)[best, run]
-    return np.sqrt(factor * a[best, run]), np.sqrt(factor * b[best, run]), found
+    best, run = np.argmin(cost, axis=0), np.arange(cost.shape[-1])
+    found = np.sqrt(norm * np.concatenate([a[None], b]))[:, best, run]
+    return *found, np.broadcast_to(tried, cost.shape)[best, run]

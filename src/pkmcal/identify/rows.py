@@ -190,7 +190,7 @@ class EdgeData:
     shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
     deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
     by a unit of their station's focal breathing; zero numbers where nothing breathes. scale :
-    (B, K, G) factor on the stated noise. own : (B, K, G) px, standard deviation of the shading of
+    (B, K, G, 2) factors on the stated noise, of what a shift outward does and of the rest. own : (B, K, G) px, standard deviation of the shading of
     each edge beside its line's, that of all who share it counted.
     """
 
@@ -201,7 +201,7 @@ class EdgeData:
     weight: Array
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
-    scale: Array = field(default_factory=lambda: np.ones((1, 1, 1)))
+    scale: Array = field(default_factory=lambda: np.ones((1, 1, 1, 2)))
     own: Array = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
     def among(self, configurations: slice) -> EdgeData:
@@ -215,17 +215,16 @@ class EdgeData:
 
     @cached_property
     def whiten(self) -> Array:
-        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scale and the edges' own shading:
-        in the stated noise's units the covariance is ``scale^2 + own^2 v v^T``, v the
-        :attr:`by_shift`, and its inverse root turns only what lies along v.
+        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scales and the edges' own
+        shading: in the stated noise's units the covariance is ``tilt^2`` across v, the
+        :attr:`by_shift`, and ``shift^2 + own^2 v v^T`` along it.
         """
-        if not self.own.any():
-            return self.white / self.scale[..., None, None]
+        shift, tilt = self.scale[..., 0], self.scale[..., 1]
         v, square = self.by_shift, np.sum(self.by_shift**2, axis=-1)
-        ratio = self.scale / np.sqrt(self.scale**2 + self.own**2 * square)
+        ratio = tilt / np.sqrt(shift**2 + self.own**2 * square)
         along = v * ((ratio - 1) / np.where(square > 0, square, 1.0))[..., None]
         turned = self.white + along[..., None] * (v[..., None, :] @ self.white)
-        return turned / self.scale[..., None, None]
+        return turned / tilt[..., None, None]
 
     @cached_property
     def weighed(self) -> Array:

@@ -25,7 +25,8 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.assembly import SHIFT_SIGMA
-from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE, common_shading
+from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
@@ -95,9 +96,10 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             scale = max(scale, LEAST_SCALE)
         if shading.size:
             lines = system.unknowns.shading
-            told = np.sum(half[lines] ** 2, axis=1) / shading**2
+            covariance = half[lines] @ half[lines].T
             shift = now.shifts[system.unknowns.n_cameras :]
-            shading = common_shading(shift[None], told[None], shading[None], SHADING_SIGMA)[0]
+            given = shift[None], covariance[None], shading[None], SHADING_SIGMA
+            shading = common_shading(*given)[0]
         weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)

@@ -1,0 +1,67 @@
+"""How far light moves lines: the deviation of what all edges of a side of a tube have in common.
+
+A camera's edge shift is what all its lines have in common, and a tube's radius takes up what both
+its sides have, at every station. What is left of the lines' shifts to tell their deviation s is
+little where there is one station, and a likelihood that hardly falls from nothing to a tenth of a
+pixel has its highest point anywhere. The mean of s^2 over all that the data allow is then the
+larger, and honest (Gelman 2006).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.assembly import SHIFT_SIGMA
+
+SHADING_FREEDOM = 4.0
+"""Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
+some five deviations off, and costs clean ones little."""
+SHADING_WEIGHINGS = 5
+"""Rounds of weights and their common deviation, before the next solution."""
+SHADINGS_TRIED = np.geomspace(1.0, 100.0, 48)
+"""Deviations that are tried, in times of the least: a tenth apart."""
+
+
+def common_shading(shift: Array, covariance: Array, sigma: Array, least: Array | float) -> Array:
+    """Standard deviation (B, n) px of each line's shading, as the data have it.
+
+    shift : (B, n) px, as estimated with the deviations sigma (B, n) px; covariance : (B, n, n) of
+    that. least : (B or 1, 1) what all have at least.
+
+    With P the inverse of the covariance, the data alone say ``D = P - diag(1 / sigma^2)`` of the
+    lines and have the slope ``h = P shift`` at nothing; of normal shifts with the variances s^2
+    they have the likelihood ``|1 + s^2 D|^-1/2 exp(h^T (D + 1 / s^2)^-1 h / 2)``. s^2 is its mean
+    over a half-Cauchy distribution of s, whose scale is what a whole camera's shift may be.
+
+    Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded alike,
+    and some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w
+    with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little, Taylor
+    1989), x^2 the square expected of its shift.
+    """
+    known = np.linalg.inv(covariance)
+    slope = (known @ shift[..., None])[..., 0]
+    told = known - np.eye(shift.shape[-1]) / sigma[..., None] ** 2
+    expected = shift**2 + np.diagonal(covariance, axis1=-2, axis2=-1)
+    tried = SHADINGS_TRIED * least
+    common = np.median(sigma, axis=1, keepdims=True) ** 2
+    weight = np.ones_like(shift)
+    for _ in range(SHADING_WEIGHINGS):
+        weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
+        common = _mean_variance(told, slope, 1 / np.sqrt(weight), tried)
+    return np.maximum(np.sqrt(common / weight), least)
+
+
+def _mean_variance(told: Array, slope: Array, unit: Array, tried: Array) -> Array:
+    """The mean (B, 1) of s^2 over the deviations tried (B or 1, T), where each line's is s times
+    its ``unit`` (B, n).
+    """
+    value, vectors = np.linalg.eigh(unit[..., None] * told * unit[:, None])
+    along = (vectors.mT @ (unit * slope)[..., None])[..., 0]
+    each = 1 + tried[..., None] ** 2 * np.maximum(value, 0.0)[:, None]  # (B, T, n)
+    gain = tried[..., None] ** 2 * along[:, None] ** 2 / each
+    told_by = np.sum(gain - np.log(each), axis=-1) / 2
+    prior = tried / (1 + (tried / SHIFT_SIGMA) ** 2)  # a step of the tried ones is s wide
+    share = prior * np.exp(told_by - told_by.max(axis=-1, keepdims=True))
+    mean = np.sum(share * tried**2, axis=-1) / np.sum(share, axis=-1)
+    return mean[:, None]
