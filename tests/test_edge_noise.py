@@ -1,4 +1,4 @@
-"""The edges' noise as the data show it, and what edges that are shaded alike count for."""
+"""The edges' and the lines' noise as the data show it, and what edges that err alike count for."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
 
-from pkmcal.identify.assembly import assemble, crowd, lines
+from pkmcal.identify import line_shading
+from pkmcal.identify.alike import covariance_of_alike
+from pkmcal.identify.assembly import SHIFT_SIGMA, assemble, lines
 from pkmcal.identify.bundle import as_ended, bundle, solve_batch
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.line_cells import LineCells
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.rows import EdgeData
 from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, concatenate
 from pkmcal.solver.search import minimise
@@ -21,29 +26,39 @@ LINE = 0.05
 """px, of what all edges of a line have in common."""
 
 
-def shaded(rng, own, runs=8, configurations=8, n_stations=2):
+def alike(rng, line, normal):
+    """Draws of unit variance (B, n) that edges with normals (B, n, 3) of a line have alike where
+    these are near."""
+    out = np.zeros(normal.shape[:2])
+    for run, number in np.ndindex(len(normal), line.max() + 1):
+        mine = np.flatnonzero(line == number)
+        angle = np.arccos(np.clip(normal[run, mine] @ normal[run, mine].T, -1, 1))
+        root = np.exp(-angle / SHADING_ALIKE_ANGLE) + 1e-9 * np.eye(len(mine))
+        out[run, mine] = np.linalg.cholesky(root) @ rng.normal(size=len(mine))
+    return out
+
+
+def shaded(rng, own, runs=8, configurations=8, n_stations=2, tilt=0.0, reach=1.0):
     """A scene whose edges are shaded line by line, and each by ``own`` px beside, alike where
-    normals are near."""
-    scene = make_scene(rng, runs=runs, configurations=configurations, n_stations=n_stations)
+    normals are near; and tilted, by ``tilt`` standard deviations alike in the same way."""
+    scene = make_scene(rng, runs, configurations, n_stations, reach=reach)
     line = np.unique(scene.index[[0, 2, 3, 4]], axis=1, return_inverse=True)[1].ravel()
     shift = (LINE * rng.normal(size=(runs, line.max() + 1)))[:, line]
-    for run in range(runs):
-        for number in range(line.max() + 1):
-            mine = np.flatnonzero(line == number)
-            normal = scene.normal[run, mine]
-            angle = np.arccos(np.clip(normal @ normal.T, -1, 1))
-            root = np.linalg.cholesky(
-                np.exp(-angle / SHADING_ALIKE_ANGLE) + 1e-9 * np.eye(len(mine))
-            )
-            drawn = root @ rng.normal(size=len(mine))
-            shift[run, mine] += own * drawn
-    return replace(scene, shading=shift)
+    shift = shift + own * alike(rng, line, scene.normal)
+    turned = 0.0
+    if tilt:
+        root = np.linalg.cholesky(scene.covariance)
+        v = np.linalg.solve(root, scene.shift[..., None])[..., 0]
+        across = np.stack([-v[:, 1], v[:, 0]], axis=-1) / np.linalg.norm(v, axis=-1)[:, None]
+        drawn = tilt * alike(rng, line, scene.normal)
+        turned = (root @ across[..., None])[..., 0] * drawn[..., None]
+    return replace(scene, shading=shift, turned=turned)
 
 
 def off(result, truth):
     """Mean square of the errors in units of the stated deviations."""
     error = (result.solution.state.z - truth.z) ** 2
-    variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
+    variance = np.einsum("bii->bi", result.covariance)[:, : error.shape[1]]
     return float(np.mean(error / variance))
 
 
@@ -128,10 +143,97 @@ def test_a_crowd_is_the_sum_over_its_line():
     for k in range(len(edges)):
         near = edges.normal[number == number[k]] @ edges.normal[k]
         expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / SHADING_ALIKE_ANGLE).sum()
-    np.testing.assert_allclose(crowd(measurements, number), expected, rtol=0.05)
-    same = replace(edges, normal=np.broadcast_to(edges.normal[0], edges.normal.shape))
+    np.testing.assert_allclose(LineCells.of(edges.normal, number).crowd, expected, rtol=0.05)
+    same = np.broadcast_to(edges.normal[0], edges.normal.shape)
     counted = np.bincount(number)[number]
-    np.testing.assert_allclose(crowd(replace(measurements, edges=same), number), counted)
+    np.testing.assert_allclose(LineCells.of(same, number).crowd, counted)
+    alone = np.where(number == 0, -1, number)
+    np.testing.assert_array_equal(LineCells.of(same, alone).crowd[number == 0], 1)
+
+
+def test_what_edges_have_in_common_is_in_the_covariance():
+    """Against the whole covariance of all edges' errors, told edge by edge."""
+    rng = np.random.default_rng(12)
+    scene = shaded(rng, 0.15, runs=1, configurations=5)
+    measurements = scene.measurements(rng)
+    assembled = assemble(scene.machine, measurements, default_gauge(scene.machine))
+    result = solve_batch(assembled.problem, scene.batch(rng)[1])
+    info, problem = result.info, result.info.problem
+    at = assembled.places.edges
+    rows = info.reduced.rows[0]
+    jac = np.stack([rows[at.row, 2 * at.place + k] for k in range(2)], axis=1)
+    data, edges = problem.data, measurements.edges
+    v = at.taken(np.broadcast_to(data.by_shift, (1, *at.shape, 2))[0])
+    size = np.linalg.norm(v, axis=-1)
+    unit = v / size[:, None]
+    along = np.einsum("nr,nra->na", unit, jac)
+    across = unit[:, :1] * jac[:, 1] - unit[:, 1:] * jac[:, 0]
+    number = lines(measurements)[1]
+    angle = np.arccos(np.clip(edges.normal @ edges.normal.T, -1, 1))
+    near = np.exp(-angle / SHADING_ALIKE_ANGLE) * (number[:, None] == number)
+    noise = at.taken(data.scale[0]) ** 2
+    own = result.edges.shading[0][edges.tube] * size
+    counted = noise + at.taken(data.own[0]) ** 2 * size**2
+    shift = np.diag(noise / counted) + near * np.outer(own, own) / np.sqrt(
+        np.outer(counted, counted)
+    )
+    inverse, n = info.covariance[0], len(edges)
+    moved = {
+        part: inverse @ (along.T @ (shift - np.eye(n)) @ along + part * tilts) @ inverse
+        for part in (0.0, 1.0)
+        for tilts in [across.T @ (near - np.eye(n)) @ across]
+    }
+    found = covariance_of_alike(info)[0] - inverse
+    # one number is free, how alike tilts are
+    part = np.sum((found - moved[0]) * (moved[1] - moved[0])) / np.sum((moved[1] - moved[0]) ** 2)
+    assert 0 <= part <= 1
+    expected = moved[0] + part * (moved[1] - moved[0])
+    assert np.abs(found - expected).max() < 0.03 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 2.0])
+def test_deviations_hold_where_edges_err_alike(tilt):
+    """Where tilts do, the inverse of the normal matrix alone promises too much."""
+    rng = np.random.default_rng(13)
+    assembled, truth = shaded(rng, 0.1, runs=16, configurations=20, tilt=tilt, reach=0.15).batch(
+        rng
+    )
+    result = solve_batch(assembled.problem, truth)
+    assert off(result, truth) == pytest.approx(1, abs=0.15)
+    machine = np.einsum("bii->bi", result.info.covariance)[:, : truth.z.shape[1]]
+    by_itself = np.mean((result.solution.state.z - truth.z) ** 2 / machine)
+    assert by_itself > 1.3 if tilt else by_itself == pytest.approx(1, abs=0.15)
+
+
+def integrated(shift, covariance, sigma, least):
+    """The mean of the lines' variance by quadrature, of normal shifts with one deviation."""
+    tried = np.geomspace(least, 100 * least, 4000)
+    known = np.linalg.inv(covariance) - np.diag(1 / sigma**2)
+    best = np.linalg.solve(known, np.linalg.solve(covariance, shift))
+    density = [
+        multivariate_normal.logpdf(best, cov=np.linalg.inv(known) + s**2 * np.eye(len(shift)))
+        for s in tried
+    ]
+    share = np.exp(density - np.max(density)) / (1 + (tried / SHIFT_SIGMA) ** 2)
+    return np.sqrt(np.trapezoid(share * tried**2, tried) / np.trapezoid(share, tried))
+
+
+@pytest.mark.parametrize(("told", "n"), [(0.01, 60), (0.3, 5)])
+def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
+    """Near the true one where the data tell it; where they hardly do, well above the least."""
+    monkeypatch.setattr(line_shading, "SHADING_FREEDOM", 1e9)
+    rng = np.random.default_rng(14)
+    true = rng.normal(0, 0.1, n)
+    root = rng.normal(size=(n, n)) / np.sqrt(n)
+    noise = told**2 * (root @ root.T + np.eye(n))
+    measured = true + np.linalg.cholesky(noise) @ rng.normal(size=n)
+    sigma = np.full(n, 0.2)
+    covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
+    shift = covariance @ np.linalg.solve(noise, measured)
+    found = common_shading(shift[None], covariance[None], sigma[None], 0.03)[0]
+    np.testing.assert_allclose(found, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
+    np.testing.assert_allclose(found, 0.1, rtol=0.2 if told < 0.1 else 1.0)
+    assert found[0] > 0.05
 
 
 numbers = st.floats(-3, 3, allow_nan=False)

@@ -33,7 +33,8 @@ JOINT_NOISE = 3e-6
 class Scene:
     """machine : the drawing. theta (B, P), T_camera_base (S, 4, 4), poses (B, K, 4, 4), joints
     (B, K, 6), edge_shift (B,). index : station, configuration, leg, tube, side, (5, N).
-    normal (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2). shading (B, N) px."""
+    normal (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2). shading (B, N) px.
+    turned (B, N, 2) what else turns the normals, in that basis."""
 
     machine: Machine
     theta: np.ndarray
@@ -47,6 +48,7 @@ class Scene:
     shift: np.ndarray
     middle: np.ndarray
     shading: np.ndarray | None = None
+    turned: np.ndarray | float = 0.0
 
     def state(self, run: int = 0) -> State:
         return State(
@@ -75,7 +77,7 @@ class Scene:
         """Normals (B, N, 3) with the edge shift and noise drawn from the covariances."""
         basis = tangent_basis(self.normal, self.middle)
         pixels = self.edge_shift[:, None] + (0.0 if self.shading is None else self.shading)
-        move = self.shift * pixels[..., None]
+        move = self.shift * pixels[..., None] + self.turned
         chol = np.linalg.cholesky(self.covariance)
         draw = rng.normal(size=(*self.normal.shape[:2], 2, 1))
         move = move + noise * (chol @ draw)[..., 0]
@@ -138,15 +140,17 @@ def make_scene(
     tolerance: float = 1.0,
     machine: Machine | None = None,
     noise: float = 1.0,
+    reach: float = 1.0,
 ) -> Scene:
-    """Machines with errors of ``tolerance`` times the drawing's, in random poses."""
+    """Machines with errors of ``tolerance`` times the drawing's, in random poses; reach : how far
+    from home, in times of 0.25 rad and 40 mm."""
     machine = machine or load_mechanism("gough-stewart")
     table = machine.parameters
     free = table.free_matrix()
     sigma = table.tolerance[np.argmax(free, axis=0)]
     theta = table.drawing + (tolerance * sigma * rng.normal(size=(runs, len(sigma)))) @ free.T
-    turn = rng.uniform(-0.25, 0.25, (runs, configurations, 3))
-    move = rng.uniform(-0.04, 0.04, (runs, configurations, 3))
+    turn = reach * rng.uniform(-0.25, 0.25, (runs, configurations, 3))
+    move = reach * rng.uniform(-0.04, 0.04, (runs, configurations, 3))
     poses = perturb(machine.home(), np.concatenate([turn, move], axis=-1))
     ends = limb_ends(machine.layout, theta[:, None], np.zeros((configurations, 6)), poses)
     length = np.linalg.norm(ends.b - ends.a, axis=-1)

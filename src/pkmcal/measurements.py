@@ -109,7 +109,7 @@ class EdgeSet:
         photograph to photograph; else zero.
     shading : (N,) px, standard deviation of what shading adds to each edge beside what it adds to
         all of its line; edges of a line share it as far as their normals agree, see
-        :func:`~pkmcal.identify.assembly.crowd`. It counts where measurements are ``shaded``.
+        :mod:`~pkmcal.identify.line_cells`. It counts where measurements are ``shaded``.
     """
 
     station: Integers

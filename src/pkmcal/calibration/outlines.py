@@ -16,8 +16,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import lines
-from pkmcal.identify.line_shading import SHADING_FREEDOM
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.line_shading import SHADING_FREEDOM
 from pkmcal.identify.score import Score
 from pkmcal.measurements import Departure, Effect, Measurements
 from pkmcal.observe.predict import legs_in_camera

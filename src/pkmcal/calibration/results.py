@@ -204,10 +204,10 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
     if not estimate.edge_weights.size:
         return []
     found = estimate.edge_noise
-    names = "scale", "shading", "tilt", "tails"
+    rows = zip(found.scale, found.shading, found.tails, strict=True)
     return [
-        {"tube": k, **dict(zip(names, numbers, strict=True))}
-        for k, numbers in enumerate(zip(*found.parts, strict=True), start=1)
+        {"tube": k, "scale": scale, "shading": shading, "tails": tails}
+        for k, (scale, shading, tails) in enumerate(rows, start=1)
     ]
 
 

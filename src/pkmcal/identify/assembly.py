@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TypeVar, cast
 
 import numpy as np
@@ -12,10 +11,11 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
+from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_ALIKE_ANGLE, SHADING_SIGMA, Measurements
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -204,30 +204,6 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
     return keys, number
 
 
-def crowd(measurements: Measurements, number: Integers) -> Array:
-    """How many edges of its line share an edge's own shading, itself among them, (N,): the sum of
-    exp(-angle / SHADING_ALIKE_ANGLE) over the angles between the normals. number : (N,) of each
-    edge's line.
-
-    Of n edges with the same normal each counts as one n-th, whatever their number. Normals are
-    gathered in cells an eighth of SHADING_ALIKE_ANGLE wide first, so that thousands cost little.
-    """
-    edges = measurements.edges
-    out = np.ones(len(edges))
-    cell = np.round(8 * edges.normal / SHADING_ALIKE_ANGLE).astype(int)
-    keys, at = np.unique(np.column_stack([number, cell]), axis=0, return_inverse=True)
-    at = at.reshape(-1)
-    count = np.bincount(at)
-    middle = np.stack([np.bincount(at, n) for n in edges.normal.T], axis=-1) / count[:, None]
-    middle = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
-    first = np.searchsorted(keys[:, 0], np.arange(number.max(initial=-1) + 2))
-    many = np.ones(len(count))
-    for start, end in pairwise(first.tolist()):
-        angle = np.arccos(np.clip(middle[start:end] @ middle[start:end].T, -1, 1))
-        many[start:end] = np.exp(-angle / SHADING_ALIKE_ANGLE) @ count[start:end]
-    return np.where(number >= 0, many[at], out)
-
-
 def _alone(measurements: Measurements) -> Booleans:
     """(N,) edges of stations that saw one configuration alone, as photographs by hand do."""
     pair = np.unique(
@@ -255,10 +231,11 @@ def _edges(
         # the measured normals move with the intrinsics; residuals are predicted less measured
         optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
     own, crowded = np.zeros((2, len(edges)))
+    cells = LineCells.of(edges.normal, line if len(line) else np.full(len(edges), -1))
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
         alone = np.where(line < 0, SHADING_SIGMA, 0.0)
-        crowded = 1 + share * (crowd(measurements, line) - 1)
+        crowded = 1 + share * (cells.crowd - 1)
         own = np.hypot(edges.shading * np.sqrt(crowded), alone)
     legs = np.unique(edges.leg)
     leg = np.repeat(legs, at.shape[1] // max(len(legs), 1))
@@ -274,6 +251,8 @@ def _edges(
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
         tube=at.filled(edges.tube),
         crowd=at.filled(crowded),
+        cell=np.where(at.present, at.filled(cells.cell), -1),
+        cells=cells,
     )
     data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],

@@ -13,6 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
+from pkmcal.identify.alike import covariance_of_alike
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Information,
@@ -90,6 +91,11 @@ class BatchResult:
     def components(self) -> Components:
         """How large the noise of each kind of rows shows itself."""
         return components(self.info, self.weight)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (B, na, na) of the shared unknowns, with what edges have in common."""
+        return covariance_of_alike(self.info)
 
     @property
     def noise_scale(self) -> Array:
@@ -440,7 +446,7 @@ def _estimate(
 ) -> Estimate:
     """The result in the gauge, with everything that a report asks for."""
     found, problem = result.solution.state, result.info.problem
-    shared, u = result.info.covariance[0], problem.unknowns
+    shared, u = result.covariance[0], problem.unknowns
     solved = state_of(assembled, found, start)
     full = machine_covariance(problem, machine, solved, shared, gauge)
     state = in_gauge(machine, solved, gauge)

@@ -155,8 +155,8 @@ class Estimate:
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
         found = self.edge_noise
-        shading = found.shading[edges.tube]
-        edges = replace(edges, covariance=found.covariance(edges), shading=shading)
+        covariance = edges.covariance * found.scale[edges.tube, None, None] ** 2
+        edges = replace(edges, covariance=covariance, shading=found.shading[edges.tube])
         noise = measurements.joint_noise * scale
         return replace(measurements, edges=edges, joint_noise=noise)
 

@@ -17,7 +17,7 @@ from pkmcal.identify.assembly import SHIFT_SIGMA
 SHADING_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
 some five deviations off, and costs clean ones little."""
-SHADING_WEIGHINGS = 5
+SHADING_WEIGHINGS = 2
 """Rounds of weights and their common deviation, before the next solution."""
 SHADINGS_TRIED = np.geomspace(1.0, 100.0, 48)
 """Deviations that are tried, in times of the least: a tenth apart."""

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
 from pkmcal.geometry.rigid import dot, pose_difference, skew
+from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import Closure
@@ -82,7 +83,8 @@ def _among(numbers: BlockNumbers, configurations: slice, axis: int) -> BlockNumb
     """
     cut = (slice(None),) * axis + (configurations,)
     found = ((f.name, getattr(numbers, f.name)) for f in fields(numbers))
-    return replace(numbers, **{name: x[cut] for name, x in found if x.shape[axis] > 1})
+    arrays = ((name, x) for name, x in found if isinstance(x, np.ndarray))
+    return replace(numbers, **{name: x[cut] for name, x in arrays if x.shape[axis] > 1})
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class EdgeBlocks:
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
     empty where nothing is shaded. tube : (K, G) number of the tube on its leg. crowd : (K, G) how
-    many of its line share an edge's own shading (:func:`~pkmcal.identify.assembly.crowd`), zero
-    where nothing is shaded.
+    many of its line share an edge's own shading, see :mod:`~pkmcal.identify.line_cells`, zero where
+    nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
     """
 
     leg: Integers
@@ -110,6 +112,8 @@ class EdgeBlocks:
     present: Booleans
     tube: Integers
     crowd: Array
+    cell: Integers
+    cells: LineCells
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
     def among(self, configurations: slice) -> EdgeBlocks:
@@ -190,7 +194,7 @@ class EdgeData:
     shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
     deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
     by a unit of their station's focal breathing; zero numbers where nothing breathes. scale :
-    (B, K, G, 2) factors on the stated noise, of what a shift outward does and of the rest. own : (B, K, G) px, standard deviation of the shading of
+    (B, K, G) factor on the stated noise. own : (B, K, G) px, standard deviation of the shading of
     each edge beside its line's, that of all who share it counted.
     """
 
@@ -201,7 +205,7 @@ class EdgeData:
     weight: Array
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
-    scale: Array = field(default_factory=lambda: np.ones((1, 1, 1, 2)))
+    scale: Array = field(default_factory=lambda: np.ones((1, 1, 1)))
     own: Array = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
     def among(self, configurations: slice) -> EdgeData:
@@ -215,16 +219,17 @@ class EdgeData:
 
     @cached_property
     def whiten(self) -> Array:
-        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scales and the edges' own
-        shading: in the stated noise's units the covariance is ``tilt^2`` across v, the
-        :attr:`by_shift`, and ``shift^2 + own^2 v v^T`` along it.
+        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scale and the edges' own shading:
+        in the stated noise's units the covariance is ``scale^2 + own^2 v v^T``, v the
+        :attr:`by_shift`, and its inverse root turns only what lies along v.
         """
-        shift, tilt = self.scale[..., 0], self.scale[..., 1]
+        if not self.own.any():
+            return self.white / self.scale[..., None, None]
         v, square = self.by_shift, np.sum(self.by_shift**2, axis=-1)
-        ratio = tilt / np.sqrt(shift**2 + self.own**2 * square)
+        ratio = self.scale / np.sqrt(self.scale**2 + self.own**2 * square)
         along = v * ((ratio - 1) / np.where(square > 0, square, 1.0))[..., None]
         turned = self.white + along[..., None] * (v[..., None, :] @ self.white)
-        return turned / tilt[..., None, None]
+        return turned / self.scale[..., None, None]
 
     @cached_property
     def weighed(self) -> Array:

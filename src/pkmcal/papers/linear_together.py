@@ -26,8 +26,8 @@ from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.assembly import SHIFT_SIGMA
 from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE
-from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.gauge import centre_index
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements

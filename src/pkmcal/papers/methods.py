@@ -168,7 +168,7 @@ def _estimate(
         pose_weights=np.ones(len(poses)),
         edge_weights=weight,
         edge_noise=EdgeScatter(
-            *(np.full(n_tubes, each) for each in (scale, scale * OWN_SHADING, 0.0, np.inf))
+            np.full(n_tubes, scale), np.full(n_tubes, scale * OWN_SHADING), np.full(n_tubes, np.inf)
         ),
         edge_trust=np.ones(len(weight)),
         joint_residuals=joints / measurements.joint_noise,

@@ -201,11 +201,11 @@ def _told(
     kept &= expected
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
-    covariance = estimate.edge_noise.covariance(edges)
-    weight = estimate.edge_weights * estimate.edge_trust
+    scale = estimate.edge_noise.scale[edges.tube]
+    weight = estimate.edge_weights * estimate.edge_trust / scale**2
     own = unit[place(edges)]
     told = np.zeros((*shape, 2, 2))  # lost edges stay zero
-    told[place(edges)] = own.mT @ (np.linalg.inv(covariance) * weight[:, None, None]) @ own
+    told[place(edges)] = own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
     kind = np.stack([tubes.tube, tubes.side], axis=1)
     long = np.ones(shape)
     long[place(ideal)] = pixel_lengths(ideal)
@@ -214,7 +214,7 @@ def _told(
     sigma = np.full((len(few), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.hypot(
-        np.sqrt(covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
+        scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
     )
     for s, j in np.ndindex(len(few), n_legs):
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)

@@ -130,7 +130,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
-    tubes = zip(*noise.parts, strict=True)
+    tubes = zip(noise.scale, noise.shading, noise.tails, strict=True)
     units = dict.fromkeys(session.machine.joint_units)
     return (
         ("Session", session.folder.name),

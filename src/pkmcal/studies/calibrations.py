@@ -184,7 +184,7 @@ class SimulatedCalibrations:
         state = state_of(
             data.assembled, take(found.solution.state, np.array([run])), _truth(data, run)
         )
-        shared = found.info.covariance[run]
+        shared = found.covariance[run]
         full = machine_covariance(data.assembled.problem, machine, state, shared, self.gauge)
         theta = machine.parameters.unit_axes(in_gauge(machine, state, self.gauge).theta)
         return theta, full[:p, :p]

@@ -1,0 +1,93 @@
+"""The edges' rows with what the unknowns take up of them: shift and tilt apart.
+
+In the noise that a solution counts with, the two residuals of an edge are turned into the one along
+what a shift outward does and the one across, its tilt. Of both the hat matrix has the part of the
+configuration's own unknowns, ``q q^T``, and that of the shared ones, ``t t^T`` with ``t = F^T J``
+where J is what elimination has left of the row and ``F F^T`` the shared unknowns' covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.scatter import NUMBERS_AN_EDGE
+from pkmcal.solver.elimination import divisions
+from pkmcal.solver.strips import Eliminated, StripLayout, eliminated
+
+
+@dataclass(frozen=True)
+class ReducedEdges:
+    """The edges of some configurations of B runs, in strips: N views of r numbers each, shift and
+    tilt of one edge after the other.
+
+    problem : of these configurations, from ``first`` on. value : (B, N, r) residuals. own : (B, N,
+    d, r) what the own unknowns take up, q. numbers : (B, w, N, r) rows by the strips' unknowns.
+    """
+
+    problem: Problem
+    first: int
+    layout: StripLayout
+    value: Array
+    own: Array
+    numbers: Array
+    found: Eliminated
+
+    @property
+    def at(self) -> tuple[Integers, Integers]:
+        """Configuration and place, (N, 1) and (N, r / 2), of each edge; place -1 for padding."""
+        place = self.layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
+        return self.layout.configuration[:, None], place
+
+    def placed(self, numbers: Array) -> Array:
+        """Numbers (B, N, r) at the edges' places, (B, K', G, 2)."""
+        count, places = self.problem.blocks.present.shape
+        # a place more than there are takes in the padding, -1
+        out = np.zeros((len(numbers), count, places + 1, NUMBERS_AN_EDGE))
+        out[:, *self.at] = numbers.reshape(*numbers.shape[:2], -1, NUMBERS_AN_EDGE)
+        return out[:, :, :-1]
+
+    def shared(self, half: Array) -> Iterator[tuple[slice, Array]]:
+        """What the shared unknowns take up, t, of views with the same unknowns after the other, (B,
+        N', na, r); half : (B, na, na) F.
+        """
+        at = self.layout.configuration
+        of_own = (self.found.along @ half[:, None]).mT
+        by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
+        for cut, columns in zip(self.layout.groups, self.layout.columns, strict=True):
+            taken = by_shared[:, None, columns].mT @ self.numbers[:, :, cut].swapaxes(1, 2)
+            yield cut, taken - of_own[:, at[cut]] @ self.own[:, cut]
+
+
+def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
+    """The edges of a solution, some configurations after the other."""
+    problem, n_runs = info.problem, len(info.state.z)
+    for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
+        part, state = problem.among(cut), problem.state_among(info.state, cut)
+        rows = part.compact(state)
+        found, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
+        at = layout.configuration[:, None], layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
+        v = part.data.by_shift
+        norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
+        unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
+        numbers = _turned(rows.strips.numbers, unit[:, *at])
+        d = layout.n_own
+        own = found.inverse.mT[:, layout.configuration] @ numbers[:, :d].swapaxes(1, 2)
+        yield ReducedEdges(part, cut.start, layout, numbers[:, -1], own, numbers[:, d:-1], found)
+
+
+def _turned(numbers: Array, unit: Array) -> Array:
+    """Numbers (B, ..., N, n) of strips of edges with the two rows of each turned into those along
+    ``unit`` (B, N, n / 2, 2) and across.
+    """
+    first, second = numbers[..., ::NUMBERS_AN_EDGE], numbers[..., 1::NUMBERS_AN_EDGE]
+    x, y = np.moveaxis(unit, -1, 0)[:, :, None]
+    out = np.empty_like(numbers)
+    out[..., ::NUMBERS_AN_EDGE] = x * first + y * second
+    out[..., 1::NUMBERS_AN_EDGE] = x * second - y * first
+    return out
