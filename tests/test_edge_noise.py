@@ -230,7 +230,9 @@ def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
     sigma = np.full(n, 0.2)
     covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
     shift = covariance @ np.linalg.solve(noise, measured)
-    found = common_shading(shift[None], covariance[None], sigma[None], 0.03)[0]
+    found = common_shading(
+        shift[None], covariance[None], np.eye(n), sigma[None], np.ones((1, n)), 0.03
+    )[0]
     np.testing.assert_allclose(found, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
     np.testing.assert_allclose(found, 0.1, rtol=0.2 if told < 0.1 else 1.0)
     assert found[0] > 0.05

@@ -23,6 +23,9 @@ SHADING_ALIKE_ANGLE = np.radians(7.0)
 shading ceases to be the same, by exp(-angle / SHADING_ALIKE_ANGLE): what a surface mirrors, and
 where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree by
 half at 5 degrees once what all have in common is taken off."""
+TUBES_ALIKE = 0.4
+"""The same between edges of two tubes of a leg on one side: they see the same light, and mirror the
+same, in part. Of path-traced legs of five finishes 0.2 to 0.6."""
 BREATHING_SIGMA = 1.5e-3
 """Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
 focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5

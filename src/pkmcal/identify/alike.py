@@ -95,10 +95,10 @@ def _beside(info: Information) -> Array:
             taken = taken.reshape(len(mine), -1)
             compared.append(_Tilts(*(x[some] for x in (value, tilt, taken, number, mine))))
     by_tilts = -tilts
-    for own, alike in cells.alike():
+    for own, shifts_alike, tilts_alike in cells.alike():
         shift, tilt = sums[:, own]
-        out += shift.T @ alike @ shift
-        by_tilts += tilt.T @ alike @ tilt
+        out += shift.T @ shifts_alike @ shift
+        by_tilts += tilt.T @ tilts_alike @ tilt
     every_tilt = _Tilts(*(np.concatenate(part) for part in zip(*compared, strict=True)))
     return out + every_tilt.part_alike(cells) * by_tilts
 
@@ -118,15 +118,14 @@ class _Tilts(NamedTuple):
         """c; see the module."""
         from scipy.special import ndtr
 
-        own = np.where(
-            self.configuration[:, None] == self.configuration, self.own @ self.own.T, 0.0
-        )
-        rest = np.eye(len(self.value)) - self.shared @ self.shared.T - own
+        together = self.configuration[:, None] == self.configuration
+        taken = self.shared @ self.shared.T + np.where(together, self.own @ self.own.T, 0.0)
+        rest = np.eye(len(self.value)) - taken
         square = self.value @ self.value / max(np.trace(rest), LEAST_TILT_FREEDOM)
         pairs = np.zeros_like(rest)
-        for line, alike in cells.alike():
-            mine = np.flatnonzero((self.cell >= line.start) & (self.cell < line.stop))
-            place = self.cell[mine] - line.start
+        for own, _, alike in cells.alike():
+            mine = np.flatnonzero((self.cell >= own.start) & (self.cell < own.stop))
+            place = self.cell[mine] - own.start
             pairs[np.ix_(mine, mine)] = alike[np.ix_(place, place)] - np.eye(len(mine))
         product = pairs @ rest
         told = np.sum(product * product.T)

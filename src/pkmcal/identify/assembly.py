@@ -15,7 +15,7 @@ from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, Measurements
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBES_ALIKE, Measurements
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -90,7 +90,8 @@ def assemble(
     where these are candidates, for the edges that share their shading.
     """
     _check(machine, measurements)
-    seen, line = seen_configurations(measurements), lines(measurements)[1]
+    seen, (keys, line) = seen_configurations(measurements), lines(measurements)
+    side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
     edges = _places(measurements.edges.configuration, seen, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
@@ -112,12 +113,13 @@ def assemble(
         use_drawing=use_drawing,
         on_platform=measurements.on_platform,
         level=measurements.level,
+        side=side,
     )
     if measurements.intrinsics_at.size:
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     target[[kind == "breathing" for kind in kinds]] = -measurements.breathing_at
-    blocks, data = _edges(machine, measurements, edges, line, seen, share)
+    blocks, data = _edges(machine, measurements, edges, line, side, seen, share)
     data = replace(data, shading=np.atleast_2d(shading).astype(float))
     pose_blocks, pose_data = _poses(measurements, poses)
     problem = Problem(
@@ -218,6 +220,7 @@ def _edges(
     measurements: Measurements,
     at: Places,
     line: Integers,
+    side: Integers,
     seen: Booleans,
     share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
@@ -231,7 +234,7 @@ def _edges(
         # the measured normals move with the intrinsics; residuals are predicted less measured
         optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
     own, crowded = np.zeros((2, len(edges)))
-    cells = LineCells.of(edges.normal, line if len(line) else np.full(len(edges), -1))
+    cells = LineCells.of(edges.normal, line if len(line) else np.full(len(edges), -1), side)
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
         alone = np.where(line < 0, SHADING_SIGMA, 0.0)
@@ -300,13 +303,15 @@ def prior_rows(
     use_drawing: bool,
     on_platform: Booleans,
     level: Booleans,
+    side: Integers,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
     can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading,
     breathing and sizes stand in units of their prior. on_platform : (M,) mounts. level : (S,)
-    stations that do not tilt against the base.
+    stations that do not tilt against the base. side : (n,) number of the leg's side at a station
+    that each line is on: what shades two tubes there is alike by TUBES_ALIKE.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -317,7 +322,9 @@ def prior_rows(
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = np.flatnonzero(radius | use_drawing)
     optics = np.tile([SHIFT_SIGMA] + [1.0] * (u.n_optics - 1), u.n_cameras)
-    lines = np.ones(u.n_lines)
+    shaded = np.where(side[:, None] == side, TUBES_ALIKE, 0.0) + (1 - TUBES_ALIKE) * np.eye(
+        len(side)
+    )
     moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
     upright = np.flatnonzero(level)
@@ -325,7 +332,7 @@ def prior_rows(
     known = (
         ("drawing", held, tolerance[held]),
         ("camera", u.columns("optics"), optics),
-        ("shading", u.columns("shading"), lines),
+        ("shading", u.columns("shading"), np.linalg.cholesky(shaded)),
         ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
         ("size", u.columns("sizes"), np.ones(u.n_sizes)),
         ("mount", places, np.full(len(places), _size(machine) if len(places) else 1.0)),
@@ -335,7 +342,7 @@ def prior_rows(
     kinds: list[str] = []
     for kind, columns, sigma in known:
         part = np.zeros((len(columns), u.count))
-        part[np.arange(len(columns)), columns] = 1 / sigma
+        part[:, columns] = np.diag(1 / sigma) if sigma.ndim == 1 else np.linalg.inv(sigma)
         rows.append(part)
         kinds += [kind] * len(part)
     if not use_drawing and freedoms(machine).shape[1]:

@@ -98,8 +98,9 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             lines = system.unknowns.shading
             covariance = half[lines] @ half[lines].T
             shift = now.shifts[system.unknowns.n_cameras :]
-            given = shift[None], covariance[None], shading[None], SHADING_SIGMA
-            shading = common_shading(*given)[0]
+            alike, rare = np.eye(len(shift)), np.ones((1, len(shift)))
+            given = shift[None], covariance[None], alike, shading[None], rare
+            shading = common_shading(*given, SHADING_SIGMA)[0]
         weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)
