@@ -62,6 +62,8 @@ FREE_ROUNDS = 6
 would take turns for ever."""
 SCALE_CHANGE = 1e-3
 """Relative change of a noise scale below which it counts as found."""
+LEAST_SHADING_SHARE = 0.1
+"""Part of the usual deviation of the lines' shading below which it is not looked for."""
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found; and of the edges'
 noise."""
@@ -133,7 +135,7 @@ def solve_batch(
     # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
     # outliers of the edges that speak against it.
     estimates_shading = scale_noise and problem.unknowns.n_lines > 0
-    least = problem.data.shading[:, :1]
+    least = LEAST_SHADING_SHARE * problem.data.shading[:, :1]
     if estimates_shading:
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)

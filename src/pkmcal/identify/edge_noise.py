@@ -25,12 +25,12 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.reduced_edges import reduced_edges
 from pkmcal.identify.scatter import (
     EDGE_SCATTER_FLOOR,
+    LEAST_OWN_SHADING,
     NUMBERS_AN_EDGE,
     EdgeScatter,
     shift_squares,
     worth,
 )
-from pkmcal.measurements import OWN_SHADING
 
 TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
@@ -107,7 +107,7 @@ def _student(
     from scipy.special import gammaln
 
     tails, norm = tried[..., None], worth(tried)
-    least, count = OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
+    least, count = LEAST_OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
     of_rest, square = weight * rest, size**2
 
     def total(each: Array, times: Array) -> Array:

@@ -24,7 +24,7 @@ SHADING_FREEDOM = 4.0
 some five deviations off, and costs clean ones little."""
 SHADING_WEIGHINGS = 2
 """Rounds of weights and their common deviation, before the next solution."""
-SHADINGS_TRIED = np.geomspace(1.0, 100.0, 48)
+SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
 """Deviations that are tried, in times of the least: a tenth apart."""
 
 

@@ -16,6 +16,8 @@ from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 NUMBERS_AN_EDGE = 2
 """Numbers that an edge measures."""
 EDGE_SCATTER_FLOOR = 1e-12
+LEAST_OWN_SHADING = OWN_SHADING / 3
+"""px; what a session of few edges can tell to be less."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class EdgeScatter:
         """Deviations as many times as far from another's, with these tails."""
         scale = before.scale * (self.scale / before.scale) ** pace
         shading = before.shading * (self.shading / before.shading) ** pace
-        return replace(self, scale=scale, shading=np.maximum(shading, OWN_SHADING))
+        return replace(self, scale=scale, shading=np.maximum(shading, LEAST_OWN_SHADING))
 
     def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
         """The edges with this noise."""
