@@ -122,9 +122,9 @@ def find_station(
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
-    for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
-        asked = number % folds == fold
-        searched, other = np.flatnonzero(~asked), np.flatnonzero(asked)
+    asked = [number % folds == fold for fold in range(folds if count > 1 else 0)]
+    parts = [(np.flatnonzero(~part), np.flatnonzero(part)) for part in asked]  # one alone has none
+    for searched, other in parts:
         found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
@@ -139,6 +139,8 @@ def find_station(
     order = order[without_shadows(candidates[order], light)]
     first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
+    if parts and confirmed >= BY_CHANCE:
+        confirmed = min(confirmed, _asked_again(view, candidates[order], parts, rng))
     order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
@@ -336,6 +338,30 @@ def _confirmed(view: StationView, place: Array, asked: Array, surely: list[Array
     choices = len(distinct_silhouettes(view, asked, every))
     about = [sure for sure, mine in zip(surely, own, strict=True) if mine]
     return min(choices * _by_chance(about), 1.0)
+
+
+def _asked_again(
+    view: StationView,
+    candidates: Array,
+    parts: list[tuple[Integers, Integers]],
+    rng: np.random.Generator,
+) -> float:
+    """Probability by chance of what photographs say of the first of some places (H, 4, 4), where a
+    search in a part of them ended beside it, at a place that the rest do not confirm.
+
+    It is searched in each part alone, from the place that all have led to, and the rest are asked.
+    All have chosen it: from so many places, and in a second attempt.
+    """
+    surely: list[Array] = []
+    for searched, other in parts:
+        part = view.select(searched)
+        few = part.few(8)
+        near, evidence = settle_by_evidence(
+            part, _best_about(part, candidates[:1], few, rng), few, 5, 5
+        )
+        surely.append(_surely(view, near[evidence.argmax()], searched, other, rng))
+    choices = len(distinct_silhouettes(view, candidates, view.few(len(view.configuration))))
+    return min(2 * choices * _by_chance(surely), 1.0)
 
 
 def _by_chance(parts: list[Array]) -> float:
