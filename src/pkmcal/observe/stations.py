@@ -139,7 +139,7 @@ def find_station(
     order = order[without_shadows(candidates[order], light)]
     first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
-    if parts and confirmed >= BY_CHANCE:
+    if parts and T_camera_base is None and confirmed >= BY_CHANCE:
         confirmed = min(confirmed, _asked_again(view, candidates[order], parts, rng))
     order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
