@@ -16,10 +16,9 @@ from pkmcal.identify.assembly import SHIFT_SIGMA, assemble, lines
 from pkmcal.identify.bundle import as_ended, bundle, solve_batch
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.line_cells import LineCells
-from pkmcal.identify.line_shading import common_shading, rarity
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.rows import EdgeData
 from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, TUBES_ALIKE, concatenate
-from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver.search import minimise
 from test_identify_scene import make_scene
 
@@ -235,9 +234,7 @@ def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
     sigma = np.full(n, 0.2)
     covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
     shift = covariance @ np.linalg.solve(noise, measured)
-    found = common_shading(
-        shift[None], covariance[None], np.eye(n), sigma[None], np.ones((1, n)), 0.03
-    )[0]
+    found = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03)[0]
     np.testing.assert_allclose(found, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
     if told < 0.1:
         np.testing.assert_allclose(found, 0.1, rtol=0.2)
@@ -246,23 +243,6 @@ def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
 
 
 numbers = st.floats(-3, 3, allow_nan=False)
-
-
-def test_a_line_that_few_photographs_show_is_less_known():
-    """Of six photographs all, half, and one: as many times as far as its edges may all be off."""
-    rng = np.random.default_rng(15)
-    measurements = shaded(rng, 0.1, runs=1, configurations=6, n_stations=1).measurements(rng)
-    edges, number = measurements.edges, lines(measurements)[1]
-    most = np.flatnonzero(np.bincount(number) == 6)
-    rest = np.cumsum(number == most[1]) > 3
-    one = np.cumsum(number == most[2]) > 1
-    kept = ~(((number == most[1]) & rest) | ((number == most[2]) & one))
-    fewer = replace(measurements, edges=edges.select(kept))
-    assembled = assemble(
-        load_mechanism("gough-stewart"), fewer, default_gauge(load_mechanism("gough-stewart"))
-    )
-    found = rarity(assembled.problem.blocks, assembled.problem.data.weight)[0]
-    np.testing.assert_allclose(found[most[:3]], [1, 2, 6])
 
 
 @given(

@@ -25,7 +25,7 @@ from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.kinds import EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
-from pkmcal.identify.line_shading import common_shading, rarity
+from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.noise import (
     LARGEST_NOISE_STEP,
     LEAST_NOISE_FREEDOM,
@@ -333,8 +333,7 @@ def _shading_of(fit: BatchResult, least: Array) -> Array:
     covariance = unit[..., None] * fit.info.covariance[:, lines, lines] * unit[:, None]
     prior = problem.prior[:, lines]
     alike = np.linalg.inv(prior.T @ prior)
-    rare = rarity(problem.blocks, fit.weight.edges)
-    return common_shading(unit * fit.info.state.shading, covariance, alike, unit, rare, least)
+    return common_shading(unit * fit.info.state.shading, covariance, alike, unit, least)
 
 
 @dataclass(frozen=True)

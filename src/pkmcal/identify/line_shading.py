@@ -5,10 +5,6 @@ its sides have, at every station. What is left of the lines' shifts to tell thei
 little where there is one station, and a likelihood that hardly falls from nothing to a tenth of a
 pixel has its highest point anywhere. The mean of s^2 over all that the data allow is then the
 larger, and honest (Gelman 2006).
-
-Of a line that hardly any photograph shows, those edges that were found are no better than the ones
-that were not: s is that of a line which was measured in all photographs of its station, and one of
-which a part was has it times as many as there are to one that was found (:func:`rarity`).
 """
 
 from __future__ import annotations
@@ -17,7 +13,6 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.assembly import SHIFT_SIGMA
-from pkmcal.identify.rows import EdgeBlocks
 
 SHADING_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
@@ -28,27 +23,13 @@ SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
 """Deviations that are tried, in times of the least: a tenth apart."""
 
 
-def rarity(blocks: EdgeBlocks, weight: Array) -> Array:
-    """Photographs of its station to each edge of a line in use, (B, n); weight : (B, K, G)."""
-    n_lines = int(blocks.line.max(initial=-1)) + 1
-    mine = blocks.present & (blocks.line >= 0)
-    line, (row, _) = blocks.line[mine], np.nonzero(mine)
-    station = np.zeros(n_lines, dtype=int)
-    station[line] = blocks.station[mine]
-    seen = np.unique(np.stack([blocks.station[mine], row]), axis=1)[0]
-    photographs = np.bincount(seen, minlength=int(station.max(initial=0)) + 1)[station]
-    found = np.stack([np.bincount(line, own[mine], n_lines) for own in weight])
-    return photographs / np.maximum(found, 1.0)
-
-
 def common_shading(
-    shift: Array, covariance: Array, alike: Array, sigma: Array, rare: Array, least: Array | float
+    shift: Array, covariance: Array, alike: Array, sigma: Array, least: Array | float
 ) -> Array:
     """Standard deviation (B, n) px of each line's shading, as the data have it.
 
     shift : (B, n) px, as estimated with the deviations sigma (B, n) px and the correlations alike
-    (n, n); covariance : (B, n, n) of that. rare : (B, n) their :func:`rarity`. least : (B or 1, 1)
-    what all have at least.
+    (n, n); covariance : (B, n, n) of that. least : (B or 1, 1) what all have at least.
 
     With P the inverse of the covariance and R of the correlations, the data alone say ``D = P - R /
     sigma sigma^T`` of the lines and have the slope ``h = P shift`` at nothing; of normal shifts
@@ -59,21 +40,21 @@ def common_shading(
     Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded alike,
     and some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w
     with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little, Taylor
-    1989), x^2 the square expected of its shift; both in times of its rarity.
+    1989), x^2 the square expected of its shift.
     """
     known = np.linalg.inv(covariance)
     slope = (known @ shift[..., None])[..., 0]
     told = known - np.linalg.inv(alike) / (sigma[..., None] * sigma[:, None])
     root = np.linalg.cholesky(alike)
-    expected = (shift**2 + np.diagonal(covariance, axis1=-2, axis2=-1)) / rare**2
+    expected = shift**2 + np.diagonal(covariance, axis1=-2, axis2=-1)
     tried = SHADINGS_TRIED * least
-    common = np.median(sigma / rare, axis=1, keepdims=True) ** 2
+    common = np.median(sigma, axis=1, keepdims=True) ** 2
     weight = np.ones_like(shift)
     for _ in range(SHADING_WEIGHINGS):
         weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
-        unit = (rare / np.sqrt(weight))[..., None] * root
+        unit = root / np.sqrt(weight)[..., None]
         common = _mean_variance(unit.mT @ told @ unit, unit.mT @ slope[..., None], tried)
-    return np.maximum(rare * np.sqrt(common / weight), least)
+    return np.maximum(np.sqrt(common / weight), least)
 
 
 def _mean_variance(told: Array, slope: Array, tried: Array) -> Array:

@@ -98,8 +98,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             lines = system.unknowns.shading
             covariance = half[lines] @ half[lines].T
             shift = now.shifts[system.unknowns.n_cameras :]
-            alike, rare = np.eye(len(shift)), np.ones((1, len(shift)))
-            given = shift[None], covariance[None], alike, shading[None], rare
+            given = shift[None], covariance[None], np.eye(len(shift)), shading[None]
             shading = common_shading(*given, SHADING_SIGMA)[0]
         weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
