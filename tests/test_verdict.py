@@ -60,6 +60,15 @@ def test_a_whole_session_may_be_used(whole):
     assert verdict.warnings == ()
 
 
+def test_light_that_moves_single_edges_is_warned_of(whole):
+    observation, estimate, findings, _ = whole
+    noise = replace(estimate.edge_noise, shading=np.array([0.02, 0.11]))
+    shiny = replace(estimate, edge_noise=noise)
+    (said,) = judge(observation, shiny, findings).warnings
+    assert said.startswith("Light moves single edges by 0.11 px, as on polished metal")
+    assert "softer light, a white sheet" in said
+
+
 def test_stations_apart_are_refused_with_words_and_advice(apart):
     _, _, findings, verdict = apart
     assert not verdict.usable
