@@ -13,6 +13,7 @@ do not.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -343,7 +344,7 @@ def _confirmed(view: StationView, place: Array, asked: Array, surely: list[Array
 def _asked_again(
     view: StationView,
     candidates: Array,
-    parts: list[tuple[Integers, Integers]],
+    parts: Sequence[tuple[Integers, Integers]],
     rng: np.random.Generator,
 ) -> float:
     """Probability by chance of what photographs say of the first of some places (H, 4, 4), where a
