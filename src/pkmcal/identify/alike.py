@@ -50,14 +50,17 @@ def covariance_of_alike(info: Information) -> Array:
         return info.covariance
     out = info.covariance.copy()
     for run in range(len(out)):
-        one = Information(
-            info.problem.select(np.array([run])),
-            take(info.state, np.array([run])),
-            None if info.normal is None else info.normal[[run]],
-        )
+        one = info if len(out) == 1 else _of_run(info, run)  # of many edges no copy is made
         half = one.root[0]
         out[run] += half @ _beside(one) @ half.T
     return out
+
+
+def _of_run(info: Information, run: int) -> Information:
+    """What one run's problem says alone."""
+    at = np.array([run])
+    normal = None if info.normal is None else info.normal[at]
+    return Information(info.problem.select(at), take(info.state, at), normal)
 
 
 def _beside(info: Information) -> Array:
