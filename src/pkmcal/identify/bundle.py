@@ -65,8 +65,8 @@ SCALE_CHANGE = 1e-3
 LEAST_SHADING_SHARE = 0.1
 """Part of the usual deviation of the lines' shading below which it is not looked for."""
 SHADING_CHANGE = 0.02
-"""Relative change of the shading's deviation below which it counts as found; and of the edges'
-noise."""
+"""Change of the shading's deviation, in times of it and no less than of what is usual, below which
+it counts as found; and of the edges' noise."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,8 @@ def _settle(
             weight = settled_weights(norms(problem, rows), scale)
             if by_tube:
                 trust = edges.trust(problem.blocks, np.sum(rows.edges**2, axis=-1))
-        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
+        change = (shading - problem.data.shading) / np.maximum(problem.data.shading, SHADING_SIGMA)
+        found_shading = np.abs(change).max() < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():
             readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
@@ -330,7 +331,8 @@ def _shading_of(fit: BatchResult, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
     problem, unit = fit.info.problem, fit.info.problem.data.shading
     lines = problem.unknowns.shading
-    covariance = unit[..., None] * fit.info.covariance[:, lines, lines] * unit[:, None]
+    half = unit[..., None] * fit.info.root[:, lines]
+    covariance = half @ half.mT
     prior = problem.prior[:, lines]
     alike = np.linalg.inv(prior.T @ prior)
     return common_shading(unit * fit.info.state.shading, covariance, alike, unit, least)

@@ -72,10 +72,13 @@ class EdgeScatter:
         return np.sqrt(np.where(count > 0, square / np.maximum(count, EDGE_SCATTER_FLOOR), 1.0))
 
     def close_to(self, other: EdgeScatter, share: float) -> bool:
-        """Whether its deviations are another's up to a share, and its tails the same."""
-        pairs = ((self.scale, other.scale), (self.shading, other.shading))
-        change = [np.abs(new / old - 1).max(initial=0.0) for new, old in pairs]
-        return max(change) < share and bool(np.all(self.tails == other.tails))
+        """Whether its deviations are another's up to a share, those of shading up to one of what is
+        usual, and its tails the same.
+        """
+        scale = np.abs(self.scale / other.scale - 1).max(initial=0.0)
+        usual = np.maximum(other.shading, OWN_SHADING)
+        shading = (np.abs(self.shading - other.shading) / usual).max(initial=0.0)
+        return max(scale, shading) < share and bool(np.all(self.tails == other.tails))
 
     def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
         """Deviations as many times as far from another's, with these tails."""
