@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe import stations
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.legs import LEG_SEARCH_REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
@@ -20,6 +23,9 @@ from pkmcal.observe.tables import (
     direction_of,
     distance_tables,
 )
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings, load_truth, simulate_session
+from pkmcal.simulation.demo import camera_of_size
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -369,3 +375,22 @@ def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
     assert without_shadows(places, np.array([-1.0, 0.2, -0.9])).tolist() == [0, 1, 2]
     places[1] = pose(rotation(np.array([0.0, 0.0, 1.0])), np.zeros(3))
     assert without_shadows(places, np.array([-1.0, 0.9, 0.0])).tolist() == [0, 1, 2]
+
+
+@pytest.mark.slow
+def test_a_place_that_half_of_the_photographs_miss_is_asked_about_again(tmp_path, monkeypatch):
+    """Of three legs that are alike a search in five photographs ends beside the place that all ten
+    lead to: it is believed once the others are asked about that, and not before."""
+    settings = Settings(stations=1, configurations=10)
+    folder = tmp_path / "session"
+    simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)
+    session = load_session(folder)
+    shown = read_photographs(session)
+    (view,) = recognise(session, shown, platform_poses(session), [np.random.default_rng(0)]).views
+    found = find_station(view, None, np.random.default_rng(1))
+    true = load_truth(folder, session.machine).T_camera_base[0]
+    eye, there = (inverse(T)[:3, 3] for T in (found.T_camera_base, true))
+    assert found.good
+    assert np.linalg.norm(eye - there) < 0.1 * np.linalg.norm(there)
+    monkeypatch.setattr(stations, "_asked_again", lambda *_: 1.0)
+    assert not find_station(view, None, np.random.default_rng(1)).good
