@@ -38,8 +38,10 @@ from pkmcal.solver.search import take
 MOST_TILTS_COMPARED = 800
 """Edges, of configurations evenly among all, whose tilts tell how alike they are, if there are
 more: c is then known to a few hundredths."""
-
-LEAST_TILT_FREEDOM = 1e-9
+LEAST_TILTS_TOLD = 1e-9
+"""Below it the pairs of tilts, or a probability, are rounding."""
+UNTOLD_PART_ALIKE = 0.5
+"""The mean of a part of which nothing is told."""
 
 
 def covariance_of_alike(info: Information) -> Array:
@@ -124,7 +126,7 @@ class _Tilts(NamedTuple):
         together = self.configuration[:, None] == self.configuration
         taken = self.shared @ self.shared.T + np.where(together, self.own @ self.own.T, 0.0)
         rest = np.eye(len(self.value)) - taken
-        square = self.value @ self.value / max(np.trace(rest), LEAST_TILT_FREEDOM)
+        square = self.value @ self.value / max(np.trace(rest), LEAST_TILTS_TOLD)
         pairs = np.zeros_like(rest)
         for own, _, alike in cells.alike():
             mine = np.flatnonzero((self.cell >= own.start) & (self.cell < own.stop))
@@ -132,13 +134,13 @@ class _Tilts(NamedTuple):
             pairs[np.ix_(mine, mine)] = alike[np.ix_(place, place)] - np.eye(len(mine))
         product = pairs @ rest
         told = np.sum(product * product.T)
-        if square == 0 or told <= LEAST_TILT_FREEDOM:
-            return 0.5
+        if square == 0 or told <= LEAST_TILTS_TOLD:
+            return UNTOLD_PART_ALIKE
         found = (self.value @ pairs @ self.value / square - np.trace(product)) / told
         sigma = np.sqrt(2 / told)
         low, high = -found / sigma, (1 - found) / sigma
         density = np.exp(-(np.array([low, high]) ** 2) / 2) / np.sqrt(2 * np.pi)
         within = ndtr(high) - ndtr(low)
-        if within < LEAST_TILT_FREEDOM:
+        if within < LEAST_TILTS_TOLD:
             return float(np.clip(found, 0.0, 1.0))
         return float(found + sigma * (density[0] - density[1]) / within)
