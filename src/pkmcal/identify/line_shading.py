@@ -32,10 +32,10 @@ def common_shading(
     (n, n); covariance : (B, n, n) of that. least : (B or 1, 1) what all have at least.
 
     With P the inverse of the covariance and R that of the correlations, the data alone say
-    ``D = P - R / sigma sigma^T`` of the lines and have the slope ``h = P shift`` at nothing; of normal shifts
-    with the covariance ``s^2 R^-1`` they have the likelihood ``|R + s^2 D|^-1/2 exp(h^T (D + R /
-    s^2)^-1 h / 2)``. s^2 is its mean over a half-Cauchy distribution of s, whose scale is what a
-    whole camera's shift may be.
+    ``D = P - R / sigma sigma^T`` of the lines and have the slope ``h = P shift`` at nothing; of
+    normal shifts with the covariance ``s^2 R^-1`` they have the likelihood
+    ``|R + s^2 D|^-1/2 exp(h^T (D + R / s^2)^-1 h / 2)``. s^2 is its mean over a half-Cauchy
+    distribution of s, whose scale is what a whole camera's shift may be.
 
     Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded alike,
     and some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w
