@@ -41,8 +41,7 @@ class ReducedEdges:
     @property
     def at(self) -> tuple[Integers, Integers]:
         """Configuration and place, (N, 1) and (N, r / 2), of each edge; place -1 for padding."""
-        place = self.layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
-        return self.layout.configuration[:, None], place
+        return _edges_at(self.layout)
 
     def placed(self, numbers: Array) -> Array:
         """Numbers (B, N, r) at the edges' places, (B, K', G, 2)."""
@@ -71,14 +70,18 @@ def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         rows = part.compact(state)
         found, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
-        at = layout.configuration[:, None], layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
         v = part.data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
-        numbers = _turned(rows.strips.numbers, unit[:, *at])
+        numbers = _turned(rows.strips.numbers, unit[:, *_edges_at(layout)])
         d = layout.n_own
         own = found.inverse.mT[:, layout.configuration] @ numbers[:, :d].swapaxes(1, 2)
         yield ReducedEdges(part, cut.start, layout, numbers[:, -1], own, numbers[:, d:-1], found)
+
+
+def _edges_at(layout: StripLayout) -> tuple[Integers, Integers]:
+    """Configuration and place of the edges in strips; see :attr:`ReducedEdges.at`."""
+    return layout.configuration[:, None], layout.rows[:, ::NUMBERS_AN_EDGE] // NUMBERS_AN_EDGE
 
 
 def _turned(numbers: Array, unit: Array) -> Array:

@@ -76,7 +76,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     One equation an edge, ``n.A + R = 0`` with A = T_camera_base P, its normal n as it is without
     the camera's edge shift and the line's shading, divided by the deviation of n.A. Beside them
     the drawing, 0.3 px for a camera's shift, and for the lines' what they have in common, which is
-    estimated as the joint estimate's is.
+    estimated as the joint estimate's is, but each tube's for itself and no less than usual.
     Raises ResultError where a station sees fewer than three legs in two directions each, or the
     legs' joints on the base move.
     """
