@@ -21,6 +21,7 @@ from pkmcal.observe.profiles import (
     locate,
     profile_offsets,
     residual_curves,
+    sampled_offsets,
     without_highlights,
 )
 
@@ -110,7 +111,7 @@ def make(
 ):
     """Random profiles; the signal is exact at the profile's places, the noise interpolated."""
     rng = np.random.default_rng(seed)
-    offsets = profile_offsets()
+    offsets = sampled_offsets()
     grey, truth, widths, clipped = [], [], [], []
     for _ in range(number):
         limb = draw_limb(rng, light, albedo, ground, half_width, least_contrast, lamp)
@@ -126,9 +127,15 @@ def make(
         truth.append(shift)
         widths.append(limb.half_width)
         clipped.append(np.any(samples >= SATURATED_GREY_LEVEL, axis=0))
-    counts, widths = np.full(number, float(count)), np.array(widths)
-    cut = cut_of(np.array(clipped), widths)
-    return Made(Profiles(np.array(grey), counts, widths, cut), np.array(truth))
+    counts = np.full(number, float(count))
+    profiles = Profiles.of(np.array(grey), np.array(clipped), counts, np.array(widths))
+    return Made(profiles, np.array(truth))
+
+
+def plain(grey, half_width):
+    """Whole profiles (N, samples) at the places that the model explains."""
+    count, none = len(grey), np.zeros(len(grey), dtype=int)
+    return Profiles(grey, np.full(count, 24.0), np.full(count, half_width), none, none, none > 0)
 
 
 def steepest(profiles):
@@ -268,24 +275,46 @@ def test_slim_legs_are_looked_at_near_their_limb_only():
     assert np.all(depth <= np.maximum(0.45 * width, 1.25))
 
 
+def test_a_highlight_is_not_taken_for_the_limb():
+    """Its outer border lies up to a pixel within the limb, and is the likelier edge of the two."""
+    dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
+    made = make(8, half_width=(7, 14), lamp=10.0, **dark)
+    less, highlight = without_highlights(made.profiles, 0.7)
+    assert highlight.mean() > 0.85
+    at = located(less, 0.7)
+    off = at.position - made.truth
+    assert rms(off[at.found & highlight]) > 0.9
+    assert rms(off[at.found & ~highlight]) < 0.3
+
+
 def test_what_lies_beyond_a_highlights_middle_is_left_out():
-    """With its far side in the profile its near border, inside the limb, is the likelier edge."""
+    """Where it stands out less than the limb itself, the profile is good for that."""
     dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
     made = make(8, half_width=(7, 14), lamp=3.0, **dark)
-    less = without_highlights(made.profiles)
+    less, highlight = without_highlights(made.profiles, 0.7)
     assert np.mean(less.cut > made.profiles.cut) > 0.9
     cut, whole = located(less, 0.7), located(made.profiles, 0.7)
     off, before = (np.abs(at.position - made.truth)[at.found] for at in (cut, whole))
     assert cut.found.sum() > whole.found.sum()
     assert np.mean(off > 0.5) < 0.5 * np.mean(before > 0.5)
     assert rms(off) < 0.7 * rms(before)
+    assert rms(off[~highlight[cut.found]]) < 0.8 * rms(off)
 
 
 def test_diffuse_light_is_kept():
     """The limb of a matt tube under a lamp from the side turns from light to dark as well."""
     made = make(5, half_width=(9, 50))
-    less = without_highlights(made.profiles)
+    less, highlight = without_highlights(made.profiles, 0.7)
     assert np.mean(less.cut > made.profiles.cut) < 0.02
+    assert not highlight.any()
+
+
+def test_paint_with_the_light_behind_it_shows_no_highlight():
+    """Its limbs are bright strips too, of which the model is true."""
+    made = make(5, half_width=(9, 50), light=(1.5, 2.2), least_contrast=20)
+    less, highlight = without_highlights(made.profiles, 0.7)
+    assert np.mean(less.cut > made.profiles.cut) > 0.2
+    assert highlight.mean() < 0.01
 
 
 @pytest.mark.parametrize("blur", [0.5, 0.55, 0.63, 0.7, 0.85, 1.0, 1.2])
@@ -311,10 +340,7 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
     level = blurred(step, blur)
     truth = np.linspace(-1, 1, 9)
     grey = np.stack([np.interp(profile_offsets() - t, PLACE, level) for t in truth])
-    count = len(truth)
-    profiles = Profiles(
-        grey, np.full(count, 24.0), np.full(count, 12.0), np.zeros(count, dtype=int)
-    )
+    profiles = plain(grey, 12.0)
     at = located(profiles, blur)
     assert at.found.all()
     np.testing.assert_allclose(at.position, truth, atol=0.014)
@@ -324,7 +350,7 @@ def test_where_there_is_no_edge_none_is_found():
     rng = np.random.default_rng(8)
     for noise in (0.2, 1.0, 5.0):
         grey = 120 + noise * rng.normal(size=(200, len(profile_offsets())))
-        flat = Profiles(grey, np.full(200, 24.0), np.full(200, 12.0), np.zeros(200, dtype=int))
+        flat = plain(grey, 12.0)
         assert located(flat, 0.7).found.mean() < 0.01
 
 
@@ -332,5 +358,5 @@ def test_where_there_is_no_edge_none_is_found():
 def test_an_edge_out_of_reach_is_not_found(away):
     level = blurred(Limb(12, 0.8, 200, 30, 0.0).brightness(), 0.7)
     grey = np.interp(profile_offsets() - away, PLACE, level)[None]
-    alone = Profiles(grey, np.array([24.0]), np.array([12.0]), np.array([0]))
+    alone = plain(grey, 12.0)
     assert not located(alone, 0.7).found.any()

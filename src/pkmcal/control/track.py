@@ -300,7 +300,8 @@ def warm_up(blur: float) -> None:
     width = np.repeat(profiles.HALF_WIDTHS, samples)
     cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
     grey = np.zeros((len(width), samples))
-    some = profiles.Profiles(grey, np.ones(len(width)), width, cut)
+    none = np.zeros(len(width), dtype=int)
+    some = profiles.Profiles(grey, np.ones(len(width)), width, cut, none, none > 0)
     profiles.locate(some, profiles.residual_curves(some, blur), np.zeros(len(width)))
 
 

@@ -39,7 +39,7 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.observe.profiles import EdgeFits, edge_set, fit_edges
+from pkmcal.observe.profiles import FEWEST_PLACES_FOR_TILT, EdgeFits, edge_set, fit_edges
 
 PHOTOGRAPHS_A_WINDOW = 32
 """Photographs that are looked at together: their profiles take some 80 MB."""
@@ -391,8 +391,7 @@ def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, pose
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    full, across = _segment_profiles(photographs, points, clear, half_width)
-    return _Seen(tubes, places, full, across)
+    return _Seen(tubes, places, *_segment_profiles(photographs, points, clear, half_width))
 
 
 def _measured(
@@ -400,18 +399,20 @@ def _measured(
 ) -> tuple[StationEdges, Array]:
     """One window's part of :func:`measure`, and how far (px) each place was from its prediction."""
     tubes, places, full = seen.tubes, seen.places, seen.full
-    across = profiles.without_highlights(seen.across)
+    across, highlight = profiles.without_highlights(seen.across, blur)
     curves = profiles.residual_curves(across, blur)
     about = _leg_lines(profiles.shift_log_likelihoods(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
-    position[full], sigma[full], found[full] = at.position, at.sigma, at.found
+    position[full], sigma[full], found[full] = at.position, at.sigma, at.found & ~highlight
     fits = fit_edges(places, position, sigma, found)
     by_camera = photographs.camera.project_jacobians(places.point)[1] if refine_camera else None
     edges = edge_set(
         places, fits, tubes, photographs.station, photographs.configuration, fits.good, by_camera
     )
-    rejected = _rejections(photographs, tubes, full, found, fits)
+    lamps = full.copy()
+    lamps[full] = at.found & highlight
+    rejected = _rejections(photographs, tubes, full, found, lamps, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
     number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
@@ -443,7 +444,7 @@ def _segment_profiles(
     seen = seen[:, None].astype(np.float32)
     outward = np.repeat(_by_segment(points.outward)[full], PROFILES_A_POINT, axis=-2)
     pixel = photographs.camera.project(_between(points, full))
-    offsets = profiles.profile_offsets()
+    offsets = profiles.sampled_offsets()
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
     clipped = np.empty_like(total)
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
@@ -455,9 +456,8 @@ def _segment_profiles(
         grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
         np.matmul(seen[mine], grey >= profiles.SATURATED_GREY_LEVEL, out=clipped[mine])
-    cut = profiles.cut_of(clipped[:, 0] > 0, half_width[full])
     mean = total[:, 0] / count[full][:, None]
-    return full, profiles.Profiles(mean, count[full], half_width[full], cut)
+    return full, profiles.Profiles.of(mean, clipped[:, 0] > 0, count[full], half_width[full])
 
 
 def _by_segment(values: Array | Booleans) -> Any:
@@ -503,15 +503,18 @@ def _rejections(
     tubes: TubeList,
     full: Booleans,
     found: Booleans,
+    lamps: Booleans,
     fits: EdgeFits,
 ) -> tuple[Rejection, ...]:
     """Edges without a measurement, each with its reason."""
-    visible, seen = full.sum(axis=-1), found.sum(axis=-1)
+    visible, seen, mirrored = (where.sum(axis=-1) for where in (full, found, lamps))
     out: list[Rejection] = []
     for k, e in zip(*np.nonzero(~fits.good), strict=True):
         if visible[k, e] == 0:
             why = _HIDDEN
-        elif seen[k, e] < 3:
+        elif seen[k, e] < FEWEST_PLACES_FOR_TILT <= (seen + mirrored)[k, e]:
+            why = "a highlight lies along it, and hides where the leg ends"
+        elif seen[k, e] < FEWEST_PLACES_FOR_TILT:
             why = "too little of it is seen as a clear edge"
         else:
             why = "its places do not lie on one edge"

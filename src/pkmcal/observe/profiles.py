@@ -12,7 +12,7 @@ residual over a grid of positions is a matrix product, and its minimum is the ed
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,6 +26,8 @@ from pkmcal.observe.predict import EdgePoints, TubeList
 PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
 """Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
 other features and neighbours."""
+SAMPLED_INSIDE = 6.0
+"""Pixels inside to which profiles are sampled: beyond what is explained, a highlight ends."""
 MODELLED_LIMB_SHARE = 0.45
 """Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
 metal begin further in. On slim legs this is less than PROFILE_REACH_INSIDE."""
@@ -96,8 +98,13 @@ class ProfileEdges:
     found: Booleans
 
 
+def sampled_offsets() -> Array:
+    """Places along a profile that are sampled, px outward from the predicted edge."""
+    return np.arange(-SAMPLED_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
+
+
 def profile_offsets() -> Array:
-    """Places along a profile, px outward from the predicted edge."""
+    """The outermost of them, that the model explains."""
     return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
@@ -143,20 +150,30 @@ class Profiles:
     grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
     averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
     are not used: clipped at the camera's brightest level, or too deep inside a slim leg.
+    strip, bright : (N,), see :func:`strips`.
     """
 
     grey: Array
     count: Array
     half_width: Array
     cut: Integers
+    strip: Integers
+    bright: Booleans
+
+    @classmethod
+    def of(cls, grey: Array, clipped: Booleans, count: Array, half_width: Array) -> Profiles:
+        """From samples at :func:`sampled_offsets`, grey (N, samples), which are clipped or not."""
+        explained = slice(len(sampled_offsets()) - len(profile_offsets()), None)
+        cut = cut_of(clipped[:, explained], half_width)
+        return cls(grey[:, explained], count, half_width, cut, *strips(grey, count, half_width))
 
     def select(self, keep: Booleans | Integers) -> Profiles:
         """The profiles at a mask or at positions."""
-        return Profiles(self.grey[keep], self.count[keep], self.half_width[keep], self.cut[keep])
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def contrast(self) -> Array:
         """Largest grey-level difference in each profile, (N,)."""
-        return np.maximum(np.ptp(self.grey, axis=-1), 1e-3)
+        return _contrast(self.grey)
 
 
 def cut_of(saturated: Booleans, half_width: Array) -> Integers:
@@ -172,29 +189,52 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
     return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
 
-def without_highlights(profiles: Profiles) -> Profiles:
-    """Profiles without what lies deeper than a highlight's middle.
+def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Booleans]:
+    """Samples (N,) of :func:`profile_offsets` inward of the middle of a strip within the limb, 0
+    where there is none, and strips that are brighter than what lies behind the leg (N,).
 
-    A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
-    its far side in the profile its near border is the likelier edge. Its middle is where the
-    departure from the background is largest before, further in, it is less by more than diffuse
-    light allows, whose cosine changes by MODELLED_LIMB_SHARE down to that depth, and by more than
-    noise.
+    grey : (N, samples) at :func:`sampled_offsets`. count, half_width : (N,), as of `Profiles`.
+    A strip is where, further in, the departure from the background is less again by more than
+    diffuse light as a rule allows, whose cosine changes by MODELLED_LIMB_SHARE down to that depth,
+    and by more than noise.
     """
-    offsets = profile_offsets()
-    grey, contrast = profiles.grey, profiles.contrast()
+    offsets = sampled_offsets()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
     inside = np.flatnonzero(offsets <= -PROFILE_STEP)[::-1]  # from the limb inwards
-    away = np.abs(grey[:, inside] - background)
+    departure = grey[:, inside] - background
+    away = np.abs(departure)
     most = np.maximum.accumulate(away, axis=1)
-    noise = (np.hypot(_noise(profiles), PROFILE_MODEL_ERROR) * contrast)[:, None]
+    contrast = _contrast(grey[:, offsets >= -PROFILE_REACH_INSIDE])
+    noise = (np.hypot(_noise(contrast, count), PROFILE_MODEL_ERROR) * contrast)[:, None]
     less = most - away > np.maximum(HIGHLIGHT_DEVIATIONS * noise, MODELLED_LIMB_SHARE * most)
+    depth = np.maximum(MODELLED_LIMB_SHARE * half_width, PROFILE_REACH_INSIDE)
+    less &= -offsets[inside] <= depth[:, None]
     # the last place that was its own largest before it was less
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
     largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
-    middle = np.minimum(inside[largest], np.searchsorted(offsets, -LEAST_INSIDE - 1e-9))
-    cut = np.where(less.any(axis=1), middle, 0)
-    return replace(profiles, cut=np.maximum(profiles.cut, cut))
+    there, which = less.any(axis=1), np.arange(len(grey))
+    middle = np.minimum(offsets[inside[largest]], -LEAST_INSIDE)
+    cut = np.searchsorted(profile_offsets(), middle - 1e-9)
+    return np.where(there, cut, 0), there & (departure[which, largest] > 0)
+
+
+def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Booleans]:
+    """Profiles without what lies deeper than a strip's middle, and those (N,) that show a
+    highlight for the limb.
+
+    A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
+    its far side in the profile its near border is the likelier edge. Between that and the limb
+    the metal is as dark as what lies behind the leg: the edge itself is not to be seen. Paint with
+    the light behind it has a bright strip as well, but one that the model explains to its usual
+    error; a highlight it does not.
+    """
+    bright, odd = np.flatnonzero(profiles.bright), np.zeros(len(profiles.cut), dtype=bool)
+    if bright.size:
+        whole = profiles.select(bright)
+        left = residual_curves(whole, blur).min(axis=-1) * PROFILE_STEP
+        expected = _noise(whole.contrast(), whole.count) ** 2 + PROFILE_MODEL_ERROR**2
+        odd[bright] = left > expected * _freedom(whole)
+    return replace(profiles, cut=np.maximum(profiles.cut, profiles.strip)), odd
 
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
@@ -223,9 +263,8 @@ def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
     curves : of :func:`residual_curves`.
     """
     samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
-    floor = samples * (_noise(profiles) ** 2 + PROFILE_MODEL_ERROR**2)
-    freedom = np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
-    out = -freedom[:, None] / 2 * np.log(curves + floor[:, None])
+    floor = samples * (_noise(profiles.contrast(), profiles.count) ** 2 + PROFILE_MODEL_ERROR**2)
+    out = -_freedom(profiles)[:, None] / 2 * np.log(curves + floor[:, None])
     out -= out.max(axis=-1, keepdims=True)
     return np.where(_shows_its_edge(profiles)[:, None], out, 0.0)
 
@@ -248,9 +287,8 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
     )
     bend = np.maximum(left - 2 * here + right, 1e-12)
     position = EDGE_SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
-    # neighbouring samples of a profile at half a pixel share their noise: two count as one
-    freedom = (profiles.grey.shape[-1] - profiles.cut) * PROFILE_STEP - BRIGHTNESS_UNKNOWNS
-    variance = here * PROFILE_STEP / np.maximum(freedom, 1.0) + _noise(profiles) ** 2
+    noise = _noise(profiles.contrast(), profiles.count)
+    variance = here * PROFILE_STEP / _freedom(profiles) + noise**2
     # cost(x) = residual / (variance / PROFILE_STEP): its second derivative is 2 / sigma^2
     sigma = np.sqrt(2 * (variance / PROFILE_STEP) / (bend / step**2))
     inside = (lowest > 0) & (lowest < 2 * half)
@@ -259,9 +297,21 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
     )
 
 
-def _noise(profiles: Profiles) -> Array:
+def _contrast(grey: Array) -> Array:
+    return np.maximum(np.ptp(grey, axis=-1), 1e-3)
+
+
+def _noise(contrast: Array, count: Array) -> Array:
     """Least noise (N,) believed of a sample, in contrasts."""
-    return GREY_NOISE / profiles.contrast() / np.sqrt(np.maximum(profiles.count, 1))
+    return GREY_NOISE / contrast / np.sqrt(np.maximum(count, 1))
+
+
+def _freedom(profiles: Profiles) -> Array:
+    """Degrees of freedom (N,) that the model leaves. Neighbouring samples of a profile at half a
+    pixel share their noise: two count as one.
+    """
+    samples = profiles.grey.shape[-1] - profiles.cut
+    return np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
 
 
 def _shows_its_edge(profiles: Profiles) -> Booleans:
