@@ -18,10 +18,10 @@ from pkmcal.observe.diagnose import SeenStation, _best_names, _numbering, mistak
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, find_station
+from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.observe.tables import distance_tables
 from test_observe_drawing import camera_of, draw, machine, photographs, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose
 
