@@ -104,7 +104,7 @@ def sampled_offsets() -> Array:
 
 
 def profile_offsets() -> Array:
-    """The outermost of them, that the model explains."""
+    """Places of a profile that the model explains, the outermost of those that are sampled."""
     return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
