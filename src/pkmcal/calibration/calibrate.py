@@ -280,7 +280,7 @@ def _judge(
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
     clock.told("Judging", 0.95)
-    if found.turns.cameras.active:  # the edges are where these cameras see them
+    if found.turns.cameras.active or found.turns.coded:  # the edges are where these cameras see them
         cameras = found.turns.cameras
         refined = [
             replace(station, camera=cameras.at_station(k))
@@ -317,6 +317,7 @@ def _judge(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
             *numbering_told(session),
+            *(one.sentence for one in found.turns.coded),
         ),
     )
     clock.lap("identify")

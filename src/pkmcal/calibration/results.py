@@ -368,6 +368,7 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     return [
         {
             "file": files[c],
+            "response": next(s.camera.response for s in stations if s.camera_file == files[c]),
             "edge_shift": estimate.state.edge_shift[c],
             "sigma": estimate.edge_shift_sigma[c],
             **_refined(calibration, files[c]),

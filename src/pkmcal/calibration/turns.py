@@ -18,6 +18,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
+from pkmcal.calibration.coded import CodeTold, told_by_edges
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress
@@ -69,6 +70,7 @@ class Turns(NamedTuple):
     measurements: Measurements
     estimate: Estimate
     cameras: CameraRefinement
+    coded: tuple[CodeTold, ...] = ()
 
 
 def take_turns(
@@ -84,9 +86,10 @@ def take_turns(
     session, photographs, boards, _ = seen
     total, machine = sum(len(p.images) for p in photographs), session.machine
     estimate = _first_estimate(seen, total, told, lap)
-    blur: dict[int, float | None] = {p.station: None for p in photographs}
+    blur: dict[int, float | None] = {}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
+    coded: tuple[CodeTold, ...] = ()
     for turn in range(MOST_EDGE_LOOKS):
         share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
         done = _counted(told, "Measuring edges", total, share)
@@ -98,15 +101,30 @@ def take_turns(
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
         told("Identifying", share + 0.05)
+        before = estimate
         start, moved = _at_cameras(estimate.state, cameras), max(look.moved for look in looks)
         if turn == 0 and moved > ASTRAY_EDGE_DISTANCE:
             start = better_start(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
         lap("identify")
+        if turn == 0:
+            again = partial(_measure, estimate=before, blur={}, refine=cameras.active)
+            coded = told_by_edges(
+                session,
+                photographs,
+                measurements,
+                estimate,
+                lambda some, look=again: concatenate([seen.edges for seen in _each(some, look)]),
+                lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
+            )
+            if coded:
+                cameras = cameras.coded({one.file: one.response for one in coded})
+                blur = {}
+                continue
         if moved < SETTLED_EDGE_DISTANCE and not cameras.active:
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
-    return Turns(observation, measurements, estimate, cameras)
+    return Turns(observation, measurements, estimate, cameras, coded)
 
 
 def _counted(
@@ -251,7 +269,7 @@ def _measure(
     estimate: Estimate,
     blur: dict[int, float | None],
     refine: bool,
-    done: legs.PhotographsLookedAt,
+    done: legs.PhotographsLookedAt | None = None,
 ) -> legs.StationEdges:
     state = estimate.state
     return legs.measure(
@@ -259,7 +277,7 @@ def _measure(
         estimate.machine,
         state.T_camera_base[photographs.station],
         state.T_base_platform[photographs.configuration],
-        blur[photographs.station],
+        blur.get(photographs.station),
         refine_camera=refine,
         done=done,
     )

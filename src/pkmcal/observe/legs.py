@@ -24,6 +24,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
+from pkmcal.cameras.response import light_in, light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
@@ -448,14 +449,17 @@ def _segment_profiles(
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
     clipped = np.empty_like(total)
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
+    response = photographs.camera.response
+    clipped_from = light_of_levels(response or "linear")[profiles.SATURATED_GREY_LEVEL]
     for image, part in zip(photographs.images, parts, strict=True):
         mine = slice(*part)
         across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)
         # a row a segment: what lies close in the photograph is interpolated together
         rows = (v.reshape(-1, seen.shape[-1] * len(offsets)) for v in across)
-        grey = levels_at(image, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
+        light = light_in(image, response)
+        grey = levels_at(light, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
-        np.matmul(seen[mine], grey >= profiles.SATURATED_GREY_LEVEL, out=clipped[mine])
+        np.matmul(seen[mine], grey >= clipped_from, out=clipped[mine])
     mean = total[:, 0] / count[full][:, None]
     return full, profiles.Profiles.of(mean, clipped[:, 0] > 0, count[full], half_width[full])
 
