@@ -312,12 +312,13 @@ def _judge(
             *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
+            *(one.sentence for one in found.turns.coded if not one.sure),
         ),
         hints=(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
             *numbering_told(session),
-            *(one.sentence for one in found.turns.coded),
+            *(one.sentence for one in found.turns.coded if one.sure),
         ),
     )
     clock.lap("identify")

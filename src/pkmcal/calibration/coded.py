@@ -27,10 +27,12 @@ from pkmcal.session.load import Session
 PHOTOGRAPHS_ASKED_OF_CODE = 12
 """Photographs of a camera that are asked at first: their two hundred edges show a wrong code by
 four standard deviations, even on metal."""
-LEAST_GAIN_OF_CODE = 2.7
-"""chi2 from which all are asked: by chance one session of ten, which costs it a look."""
-ODDS_FOR_OTHER_CODE = 1000.0
-"""Odds from which the edges overrule what is usual for files of a kind."""
+LEAST_GAIN_OF_CODE, MOST_DEVIATION_OF_CODE = 2.7, 0.1
+"""chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
+from which a code that is wrong would not show by so much."""
+ODDS_FOR_OTHER_CODE, ODDS_AGAINST_OTHER_CODE = 1000.0, 20.0
+"""Odds from which the edges overrule what is usual for files of a kind; and from which what is
+usual needs no caution."""
 _WORDS: dict[Response, str] = {
     "linear": "linearly, as sensors count it",
     "srgb": "as sRGB, as telephones do",
@@ -39,24 +41,43 @@ _WORDS: dict[Response, str] = {
 
 @dataclass(frozen=True)
 class CodeTold:
-    """What edges say of a camera's code: it is another than is usual for its files.
+    """What edges say of a camera's code, where they do not say that it is as usual.
 
-    file : of the camera. response : by which its photographs are measured from now on. gain : of
-    chi2 by it, less what there would be to gain by going back.
+    file : of the camera. usual : by which its photographs were measured at first. gain : of chi2 by
+    the other code, less what there would be to gain by going back.
     """
 
     file: str
-    response: Response
+    usual: Response
     gain: float
 
     @property
+    def sure(self) -> bool:
+        """Whether the other code is right."""
+        return self.gain > 2 * np.log(ODDS_FOR_OTHER_CODE)
+
+    @property
+    def response(self) -> Response:
+        """The code by which its photographs are measured."""
+        return OTHER_RESPONSE[self.usual] if self.sure else self.usual
+
+    @property
     def sentence(self) -> str:
-        """For a verdict's hints."""
+        """For a verdict: a hint where the edges are sure, else a caution."""
+        usual, other = _WORDS[self.usual], _WORDS[OTHER_RESPONSE[self.usual]]
+        if self.sure:
+            return (
+                f"The photographs of {self.file} code light {other}, not {usual}, which is usual"
+                f" for files of their kind: so their edges fit better, by {self.gain:.0f} of χ²."
+                f" They are measured so; write response: {self.response} into {self.file} for"
+                " check, view and servo."
+            )
         return (
-            f"The photographs of {self.file} code light {_WORDS[self.response]}, not"
-            f" {_WORDS[OTHER_RESPONSE[self.response]]}, which is usual for files of their kind: so"
-            f" their edges fit better, by {self.gain:.0f} of χ². They are measured so; write"
-            f" response: {self.response} into {self.file} for check, view and servo."
+            f"Whether the photographs of {self.file} code light {usual}, which is usual for files"
+            f" of their kind and believed here, or {other}, their edges do not tell; in the other"
+            f" case errors are larger than stated. Write response: {self.usual} or response:"
+            f" {OTHER_RESPONSE[self.usual]} into {self.file}: the camera's settings say it, as"
+            " gamma, or a photograph of a chart of greys does."
         )
 
 
@@ -81,23 +102,25 @@ def told_by_edges(
             other = replace(p.camera, response=_other(p))
             asked.setdefault(station.camera_file, []).append(replace(p, camera=other))
     few = {file: measured(_spread(mine)) for file, mine in asked.items()}
-    gains = _gains(measurements, estimate, few)
-    doubted = [file for file in asked if gains[file] > LEAST_GAIN_OF_CODE]
+    scores, ways = _asked(measurements, estimate, few)
+    doubted = [
+        file
+        for file in asked
+        if scores[file] > LEAST_GAIN_OF_CODE or not ways[file] < MOST_DEVIATION_OF_CODE
+    ]
     if not doubted:
         return ()
     every = {file: measured(asked[file]) for file in doubted}
-    gains = _gains(measurements, estimate, every)
+    there, _ = _asked(measurements, estimate, every)
     edges, moved = measurements.edges, [p.station for file in doubted for p in asked[file]]
     new = concatenate([edges.select(~np.isin(edges.station, moved)), *every.values()])
     otherwise = of_edges(new.select(np.argsort(new.station, kind="stable")))
     ended = bundle(estimate.machine, otherwise, estimate.state)
-    back = _gains(otherwise, ended, dict.fromkeys(doubted, edges))
-    return tuple(
-        CodeTold(file, response, gains[file] - back[file])
-        for file in doubted
-        for response in [asked[file][0].camera.response]
-        if response and gains[file] - back[file] > 2 * np.log(ODDS_FOR_OTHER_CODE)
-    )
+    back, _ = _asked(otherwise, ended, dict.fromkeys(doubted, edges))
+    told = [
+        CodeTold(file, _other(asked[file][0]), there[file] - back[file]) for file in doubted
+    ]
+    return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_CODE))
 
 
 def _other(photographs: Photographs) -> Response:
@@ -113,15 +136,19 @@ def _spread(photographs: Sequence[Photographs]) -> list[Photographs]:
     return [p.select(numbers) for p, numbers in here if len(numbers)]
 
 
-def _gains(
+def _asked(
     measurements: Measurements, estimate: Estimate, by_other: Mapping[str, EdgeSet]
-) -> dict[str, float]:
-    """chi2 that would be gained by going to where other edges are, for the edges of each file."""
+) -> tuple[dict[str, float], dict[str, float]]:
+    """chi2 that would be gained by going to where other edges are, for the edges of each file, and
+    the standard deviation of the way that fits.
+    """
     effects = [Effect(edges=_way(measurements.edges, other)) for other in by_other.values()]
     if not effects:
-        return {}
-    scores = Departures(*as_ended(measurements, estimate), effects).scores()
-    return {file: score.chi2 for file, score in zip(by_other, scores, strict=True)}
+        return {}, {}
+    tests = Departures(*as_ended(measurements, estimate), effects)
+    gains = [score.chi2 for score in tests.scores()]
+    deviations = [float(freed.sigma[0]) for freed in tests.fitted(range(len(effects)))]
+    return dict(zip(by_other, gains, strict=True)), dict(zip(by_other, deviations, strict=True))
 
 
 def _way(edges: EdgeSet, other: EdgeSet) -> Array:

@@ -117,7 +117,7 @@ def take_turns(
                 lambda some, look=again: concatenate([seen.edges for seen in _each(some, look)]),
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
-            if coded:
+            if any(one.sure for one in coded):
                 cameras = cameras.coded({one.file: one.response for one in coded})
                 blur = {}
                 continue
