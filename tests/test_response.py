@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.coded import CodeTold
+from pkmcal.calibration.results import refined_camera, texts_of
 from pkmcal.cameras.response import light_in, light_of_levels, levels_of_light
 from pkmcal.errors import InputError
 from pkmcal.observe.legs import measure
@@ -113,14 +115,14 @@ def test_files_of_a_kind_are_taken_for_what_is_usual(session, kind, usual):
     recode(session, kind)
     stations = load_session(session).stations
     assert {station.camera.response for station in stations} == {usual}
-    assert not any(station.response_stated for station in stations)
+    assert not any(station.response_told for station in stations)
 
 
 def test_what_the_camera_file_says_holds(session):
     stated(session, "srgb")
     stations = load_session(session).stations
     assert {station.camera.response for station in stations} == {"srgb"}
-    assert all(station.response_stated for station in stations)
+    assert all(station.response_told for station in stations)
 
 
 def test_a_response_that_there_is_not(session):
@@ -164,3 +166,29 @@ def test_a_stated_response_is_not_asked_about(session):
     calibration = calibrate_session(session)
     assert calibration.verdict.usable
     assert not any("code light" in hint for hint in calibration.verdict.advice)
+
+
+@pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
+def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
+    told = CodeTold("cameras/front.yaml", "linear", gain)
+    assert told.sure == sure
+    assert told.response == ("srgb" if sure else "linear")
+    if sure:
+        assert "by 30 of χ². They are measured so; write response: srgb into" in told.sentence
+    else:
+        assert "their edges do not tell; in the other case errors are larger" in told.sentence
+        assert "Write response: linear or response: srgb into cameras/front.yaml" in told.sentence
+
+
+def test_a_refined_camera_keeps_what_is_told_and_no_more(session):
+    """What is only usual for files of a kind is asked again of other photographs."""
+    usual = calibrate_session(session, refine_camera=True)
+    recode(session, ".png", SRGB)
+    told = calibrate_session(session, refine_camera=True)
+    written = [
+        texts_of(one, {})[name]
+        for one in (usual, told)
+        for name in [refined_camera(one.cameras.files[0])]
+    ]
+    assert "response" not in written[0]
+    assert "response: srgb" in written[1]

@@ -280,10 +280,17 @@ def _judge(
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
     clock.told("Judging", 0.95)
-    if found.turns.cameras.active or found.turns.coded:  # the edges are where these cameras see them
+    if (
+        found.turns.cameras.active or found.turns.coded
+    ):  # the edges are where these cameras see them
         cameras = found.turns.cameras
+        sure = {one.file for one in found.turns.coded if one.sure}
         refined = [
-            replace(station, camera=cameras.at_station(k))
+            replace(
+                station,
+                camera=cameras.at_station(k),
+                response_told=station.response_told or station.camera_file in sure,
+            )
             for k, station in enumerate(session.stations)
         ]
         session = replace(session, stations=tuple(refined))

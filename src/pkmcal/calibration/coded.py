@@ -98,7 +98,7 @@ def told_by_edges(
     asked: dict[str, list[Photographs]] = {}
     for p in photographs:
         station = session.stations[p.station]
-        if not station.response_stated:
+        if not station.response_told:
             other = replace(p.camera, response=_other(p))
             asked.setdefault(station.camera_file, []).append(replace(p, camera=other))
     few = {file: measured(_spread(mine)) for file, mine in asked.items()}
@@ -117,9 +117,7 @@ def told_by_edges(
     otherwise = of_edges(new.select(np.argsort(new.station, kind="stable")))
     ended = bundle(estimate.machine, otherwise, estimate.state)
     back, _ = _asked(otherwise, ended, dict.fromkeys(doubted, edges))
-    told = [
-        CodeTold(file, _other(asked[file][0]), there[file] - back[file]) for file in doubted
-    ]
+    told = [CodeTold(file, _other(asked[file][0]), there[file] - back[file]) for file in doubted]
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_CODE))
 
 

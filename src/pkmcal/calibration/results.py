@@ -10,7 +10,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -115,6 +115,9 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
+        stations = calibration.session.stations
+        if not any(s.response_told for s in stations if s.camera_file == file):
+            camera = replace(camera, response=None)  # what is only usual is asked again
         texts[refined_camera(file)] = camera_text(camera)
     return texts
 

@@ -66,9 +66,9 @@ class Station:
     photographs : by configuration and repeat.
     observe : legs, board, or both, in this order. entry : its name in session.yaml, which is that
     of many stations where the camera was held by hand, each of one photograph. handheld : whether.
-    from_exif : whether no more is known of the camera than what EXIF tells. response_stated :
-    whether its file says how photographs code light; else the camera's response is what is usual
-    for files of their kind.
+    from_exif : whether no more is known of the camera than what EXIF tells. response_told :
+    whether its file says how photographs code light, or their edges did; else the camera's response
+    is what is usual for files of their kind.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Station:
     entry: str = ""
     handheld: bool = False
     from_exif: bool = False
-    response_stated: bool = False
+    response_told: bool = False
 
     __repr__ = short_repr
 
@@ -444,8 +444,8 @@ def _stations(
         _, inside = camera_path(folder / camera_file)
         _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
-    response_stated = camera.response is not None
-    if photographs and not response_stated:
+    response_told = camera.response is not None
+    if photographs and not response_told:
         jpeg = all(photo.path.suffix.lower() in JPEG_FILE_ENDINGS for photo in photographs)
         camera = replace(camera, response="srgb" if jpeg else "linear")
     T_camera_base = None
@@ -467,7 +467,7 @@ def _stations(
             raise error.located(document.where(*keys, "pose")) from None
     whole = Station(
         name, camera, camera_file, T_camera_base, photographs, station.observe, name,
-        station.handheld, from_exif, response_stated,
+        station.handheld, from_exif, response_told,
     )  # fmt: skip
     if not station.handheld:
         return [whole]
@@ -635,8 +635,10 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     said = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
         s.camera_file: [
-            s.camera.model, s.camera.image_size, s.camera.parameters,
-            *([s.camera.response] if s.response_stated else []),
+            s.camera.model,
+            s.camera.image_size,
+            s.camera.parameters,
+            *([s.camera.response] if s.response_told else []),
         ]  # fmt: skip
         for s in session.stations
     }
