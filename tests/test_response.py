@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.coded import CodeTold
 from pkmcal.calibration.results import refined_camera, texts_of
-from pkmcal.cameras.response import light_in, light_of_levels, levels_of_light
+from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session

@@ -634,12 +634,8 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     """
     said = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
-        s.camera_file: [
-            s.camera.model,
-            s.camera.image_size,
-            s.camera.parameters,
-            *([s.camera.response] if s.response_told else []),
-        ]  # fmt: skip
+        s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
+        + ([s.camera.response] if s.response_told else [])
         for s in session.stations
     }
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
