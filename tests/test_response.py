@@ -1,4 +1,4 @@
-"""How photographs code light: the curve, what files of a kind are taken for, and what edges tell."""
+"""How photographs code light: the curve, what is usual for files of a kind, what edges tell."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def levels_of_light(light: Array, response: Response) -> Array:
 
 
 def light_in(image: Integers, response: Response | None) -> Any:
-    """The light in a photograph (height, width), uint8; itself where it is linear, or nobody says."""
+    """The light in a photograph (height, width), uint8; itself where it is linear or not told."""
     if response is None or response == "linear":
         return image
     import cv2

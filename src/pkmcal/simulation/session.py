@@ -287,13 +287,13 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
 
 
 def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) -> bytes:
-    """A JPEG file with EXIF, coded to be looked at: how the telephone was held, and its focal length
-    in whole mm.
+    """A JPEG file, coded to be looked at, with EXIF: how the telephone was held, and its focal
+    length in whole mm.
     """
     import cv2
 
     coded = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
-    picture = cv2.LUT(picture, coded)
+    picture = coded[picture]
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, HANDHELD_JPEG_QUALITY])
     if not ok:
         raise OSError("a photograph could not be encoded as JPEG")
