@@ -128,7 +128,8 @@ def make(
         widths.append(limb.half_width)
         clipped.append(np.any(samples >= SATURATED_GREY_LEVEL, axis=0))
     counts = np.full(number, float(count))
-    profiles = Profiles.of(np.array(grey), np.array(clipped), counts, np.array(widths))
+    explained = np.array(clipped)[:, -len(profile_offsets()) :]
+    profiles = Profiles.of(np.array(grey), explained, counts, np.array(widths))
     return Made(profiles, np.array(truth))
 
 

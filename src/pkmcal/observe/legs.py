@@ -445,9 +445,9 @@ def _segment_profiles(
     seen = seen[:, None].astype(np.float32)
     outward = np.repeat(_by_segment(points.outward)[full], PROFILES_A_POINT, axis=-2)
     pixel = photographs.camera.project(_between(points, full))
-    offsets = profiles.sampled_offsets()
+    offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
-    clipped = np.empty_like(total)
+    clipped = np.empty((len(seen), 1, explained), np.float32)
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
     response = photographs.camera.response
     clipped_from = light_of_levels(response or "linear")[profiles.SATURATED_GREY_LEVEL]
@@ -459,7 +459,7 @@ def _segment_profiles(
         light = light_in(image, response)
         grey = levels_at(light, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
-        np.matmul(seen[mine], grey >= clipped_from, out=clipped[mine])
+        np.matmul(seen[mine], grey[..., -explained:] >= clipped_from, out=clipped[mine])
     mean = total[:, 0] / count[full][:, None]
     return full, profiles.Profiles.of(mean, clipped[:, 0] > 0, count[full], half_width[full])
 

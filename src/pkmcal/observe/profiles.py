@@ -162,10 +162,11 @@ class Profiles:
 
     @classmethod
     def of(cls, grey: Array, clipped: Booleans, count: Array, half_width: Array) -> Profiles:
-        """From samples at :func:`sampled_offsets`, grey (N, samples), which are clipped or not."""
-        explained = slice(len(sampled_offsets()) - len(profile_offsets()), None)
-        cut = cut_of(clipped[:, explained], half_width)
-        return cls(grey[:, explained], count, half_width, cut, *strips(grey, count, half_width))
+        """From grey (N, samples) at :func:`sampled_offsets`, and whether it is clipped at
+        :func:`profile_offsets`.
+        """
+        explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width)
+        return cls(explained, count, half_width, cut, *strips(grey, count, half_width))
 
     def select(self, keep: Booleans | Integers) -> Profiles:
         """The profiles at a mask or at positions."""
