@@ -497,7 +497,7 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
             "center:",
             "centre:",
             "a.yaml, line 4, centre: this key is not known; found centre, expected center "
-            "(known here: center, covariance, distortion, focal, image_size, model, response).",
+            "(known here: center, covariance, distortion, focal, image_size, model).",
         ),
         (
             "239.5",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,15 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import pkmcal
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.coded import CodeTold
-from pkmcal.calibration.results import refined_camera, texts_of
+from pkmcal.calibration.responses import ResponseTold
+from pkmcal.calibration.saved import load
 from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError
+from pkmcal.judge.new_data import _as_then
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
 from test_calibration import check_found
-from test_observe_drawing import FRONT, camera_of, photographs, poses, redrawn
+from test_observe_drawing import FRONT, photographs, poses, redrawn
 from test_observe_measure import errors, rms, taken
 
 SRGB = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
@@ -38,8 +41,10 @@ def recode(folder: Path, kind: str, table=None) -> None:
 
 
 def stated(folder: Path, response: str) -> None:
-    for path in (folder / "cameras").glob("*.yaml"):
-        path.write_text(path.read_text() + f"response: {response}\n")
+    text = (folder / "session.yaml").read_text()
+    said = re.sub(r"^( +)(observe: legs.*)$", rf"\1\2\n\1response: {response}", text, flags=re.M)
+    assert said != text
+    (folder / "session.yaml").write_text(said)
 
 
 # the curve
@@ -71,10 +76,9 @@ def test_more_light_has_the_higher_level(pair):
     assert (light[0, 0] < light[0, 1]) == (low < high)
 
 
-@pytest.mark.parametrize("response", ["linear", None])
-def test_linear_photographs_are_their_own_light(response):
+def test_linear_photographs_are_their_own_light():
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    assert light_in(image, response) is image
+    assert light_in(image, "linear") is image
 
 
 # edges
@@ -86,8 +90,7 @@ def test_a_blurred_edge_is_where_it_is_by_the_right_code_alone():
     there = redrawn(0, 0.0005), FRONT, poses()
     shift = {}
     for response in ("srgb", "linear"):
-        camera = replace(camera_of(), response=response)
-        found = measure(replace(taken(pictures), camera=camera), *there)
+        found = measure(replace(taken(pictures), response=response), *there)
         shift[response] = errors(found.edges)[0]
     assert rms(shift["srgb"]) < 0.05
     assert abs(shift["srgb"].mean()) < 0.03
@@ -101,7 +104,7 @@ def test_light_that_is_cut_off_is_so_by_any_code():
     there = redrawn(0, 0.0005), FRONT, poses()
     usual = measure(taken(clipped), *there).edges
     coded = taken([cv2.LUT(image, SRGB) for image in clipped])
-    found = measure(replace(coded, camera=replace(camera_of(), response="srgb")), *there).edges
+    found = measure(replace(coded, response="srgb"), *there).edges
     assert 60 < len(usual) < 110
     assert abs(len(found) - len(usual)) < 0.1 * len(usual)
     assert rms(errors(found)[0]) < 1.2 * rms(errors(usual)[0]) + 0.01
@@ -114,14 +117,14 @@ def test_light_that_is_cut_off_is_so_by_any_code():
 def test_files_of_a_kind_are_taken_for_what_is_usual(session, kind, usual):
     recode(session, kind)
     stations = load_session(session).stations
-    assert {station.camera.response for station in stations} == {usual}
+    assert {station.response for station in stations} == {usual}
     assert not any(station.response_told for station in stations)
 
 
-def test_what_the_camera_file_says_holds(session):
+def test_what_the_session_says_holds(session):
     stated(session, "srgb")
     stations = load_session(session).stations
-    assert {station.camera.response for station in stations} == {"srgb"}
+    assert {station.response for station in stations} == {"srgb"}
     assert all(station.response_told for station in stations)
 
 
@@ -154,9 +157,9 @@ def test_the_edges_overrule_what_is_usual(demo, session, kind, table, found, usu
     recode(session, kind, table)
     calibration = calibrate_session(session)
     (hint,) = [text for text in calibration.verdict.advice if "code light" in text]
-    assert f"code light {found}, not {usual}, which is usual" in hint
+    assert f"code light {found}, not {usual}, as is usual" in hint
     check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
-    response = {station.camera.response for station in calibration.session.stations}
+    response = {station.response for station in calibration.session.stations}
     assert response == {"srgb" if table is not None else "linear"}
 
 
@@ -170,25 +173,45 @@ def test_a_stated_response_is_not_asked_about(session):
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
 def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
-    told = CodeTold("cameras/front.yaml", "linear", gain)
+    told = ResponseTold(("front", "left"), "linear", gain)
     assert told.sure == sure
     assert told.response == ("srgb" if sure else "linear")
     if sure:
-        assert "by 30 of χ². They are measured so; write response: srgb into" in told.sentence
+        assert "at odds of more than 1000 to 1. They are measured so" in told.sentence
+        assert "write response: srgb in session.yaml, under the stations front" in told.sentence
     else:
-        assert "their edges do not tell; in the other case errors are larger" in told.sentence
-        assert "Write response: linear or response: srgb into cameras/front.yaml" in told.sentence
+        assert (
+            "The edges do not tell how the photographs of front and left code light"
+            in told.sentence
+        )
+        assert (
+            "Write response: linear or response: srgb in session.yaml, under the" in told.sentence
+        )
 
 
-def test_a_refined_camera_keeps_what_is_told_and_no_more(session):
-    """What is only usual for files of a kind is asked again of other photographs."""
-    usual = calibrate_session(session, refine_camera=True)
+def test_each_camera_is_asked_by_itself(session):
+    """One station's photographs by a camera of its own, coded; the others' not."""
+    names = sorted(path.name for path in (session / "images").iterdir())
+    for path in sorted((session / "images" / names[0]).glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert cv2.imwrite(str(path), cv2.LUT(image, SRGB))
+    (camera,) = (session / "cameras").glob("*.yaml")
+    (session / "cameras" / "own.yaml").write_text(camera.read_text())
+    text = (session / "session.yaml").read_text()
+    changed = text.replace(f"cameras/{camera.name}", "cameras/own.yaml", 1)
+    (session / "session.yaml").write_text(changed)
+    calibration = calibrate_session(session)
+    told = {station.camera_file: station.response for station in calibration.session.stations}
+    assert told == {"cameras/own.yaml": "srgb", f"cameras/{camera.name}": "linear"}
+    said = [text for text in calibration.verdict.advice if "code light as sRGB" in text]
+    assert len(said) == 1
+
+
+def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(session):
     recode(session, ".png", SRGB)
-    told = calibrate_session(session, refine_camera=True)
-    written = [
-        texts_of(one, {})[name]
-        for one in (usual, told)
-        for name in [refined_camera(one.cameras.files[0])]
-    ]
-    assert "response" not in written[0]
-    assert "response: srgb" in written[1]
+    pkmcal.calibrate(session).save(session / "calibration")
+    saved = load(session / "calibration")
+    assert {row["response"] for row in saved.document["stations"]} == {"srgb"}
+    fresh = _as_then(saved, load_session(session))
+    assert {station.response for station in fresh} == {"srgb"}
+    assert all(station.response_told for station in fresh)

@@ -280,20 +280,22 @@ def _judge(
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
     clock.told("Judging", 0.95)
-    if (
-        found.turns.cameras.active or found.turns.coded
-    ):  # the edges are where these cameras see them
+    if found.turns.cameras.active:  # the edges are where these cameras see them
         cameras = found.turns.cameras
-        sure = {one.file for one in found.turns.coded if one.sure}
         refined = [
-            replace(
-                station,
-                camera=cameras.at_station(k),
-                response_told=station.response_told or station.camera_file in sure,
-            )
+            replace(station, camera=cameras.at_station(k))
             for k, station in enumerate(session.stations)
         ]
         session = replace(session, stations=tuple(refined))
+    responses = found.turns.responses
+    if sure := {entry: one.response for one in responses if one.sure for entry in one.entries}:
+        told = [
+            replace(station, response=sure[station.entry], response_told=True)
+            if station.entry in sure
+            else station
+            for station in session.stations
+        ]
+        session = replace(session, stations=tuple(told))
     ended = as_ended(found.turns.measurements, found.estimate)
     findings = _findings(found.turns.measurements, found.estimate, ended[1])
     departed: tuple[Departed, ...] = ()
@@ -319,13 +321,13 @@ def _judge(
             *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
-            *(one.sentence for one in found.turns.coded if not one.sure),
+            *(one.sentence for one in found.turns.responses if not one.sure),
         ),
         hints=(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
             *numbering_told(session),
-            *(one.sentence for one in found.turns.coded if one.sure),
+            *(one.sentence for one in found.turns.responses if one.sure),
         ),
     )
     clock.lap("identify")

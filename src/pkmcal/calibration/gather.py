@@ -8,7 +8,7 @@ unknown of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
-from pkmcal.cameras.response import Response
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import (
@@ -60,14 +59,6 @@ class CameraRefinement:
     def active(self) -> bool:
         """Whether there is anything to refine, of a camera or of a photograph."""
         return self.refined or bool(self.breathes.any())
-
-    def coded(self, response: Mapping[str, Response]) -> CameraRefinement:
-        """The same with what photographs of some files' cameras turned out to code light by."""
-        cameras = [
-            replace(camera, response=response.get(file, camera.response))
-            for file, camera in zip(self.files, self.calibrated, strict=True)
-        ]
-        return replace(self, calibrated=tuple(cameras))
 
     def camera(self, file: str) -> Camera:
         """A camera with its intrinsics at the present place."""

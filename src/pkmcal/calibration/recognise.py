@@ -64,7 +64,8 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         paths, labels = photograph_files(session, station)
         images = Pictures.read(paths, station.camera.image_size, labels, most)
         rows = np.array([p.configuration for p in station.photographs])
-        return legs.Photographs(number, station.camera, rows, session.joints[rows], images)
+        readings = session.joints[rows]
+        return legs.Photographs(number, station.camera, rows, readings, images, station.response)
 
     numbers, room, kept = legs_stations(session), KEPT_PHOTOGRAPH_BYTES, list[int]()
     for number in numbers:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -115,9 +115,6 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
-        stations = calibration.session.stations
-        if not any(s.response_told for s in stations if s.camera_file == file):
-            camera = replace(camera, response=None)  # what is only usual is asked again
         texts[refined_camera(file)] = camera_text(camera)
     return texts
 
@@ -253,9 +250,12 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     estimate = calibration.estimate
     out: list[dict[str, Any]] = []
     session = calibration.session
-    sources = [(x.name, x.camera_file, len(x.photographs)) for x in session.stations]
-    sources += [(table.name, table.label, len(table.configuration)) for table in session.trackers]
-    for s, (name, file, number) in enumerate(sources):
+    sources: list[tuple[str, str, int, str | None]] = [
+        (x.name, x.camera_file, len(x.photographs), x.response if "legs" in x.observe else None)
+        for x in session.stations
+    ]
+    sources += [(x.name, x.label, len(x.configuration), None) for x in session.trackers]
+    for s, (name, file, number, response) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -263,6 +263,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
             {
                 "name": name,
                 "camera": file,
+                "response": response,
                 "T_base_camera": inverse(T_camera_base),
                 "sigma_rotation": sigma[:3],
                 "sigma_translation": sigma[3:],
@@ -371,7 +372,6 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     return [
         {
             "file": files[c],
-            "response": next(s.camera.response for s in stations if s.camera_file == files[c]),
             "edge_shift": estimate.state.edge_shift[c],
             "sigma": estimate.edge_shift_sigma[c],
             **_refined(calibration, files[c]),

@@ -18,10 +18,10 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.coded import CodeTold, told_by_edges
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress
+from pkmcal.calibration.responses import ResponseTold, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -70,7 +70,7 @@ class Turns(NamedTuple):
     measurements: Measurements
     estimate: Estimate
     cameras: CameraRefinement
-    coded: tuple[CodeTold, ...] = ()
+    responses: tuple[ResponseTold, ...] = ()
 
 
 def take_turns(
@@ -89,7 +89,7 @@ def take_turns(
     blur: dict[int, float | None] = {}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
-    coded: tuple[CodeTold, ...] = ()
+    responses: tuple[ResponseTold, ...] = ()
     for turn in range(MOST_EDGE_LOOKS):
         share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
         done = _counted(told, "Measuring edges", total, share)
@@ -108,23 +108,29 @@ def take_turns(
         estimate = bundle(machine, measurements, start)
         lap("identify")
         if turn == 0:
+            told("Asking how the photographs code light", share + 0.1)
             again = partial(_measure, estimate=before, blur={}, refine=cameras.active)
-            coded = told_by_edges(
+            responses = told_by_edges(
                 session,
                 photographs,
                 measurements,
                 estimate,
-                lambda some, look=again: concatenate([seen.edges for seen in _each(some, look)]),
+                lambda some, look=again: concatenate([one.edges for one in _each(some, look)]),
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
-            if any(one.sure for one in coded):
-                cameras = cameras.coded({one.file: one.response for one in coded})
+            lap("observe")
+            if any(one.sure for one in responses):
+                entries = {entry: one.response for one in responses for entry in one.entries}
+                photographs = [
+                    replace(p, response=entries.get(session.stations[p.station].entry, p.response))
+                    for p in photographs
+                ]
                 blur = {}
                 continue
         if moved < SETTLED_EDGE_DISTANCE and not cameras.active:
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
-    return Turns(observation, measurements, estimate, cameras, coded)
+    return Turns(observation, measurements, estimate, cameras, responses)
 
 
 def _counted(

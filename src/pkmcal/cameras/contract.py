@@ -20,7 +20,6 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.cameras.response import Response
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import dot, of_components
 
@@ -41,11 +40,6 @@ class CameraSchema(Schema):
     image_size: PositiveSize = Field(description="[width, height] in pixels")
     focal: PositivePair = Field(description="[fx, fy] in pixels")
     center: tuple[float, float] = Field(description="[cx, cy] in pixels, pixel centres at integers")
-    response: Response | None = Field(
-        default=None,
-        description="how its photographs code light: linear, as sensors count it, or srgb, as"
-        " telephones write it; found out where it is left out",
-    )
 
     @field_validator("focal")
     @classmethod
@@ -87,7 +81,6 @@ class Camera(ABC):
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
-    response : how its photographs code light, where that is known.
     own : fields of the model's file between ``center`` and ``distortion``.
     """
 
@@ -99,7 +92,6 @@ class Camera(ABC):
     image_size: tuple[int, int]
     parameters: Array
     covariance: Array | None = None
-    response: Response | None = None
 
     def __repr__(self) -> str:
         width, height = self.image_size
@@ -220,7 +212,6 @@ class Camera(ABC):
             "center": p[2:4],
             **own,
             "distortion": p[4 + len(own) :],
-            **({"response": self.response} if self.response else {}),
         }
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:

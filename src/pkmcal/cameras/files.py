@@ -81,7 +81,6 @@ def camera_from_document(document: Document) -> Camera:
             " of light ends there",
             expected="focal, center and distortion of images of this size",
         )
-    camera = replace(camera, response=fields.response)
     if fields.covariance is None:
         return camera
     where = document.where("covariance")

@@ -41,9 +41,9 @@ def levels_of_light(light: Array, response: Response) -> Array:
     return np.where(part <= 0.0031308, 12.92 * part, curve) * 255
 
 
-def light_in(image: Integers, response: Response | None) -> Any:
-    """The light in a photograph (height, width), uint8; itself where it is linear or not told."""
-    if response is None or response == "linear":
+def light_in(image: Integers, response: Response) -> Any:
+    """The light in a photograph (height, width), uint8; itself where levels are light."""
+    if response == "linear":
         return image
     import cv2
 

@@ -161,7 +161,9 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], kept)  # fmt: skip
-        whole = legs.Photographs(number, station.camera, at, session.joints[at], images)
+        whole = legs.Photographs(
+            number, station.camera, at, session.joints[at], images, station.response
+        )
         out.append(whole if rows else None)
     return out, findings
 

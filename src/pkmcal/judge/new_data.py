@@ -16,7 +16,7 @@ from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
 from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import InputError
-from pkmcal.session.load import Session, digests
+from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
 
 
@@ -67,7 +67,25 @@ def measured_new_data(
     seed : of the search for the stations. told : gets the first ``share`` of the progress.
     """
     return calibrate_session(
-        replace(session, machine=saved.machine),
+        replace(session, machine=saved.machine, stations=_as_then(saved, session)),
         seed=seed,
         progress=lambda text, part: told(text, share * part),
     )
+
+
+def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
+    """The stations, their photographs taken to code light as the calibration found them to, where
+    the session does not say: a few new ones tell less.
+    """
+    then = {row["name"]: row.get("response") for row in saved.document["stations"]}
+    out: list[Station] = []
+    for station in session.stations:
+        own = [
+            name
+            for name in then
+            if name == station.entry or (station.handheld and name.startswith(f"{station.entry}-"))
+        ]
+        found = then[own[0]] if own else None
+        known = found is not None and not station.response_told
+        out.append(replace(station, response=found, response_told=True) if known else station)
+    return tuple(out)

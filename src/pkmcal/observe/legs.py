@@ -24,7 +24,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
-from pkmcal.cameras.response import light_in, light_of_levels
+from pkmcal.cameras.response import Response, light_in, light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
@@ -224,7 +224,8 @@ class Photographs:
     """One station's photographs.
 
     station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width), decoded or when they are looked at.
+    images : K grey-level arrays (height, width), decoded or when they are looked at. response : how
+    their levels code light.
     """
 
     station: int
@@ -232,6 +233,7 @@ class Photographs:
     configuration: Integers
     joints: Array
     images: Sequence[Integers]
+    response: Response = "linear"
 
     def select(self, numbers: Integers) -> Photographs:
         """Some of the photographs."""
@@ -449,8 +451,8 @@ def _segment_profiles(
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
     clipped = np.empty((len(seen), 1, explained), np.float32)
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
-    response = photographs.camera.response
-    clipped_from = light_of_levels(response or "linear")[profiles.SATURATED_GREY_LEVEL]
+    response = photographs.response
+    clipped_from = light_of_levels(response)[profiles.SATURATED_GREY_LEVEL]
     for image, part in zip(photographs.images, parts, strict=True):
         mine = slice(*part)
         across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)

@@ -18,7 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, numbered, short_repr
 from pkmcal.cameras import Camera
 from pkmcal.cameras.files import camera_path, load_camera
-from pkmcal.cameras.response import JPEG_FILE_ENDINGS
+from pkmcal.cameras.response import JPEG_FILE_ENDINGS, Response
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files import (
     LARGEST_UNITLESS_LENGTH,
@@ -66,9 +66,9 @@ class Station:
     photographs : by configuration and repeat.
     observe : legs, board, or both, in this order. entry : its name in session.yaml, which is that
     of many stations where the camera was held by hand, each of one photograph. handheld : whether.
-    from_exif : whether no more is known of the camera than what EXIF tells. response_told :
-    whether its file says how photographs code light, or their edges did; else the camera's response
-    is what is usual for files of their kind.
+    from_exif : whether no more is known of the camera than what EXIF tells. response : how the
+    photographs code light; response_told : whether session.yaml says so, or their edges did, else
+    it is what is usual for files of their kind.
     """
 
     name: str
@@ -80,6 +80,7 @@ class Station:
     entry: str = ""
     handheld: bool = False
     from_exif: bool = False
+    response: Response = "linear"
     response_told: bool = False
 
     __repr__ = short_repr
@@ -444,10 +445,8 @@ def _stations(
         _, inside = camera_path(folder / camera_file)
         _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
-    response_told = camera.response is not None
-    if photographs and not response_told:
-        jpeg = all(photo.path.suffix.lower() in JPEG_FILE_ENDINGS for photo in photographs)
-        camera = replace(camera, response="srgb" if jpeg else "linear")
+    endings = {photo.path.suffix.lower() for photo in photographs}
+    usual: Response = "srgb" if endings and endings <= JPEG_FILE_ENDINGS else "linear"
     T_camera_base = None
     if station.handheld:
         _check_handheld(document, name, station)
@@ -467,7 +466,7 @@ def _stations(
             raise error.located(document.where(*keys, "pose")) from None
     whole = Station(
         name, camera, camera_file, T_camera_base, photographs, station.observe, name,
-        station.handheld, from_exif, response_told,
+        station.handheld, from_exif, station.response or usual, station.response is not None,
     )  # fmt: skip
     if not station.handheld:
         return [whole]
@@ -635,7 +634,6 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     said = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
         s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
-        + ([s.camera.response] if s.response_told else [])
         for s in session.stations
     }
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from pkmcal.cameras.response import Response
 from pkmcal.files import Metres, Point, Radians, Reading, Schema, closest, shown
 
 BoardBody = Literal["base", "platform"]
@@ -59,6 +60,11 @@ class StationDocument(Schema):
     )
     pose: PoseDocument | None = None
     handheld: bool = False
+    response: Response | None = Field(
+        default=None,
+        description="how the photographs code light: linear, as sensors count it, or srgb, as"
+        " telephones write it; found out where it is left out",
+    )
 
 
 class NoiseDocument(Schema):

@@ -71,6 +71,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         np.array([row]),
         pane.joints[None],
         [viewed.image(look.station, look.photograph)],
+        pane.response,
     )
     take = legs.measure if look.shown == "calibration" else legs.search
     seen = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])

@@ -14,6 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera, load_camera
+from pkmcal.cameras.response import Response
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
@@ -37,7 +38,8 @@ VIEWED_JPEG_QUALITY = 88
 class Pane:
     """A machine before a camera: what is laid over one photograph.
 
-    joints : (m,) readings. T_base_platform, T_camera_base : (4, 4).
+    joints : (m,) readings. T_base_platform, T_camera_base : (4, 4). response : how the photograph
+    codes light.
     """
 
     machine: Machine
@@ -45,6 +47,7 @@ class Pane:
     joints: Array
     T_base_platform: Array
     T_camera_base: Array
+    response: Response
 
     @property
     def points(self) -> Array:
@@ -98,7 +101,7 @@ class Viewed:
         machine, joints = self.session.machine, self.session.joints[row]
         there = station.T_camera_base
         there = self.start(s) if there is None else there
-        return Pane(machine, station.camera, joints, self.poses[row], there)
+        return Pane(machine, station.camera, joints, self.poses[row], there, station.response)
 
     def _start(self, s: int) -> Array:
         """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it:
@@ -133,7 +136,9 @@ class Viewed:
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
         pose = saved.T_base_platform[row]
-        return Pane(saved.machine, camera, saved.joints[row], pose, T_camera_base)
+        response = saved.document["stations"][number].get("response") or station.response
+        joints = saved.joints[row]
+        return Pane(saved.machine, camera, joints, pose, T_camera_base, response)
 
     @cached_property
     def saved(self) -> SavedCalibration:

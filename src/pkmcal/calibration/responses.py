@@ -1,0 +1,188 @@
+"""How photographs code light, told by the edges: as sensors count it, or as telephones write it.
+
+A file's kind says what is usual, not what is so. Blurred edges lean to their dark side where levels
+are coded otherwise than believed, each by its own contrast, and no machine does that: so the way
+from where edges lie by one response to where they lie by the other is a departure of one number
+(:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs tell
+whether there is anything to gain; if so all are measured by the other response too, and right is
+the one from which there is less to gain by going to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers, evenly
+from pkmcal.cameras.response import OTHER_RESPONSE, Response
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import Departures
+from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
+from pkmcal.observe.legs import Photographs
+from pkmcal.session.load import Session
+from pkmcal.wording import listed
+
+CONFIGURATIONS_ASKED_OF_RESPONSE = 12
+"""Configurations of a camera whose photographs are asked at first: their two hundred edges show a
+wrong response by four standard deviations, even on metal."""
+LEAST_RESPONSE_GAIN, MOST_WAY_DEVIATION = 2.7, 0.1
+"""chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
+from which a response that is wrong would not show by so much."""
+ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
+"""Odds from which the edges overrule what is usual for files of a kind; and from which what is
+usual needs no caution."""
+_Camera = tuple[str, Response]
+"""A camera's file, and what is usual for the photographs' kind."""
+_WORDS: dict[Response, str] = {
+    "linear": "linearly, as sensors count it",
+    "srgb": "as sRGB, as telephones do",
+}
+
+
+@dataclass(frozen=True)
+class ResponseTold:
+    """What edges say of how photographs code light, where they do not say that it is as usual.
+
+    entries : of session.yaml's stations, of one camera. usual : by which their photographs were
+    measured at first. gain : of chi2 by the other response, less what there would be to gain by
+    going back.
+    """
+
+    entries: tuple[str, ...]
+    usual: Response
+    gain: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether the other response is right."""
+        return self.gain > 2 * np.log(ODDS_FOR_OTHER_RESPONSE)
+
+    @property
+    def response(self) -> Response:
+        """The one by which the photographs are measured."""
+        return OTHER_RESPONSE[self.usual] if self.sure else self.usual
+
+    @property
+    def sentence(self) -> str:
+        """For a verdict: a hint where the edges are sure, else a caution."""
+        usual, other = _WORDS[self.usual], _WORDS[OTHER_RESPONSE[self.usual]]
+        of = listed(self.entries)
+        place = f"in session.yaml, under the station{'s' if len(self.entries) > 1 else ''} {of}"
+        if self.sure:
+            return (
+                f"The photographs of {of} code light {other}, not {usual}, as is usual for"
+                f" files of their kind: so say their edges, at odds of more than"
+                f" {ODDS_FOR_OTHER_RESPONSE:.0f} to 1. They are measured so; write response:"
+                f" {self.response} {place}, and every command knows it."
+            )
+        return (
+            f"The edges do not tell how the photographs of {of} code light. They were"
+            f" taken as coded {usual}, as is usual for files of their kind; if it is {other},"
+            f" errors are larger than stated. Write response: linear or response: srgb {place}; a"
+            " camera's setting of gamma tells which, 1 or off is linear."
+        )
+
+
+def told_by_edges(
+    session: Session,
+    photographs: Sequence[Photographs],
+    measurements: Measurements,
+    estimate: Estimate,
+    measured: Callable[[list[Photographs]], EdgeSet],
+    of_edges: Callable[[EdgeSet], Measurements],
+) -> tuple[ResponseTold, ...]:
+    """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
+    say that it is otherwise than usual, or do not tell.
+
+    measurements, estimate : by the usual responses. measured : the edges of photographs, looked for
+    where those of ``measurements`` were. of_edges : measurements with these edges instead.
+    """
+    usual: dict[_Camera, list[Photographs]] = {}
+    for p in photographs:
+        station = session.stations[p.station]
+        if not station.response_told:
+            usual.setdefault((station.camera_file, p.response), []).append(p)
+    try:
+        few = {camera: measured(_otherwise(_spread(mine))) for camera, mine in usual.items()}
+        gains, ways = _scored(measurements, estimate, few)
+        doubted = [
+            camera
+            for camera in usual
+            if gains[camera] > LEAST_RESPONSE_GAIN or not ways[camera] < MOST_WAY_DEVIATION
+        ]
+        if not doubted:
+            return ()
+        every = {camera: measured(_otherwise(usual[camera])) for camera in doubted}
+        there, _ = _scored(measurements, estimate, every)
+        edges = measurements.edges
+        own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in doubted}
+        stay = ~np.any(list(own.values()), axis=0)
+        new = concatenate([edges.select(stay), *every.values()])
+        otherwise = of_edges(new.select(np.argsort(new.station, kind="stable")))
+        ended = bundle(estimate.machine, otherwise, estimate.state)
+        before = {camera: edges.select(mine) for camera, mine in own.items()}
+        back, _ = _scored(otherwise, ended, before)
+    except PkmcalError:  # nothing, or too little, is found by the other
+        return ()
+    told = [
+        ResponseTold(
+            tuple(dict.fromkeys(session.stations[p.station].entry for p in usual[camera])),
+            camera[1],
+            there[camera] - back[camera],
+        )
+        for camera in doubted
+    ]
+    return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+
+
+def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
+    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in photographs]
+
+
+def _spread(photographs: Sequence[Photographs]) -> list[Photographs]:
+    """The photographs of some configurations, evenly over a camera's stations."""
+    shown = [np.unique(p.configuration) for p in photographs]
+    first = np.cumsum([0, *map(len, shown)])
+    some = evenly(int(first[-1]), CONFIGURATIONS_ASKED_OF_RESPONSE)
+    out: list[Photographs] = []
+    for p, here, since, end in zip(photographs, shown, first[:-1], first[1:], strict=True):
+        asked = here[some[(some >= since) & (some < end)] - since]
+        if len(asked):
+            out.append(p.select(np.flatnonzero(np.isin(p.configuration, asked))))
+    return out
+
+
+def _scored(
+    measurements: Measurements, estimate: Estimate, other: Mapping[_Camera, EdgeSet]
+) -> tuple[dict[_Camera, float], dict[_Camera, float]]:
+    """chi2 that would be gained by going to where other edges are, for the edges of each camera,
+    and the standard deviation of the way that fits.
+    """
+    effects = [Effect(edges=_way(measurements.edges, edges)) for edges in other.values()]
+    if not effects:
+        return {}, {}
+    tests = Departures(*as_ended(measurements, estimate), effects)
+    gains = [score.chi2 for score in tests.scores()]
+    deviations = [float(freed.sigma[0]) for freed in tests.fitted(range(len(effects)))]
+    return dict(zip(other, gains, strict=True)), dict(zip(other, deviations, strict=True))
+
+
+def _way(edges: EdgeSet, other: EdgeSet) -> Array:
+    """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
+    those that it does not have.
+    """
+
+    def places(of: EdgeSet) -> list[list[int]]:
+        return np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1).tolist()
+
+    number = {tuple(place): k for k, place in enumerate(places(other))}
+    match: Integers = np.array([number.get(tuple(place), -1) for place in places(edges)], dtype=int)
+    both = match >= 0
+    turn = np.zeros((len(edges), 2, 1))
+    moved = other.normal[match[both]] - edges.normal[both]
+    turn[both, :, 0] = np.einsum("nij,ni->nj", edges.basis[both], moved)
+    return turn
