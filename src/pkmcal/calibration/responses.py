@@ -92,14 +92,16 @@ def told_by_edges(
     photographs: Sequence[Photographs],
     measurements: Measurements,
     estimate: Estimate,
+    roughly: Callable[[list[Photographs]], EdgeSet],
     measured: Callable[[list[Photographs]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> tuple[ResponseTold, ...]:
     """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
     say that it is otherwise than usual, or do not tell.
 
-    measurements, estimate : by the usual responses. measured : the edges of photographs, looked for
-    where those of ``measurements`` were. of_edges : measurements with these edges instead.
+    measurements, estimate : by the usual responses. roughly, measured : the edges of photographs,
+    looked for where those of ``measurements`` were, with their blur or with one of their own.
+    of_edges : measurements with these edges instead.
     """
     usual: dict[_Camera, list[Photographs]] = {}
     for p in photographs:
@@ -107,7 +109,7 @@ def told_by_edges(
         if not station.response_told:
             usual.setdefault((station.camera_file, p.response), []).append(p)
     try:
-        few = {camera: measured(_otherwise(_spread(mine))) for camera, mine in usual.items()}
+        few = {camera: roughly(_otherwise(_spread(mine))) for camera, mine in usual.items()}
         gains, ways = _scored(measurements, estimate, few)
         doubted = [
             camera

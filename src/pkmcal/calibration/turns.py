@@ -109,16 +109,29 @@ def take_turns(
         lap("identify")
         if turn == 0:
             told("Asking how the photographs code light", share + 0.1)
-            again = partial(_measure, estimate=before, blur={}, refine=cameras.active)
+
+            def measured(
+                some: list[legs.Photographs],
+                blur: dict[int, float | None],
+                before: Estimate = before,
+                refine: bool = cameras.active,
+            ) -> EdgeSet:
+                lap("identify")
+                look = partial(_measure, estimate=before, blur=blur, refine=refine)
+                edges = concatenate([one.edges for one in _each(some, look)])
+                lap("observe")
+                return edges
+
             responses = told_by_edges(
                 session,
                 photographs,
                 measurements,
                 estimate,
-                lambda some, look=again: concatenate([one.edges for one in _each(some, look)]),
+                partial(measured, blur=blur),  # nearly the same by the other response
+                partial(measured, blur={}),
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
-            lap("observe")
+            lap("identify")
             if any(one.sure for one in responses):
                 entries = {entry: one.response for one in responses for entry in one.entries}
                 photographs = [
