@@ -142,22 +142,22 @@ def test_a_response_that_there_is_not(session):
 
 
 def test_a_session_that_is_as_usual_says_nothing(calibrated):
-    assert not any("code light" in hint for hint in calibrated.verdict.advice)
+    assert not any("levels of the photographs" in hint for hint in calibrated.verdict.advice)
 
 
 @pytest.mark.parametrize(
     ("kind", "table", "found", "usual"),
     [
-        (".png", SRGB, "as sRGB, as telephones do", "linearly, as sensors count it"),
-        (".jpg", None, "linearly, as sensors count it", "as sRGB, as telephones do"),
+        (".png", SRGB, "sRGB (as telephones write it)", "linear (as sensors count light)"),
+        (".jpg", None, "linear (as sensors count light)", "sRGB (as telephones write it)"),
     ],
 )  # fmt: skip
 def test_the_edges_overrule_what_is_usual(demo, session, kind, table, found, usual):
     """And the machine is found as well as where it is as usual."""
     recode(session, kind, table)
     calibration = calibrate_session(session)
-    (hint,) = [text for text in calibration.verdict.advice if "code light" in text]
-    assert f"code light {found}, not {usual}, as is usual" in hint
+    (hint,) = [text for text in calibration.verdict.advice if "levels of the photographs" in text]
+    assert f"are {found}, not {usual}, as is usual for such files" in hint
     check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
     response = {station.response for station in calibration.session.stations}
     assert response == {"srgb" if table is not None else "linear"}
@@ -168,7 +168,7 @@ def test_a_stated_response_is_not_asked_about(session):
     stated(session, "srgb")
     calibration = calibrate_session(session)
     assert calibration.verdict.usable
-    assert not any("code light" in hint for hint in calibration.verdict.advice)
+    assert not any("levels of the photographs" in hint for hint in calibration.verdict.advice)
 
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
@@ -181,7 +181,7 @@ def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
         assert "write response: srgb in session.yaml, under the stations front" in told.sentence
     else:
         assert (
-            "The edges do not tell how the photographs of front and left code light"
+            "do not tell whether the levels of the photographs of front and left are linear"
             in told.sentence
         )
         assert (
@@ -203,7 +203,7 @@ def test_each_camera_is_asked_by_itself(session):
     calibration = calibrate_session(session)
     told = {station.camera_file: station.response for station in calibration.session.stations}
     assert told == {"cameras/own.yaml": "srgb", f"cameras/{camera.name}": "linear"}
-    said = [text for text in calibration.verdict.advice if "code light as sRGB" in text]
+    said = [text for text in calibration.verdict.advice if "are sRGB (as telephones" in text]
     assert len(said) == 1
 
 

@@ -39,6 +39,7 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
+from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
 from pkmcal.errors import InputError, ResultError
@@ -287,8 +288,7 @@ def _judge(
             for k, station in enumerate(session.stations)
         ]
         session = replace(session, stations=tuple(refined))
-    responses = found.turns.responses
-    if sure := {entry: one.response for one in responses if one.sure for entry in one.entries}:
+    if sure := overruled(found.turns.responses):
         told = [
             replace(station, response=sure[station.entry], response_told=True)
             if station.entry in sure

@@ -38,8 +38,8 @@ usual needs no caution."""
 _Camera = tuple[str, Response]
 """A camera's file, and what is usual for the photographs' kind."""
 _WORDS: dict[Response, str] = {
-    "linear": "linearly, as sensors count it",
-    "srgb": "as sRGB, as telephones do",
+    "linear": "linear (as sensors count light)",
+    "srgb": "sRGB (as telephones write it)",
 }
 
 
@@ -74,17 +74,22 @@ class ResponseTold:
         place = f"in session.yaml, under the station{'s' if len(self.entries) > 1 else ''} {of}"
         if self.sure:
             return (
-                f"The photographs of {of} code light {other}, not {usual}, as is usual for"
-                f" files of their kind: so say their edges, at odds of more than"
+                f"The levels of the photographs of {of} are {other}, not {usual}, as is usual for"
+                f" such files: so say their edges, at odds of more than"
                 f" {ODDS_FOR_OTHER_RESPONSE:.0f} to 1. They are measured so; write response:"
                 f" {self.response} {place}, and every command knows it."
             )
         return (
-            f"The edges do not tell how the photographs of {of} code light. They were"
-            f" taken as coded {usual}, as is usual for files of their kind; if it is {other},"
-            f" errors are larger than stated. Write response: linear or response: srgb {place}; a"
-            " camera's setting of gamma tells which, 1 or off is linear."
+            f"The edges do not tell whether the levels of the photographs of {of} are {usual},"
+            f" which is usual for such files and believed here, or {other}; then errors are larger"
+            f" than stated. Write response: linear or response: srgb {place}: a camera's setting"
+            " of gamma tells which, 1 or off is linear."
         )
+
+
+def overruled(told: Sequence[ResponseTold]) -> dict[str, Response]:
+    """How photographs code light, by their entry in session.yaml, where it is not as usual."""
+    return {entry: one.response for one in told if one.sure for entry in one.entries}
 
 
 def told_by_edges(
@@ -177,12 +182,16 @@ def _way(edges: EdgeSet, other: EdgeSet) -> Array:
     """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
     those that it does not have.
     """
-
-    def places(of: EdgeSet) -> list[list[int]]:
-        return np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1).tolist()
-
-    number = {tuple(place): k for k, place in enumerate(places(other))}
-    match: Integers = np.array([number.get(tuple(place), -1) for place in places(edges)], dtype=int)
+    every = np.concatenate(
+        [
+            np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
+            for of in (edges, other)
+        ]
+    )
+    place = np.unique(every, axis=0, return_inverse=True)[1].ravel()
+    number: Integers = np.full(len(every), -1)
+    number[place[len(edges) :]] = np.arange(len(other))
+    match = number[place[: len(edges)]]
     both = match >= 0
     turn = np.zeros((len(edges), 2, 1))
     moved = other.normal[match[both]] - edges.normal[both]

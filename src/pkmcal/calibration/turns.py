@@ -21,7 +21,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress
-from pkmcal.calibration.responses import ResponseTold, told_by_edges
+from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -132,10 +132,9 @@ def take_turns(
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
             lap("identify")
-            if any(one.sure for one in responses):
-                entries = {entry: one.response for one in responses for entry in one.entries}
+            if found := overruled(responses):
                 photographs = [
-                    replace(p, response=entries.get(session.stations[p.station].entry, p.response))
+                    replace(p, response=found.get(session.stations[p.station].entry, p.response))
                     for p in photographs
                 ]
                 blur = {}

@@ -80,12 +80,13 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     then = {row["name"]: row.get("response") for row in saved.document["stations"]}
     out: list[Station] = []
     for station in session.stations:
-        own = [
-            name
-            for name in then
-            if name == station.entry or (station.handheld and name.startswith(f"{station.entry}-"))
-        ]
-        found = then[own[0]] if own else None
+        # a photograph by hand has its own name behind its entry's
+        names = (
+            (name for name in then if name.startswith(f"{station.entry}-"))
+            if station.handheld
+            else iter([station.name])
+        )
+        found = then.get(next(names, station.name))
         known = found is not None and not station.response_told
         out.append(replace(station, response=found, response_told=True) if known else station)
     return tuple(out)
