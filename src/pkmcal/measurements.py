@@ -113,6 +113,8 @@ class EdgeSet:
     shading : (N,) px, standard deviation of what shading adds to each edge beside what it adds to
         all of its line; edges of a line share it as far as their normals agree, see
         :mod:`~pkmcal.identify.line_cells`. It counts where measurements are ``shaded``.
+    coarse : (N,) whether it is where a whole machine's silhouettes lie on picture edges
+        (:mod:`pkmcal.observe.silhouettes`), and not measured by itself.
     """
 
     station: Integers
@@ -128,11 +130,14 @@ class EdgeSet:
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     by_focal: Array = field(default_factory=lambda: np.zeros((0, 2)))
     shading: Array = field(default_factory=lambda: np.zeros(0))
+    coarse: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """What is not given is empty, zero or the usual, so that all edges select alike."""
+        if len(self.coarse) != len(self.station):
+            object.__setattr__(self, "coarse", np.zeros(len(self.station), dtype=bool))
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
         if len(self.by_focal) != len(self.station):
@@ -153,6 +158,10 @@ class EdgeSet:
     def select(self, keep: Booleans | Integers) -> EdgeSet:
         """The edges at a mask or at positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def scaled(self, factor: float) -> EdgeSet:
+        """The same, that scatter by a factor more."""
+        return replace(self, covariance=self.covariance * factor**2)
 
     def rejection(self, k: int, reason: str) -> Rejection:
         """The edge at k, left out for a reason."""

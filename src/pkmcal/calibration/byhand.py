@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -76,15 +75,6 @@ def place(
     known = KnownScene.as_drawn(session.machine, stations, session.joints)
     if len(fixed) < len(photographs):
         found, known = search_by_hand(session, photographs, boards, known, told)
-        if known.edges:
-            at = {p.station: p for p in photographs}
-            # what too few legs hold the joint estimate moves anywhere
-            loose = {k for k, e in known.edges.items() if len(np.unique(e.leg)) < FEWEST_LEGS}
-            sure = {k: known.T_camera_base[k] for k in known.edges}
-            sure |= {k: found[k].T_camera_base[0] for k in loose & found.keys()}
-            measured = {k: e for k, e in known.edges.items() if k not in loose}
-            with suppress(PkmcalError):  # with all that is observed it is told better why
-                known = join(session, at, known, sure, boards, measured)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
         lost = {k: why_lost(found[k]) for k in found if k in nowhere}
         for k in sorted(found.keys() & known.edges.keys()):
@@ -200,12 +190,8 @@ def _with_sure(
     new = {k: T for k, T in sure.items() if k not in scene.edges}
     if not new:
         return so_far
-    # what was measured from the places that are believed, when these were asked about
-    asked = {k: answer.asked for k, answer in answers.items() if k in new}
-    found = {k: a.measured_from(new[k]) for k, a in asked.items() if a is not None}
-    measured = {k: edges for k, edges in found.items() if edges is not None}
     try:
-        scene = join(session, photographs, scene, new, boards, measured)
+        scene = join(session, photographs, scene, new, boards)
     except PkmcalError:
         return so_far  # with all that is observed it is told better why
     placed: dict[int, Neighbour] = {}
@@ -322,8 +308,9 @@ def misplaced(
     """
     astray = angle_between(estimate.state.T_camera_base, T_camera_base) > MOST_TURN
     station = measurements.edges.station
-    kept = np.bincount(station, estimate.edge_weights, len(session.stations))
-    count = np.bincount(station, minlength=len(session.stations))
+    measured = ~measurements.edges.coarse  # silhouettes are found wherever they are looked for
+    kept = np.bincount(station, measured * estimate.edge_weights, len(session.stations))
+    count = np.bincount(station, measured, len(session.stations))
     poses = measurements.poses.station
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
     shown = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
@@ -346,7 +333,10 @@ def without_misplaced(
     """
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
-    known = KnownScene(estimate.machine, state.T_camera_base, state.T_base_platform, mine)
+    known = seen.known._replace(
+        machine=estimate.machine, T_camera_base=state.T_camera_base,
+        T_base_platform=state.T_base_platform, edges=mine,
+    )  # fmt: skip
     return _without(seen._replace(known=known), wrong)
 
 

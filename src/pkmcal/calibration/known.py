@@ -19,8 +19,9 @@ class KnownScene(NamedTuple):
     """The machine, T_camera_base (S, 4, 4) of the stations, NaN where one is not known, and
     T_base_platform (K, 4, 4) of the configurations.
 
-    Of photographs by hand that have told the machine: edges, what was measured in each, by its
-    station; told, what they and the drawing know of the machine together.
+    Of photographs by hand that have told the machine: edges, the silhouettes found in each, by its
+    station; told, what they and the drawing know of the machine together; scatter, by how much more
+    or less these edges scatter than each says.
     """
 
     machine: Machine
@@ -28,6 +29,7 @@ class KnownScene(NamedTuple):
     T_base_platform: Array
     edges: Mapping[int, EdgeSet] = MappingProxyType({})
     told: MachineTold | None = None
+    scatter: float = 1.0
 
     @classmethod
     def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> KnownScene:

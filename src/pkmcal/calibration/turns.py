@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
@@ -36,8 +36,10 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
+from pkmcal.observe.alone import finest_view
 from pkmcal.observe.profiles import EDGE_SHIFTS
 from pkmcal.observe.repeats import combined
+from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -90,13 +92,15 @@ def take_turns(
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses: tuple[ResponseTold, ...] = ()
+    scatter = seen.known.scatter
     for turn in range(MOST_EDGE_LOOKS):
         share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
         look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active, done=done)
-        looks = _each(photographs, look)
+        whole = partial(_with_silhouettes, session, estimate, scatter, cameras.active)
+        looks = _each(photographs, lambda p, look=look, whole=whole: whole(p, look(p)))
         blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
@@ -106,6 +110,7 @@ def take_turns(
         if turn == 0 and moved > ASTRAY_EDGE_DISTANCE:
             start = better_start(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
+        scatter *= _scatter_of(measurements.edges.coarse, estimate)
         lap("identify")
         if turn == 0:
             told("Asking how the photographs code light", share + 0.1)
@@ -299,6 +304,50 @@ def _measure(
         refine_camera=refine,
         done=done,
     )
+
+
+def _with_silhouettes(
+    session: Session,
+    estimate: Estimate,
+    scatter: float,
+    refine: bool,
+    photographs: legs.Photographs,
+    look: legs.StationEdges,
+) -> legs.StationEdges:
+    """A look at a photograph by hand, and where an edge could not be measured in it, where its
+    silhouettes lie, coarse: what has a place of its own in each photograph is told by few edges.
+
+    scatter : by how much more or less these scatter than each says.
+    """
+    if not session.stations[photographs.station].handheld:
+        return look
+    state = estimate.state
+    view = finest_view(estimate.machine, photographs, session.joints, state.T_base_platform)
+    T_camera_base = state.T_camera_base[photographs.station]
+    coarse = silhouette_edges(view, T_camera_base, photographs.station, refine)
+
+    def each(edges: EdgeSet) -> list[tuple[int, int, int]]:
+        return list(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
+
+    measured = set(each(look.edges))
+    more = np.array([edge not in measured for edge in each(coarse.edges)], dtype=bool)
+    at, number = more[coarse.point_edge], np.cumsum(more) - 1
+    added = replace(
+        coarse,
+        edges=coarse.edges.select(more).scaled(scatter),
+        points=coarse.points[at],
+        point_edge=number[coarse.point_edge[at]],
+    )
+    told = set(each(added.edges))
+    rejected = [r for r in look.rejected if (r.leg, r.tube, r.side) not in told]
+    both = legs.joined_looks([look, added], look.blur, look.moved)
+    return replace(both, rejected=tuple(rejected))
+
+
+def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
+    """Root mean square of the coarse edges' residuals, in what they state; 1 without any."""
+    squares = estimate.edge_residuals[coarse & (estimate.edge_weights >= 0.5)] ** 2
+    return float(np.sqrt(squares.mean())) if squares.size else 1.0
 
 
 def _each(

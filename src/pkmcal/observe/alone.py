@@ -23,13 +23,16 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, dot, inverse, pose, rotation
+from pkmcal.mechanisms import Machine
 from pkmcal.observe.evidence import (
+    LAST_REACH,
     StationView,
     descend,
     distinct_silhouettes,
     evidence_of,
     settle_by_evidence,
 )
+from pkmcal.observe.legs import Photographs
 from pkmcal.observe.places import CAMERA_DIRECTIONS, SIGHT_LINE_TURNS, frame_of, sphere
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tables import WORKING_WIDTH, distance_tables
@@ -64,6 +67,11 @@ MACHINE_FOLDS = (2, 3, 4, 6)
 JOINT_ON_JOINT_DISTANCE = 0.2
 """Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
 equal that they could be exchanged, and yet from a photograph they could."""
+NEAR_ROUNDS, NEAR_STARTS = 3, 64
+"""How often, and from how many places at once, the likeliest place near one is looked for."""
+NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
+"""How far these are turned about the machine (rad), and shifted, in the camera's distance: legs
+move by their own width then, by which the search that found the place may be off."""
 PLACES_IN_A_BATCH = 214
 """Places that are looked up together: some ten megabytes."""
 
@@ -120,6 +128,40 @@ def distinct(view: StationView, found: Array) -> Integers:
     kept = np.array(distinct_silhouettes(view, found, np.zeros(1, dtype=int)))
     # near the first lies the same place, less well settled
     return kept[(angle_between(found[kept], found[0]) >= SAME_PLACE_TURN) | (kept == 0)]
+
+
+def finest_view(
+    machine: Machine, photograph: Photographs, joints: Array, poses: Array
+) -> StationView:
+    """What places of one photograph are weighed on; joints, poses : of all configurations."""
+    tables = distance_tables([photograph.images[0]], *FINEST_TABLES)
+    return StationView(
+        machine, photograph.camera, photograph.configuration, joints, poses, tables
+    )
+
+
+def likeliest_near(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:
+    """The place with the most evidence near one (4, 4), and its evidence: where a drawing has put
+    the camera, it may hold on to the wrong side of some legs.
+
+    scatter : as :func:`settle_by_evidence` takes it.
+    """
+    rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
+    ends = view.machine.ends_at(view.joints, view.poses)
+    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
+    best, most = T_camera_base, -np.inf
+    for _ in range(NEAR_ROUNDS):
+        turn = rotation(rng.normal(size=(NEAR_STARTS, 3)) * NEAR_TURN)
+        turn[0] = np.eye(3)
+        starts = best @ pose(turn, middle - turn @ middle)
+        away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
+        starts[1:, :3, 3] += away * rng.normal(size=(NEAR_STARTS - 1, 3)) * NEAR_SHIFT
+        for widest in (LAST_REACH, scatter):
+            starts, evidence = settle_by_evidence(view, starts, one, 16, 10, widest)
+        k = int(np.argmax(evidence))
+        if evidence[k] > most:
+            best, most = starts[k], float(evidence[k])
+    return best, most
 
 
 def _unit(view: StationView, found: Array) -> float:

@@ -1,0 +1,61 @@
+"""Edges of a whole machine in one photograph, coarse: where its silhouettes lie on picture edges.
+
+A place was compared with others by how well the machine's silhouettes lie on the edges of the
+picture (:mod:`pkmcal.observe.evidence`). The same distances, each counted by the probability that
+it is the machine's own edge and not what chance has put there, say where the silhouettes should
+have been: an edge a tube's side, to a pixel. In a cluttered picture of polished legs that is three
+times as many edges as can be measured one by one, and enough to tell the machine together with the
+places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.observe.evidence import StationView, first_mixture, look_under
+from pkmcal.observe.legs import OTHER_OUTLINE_CLEARANCE, StationEdges
+from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
+from pkmcal.observe.profiles import edge_set, fit_edges
+
+SILHOUETTE_SAMPLES = 40
+"""Places along an edge at which the picture is asked."""
+LEAST_OWN = 0.05
+"""Probability of being the machine's from which a place counts: those that hardly are weigh little,
+and leaving out more of them makes edges come and go from look to look."""
+WIDEST_SCATTER = 2.0
+"""Reduced pixels within which silhouettes scatter about the picture's edges at most, where the
+machine is known to a few pixels."""
+
+
+def silhouette_edges(
+    view: StationView, T_camera_base: Array, station: int, refine_camera: bool = False
+) -> StationEdges:
+    """Edges of one photograph, taken from near a place (4, 4). view : of it alone. refine_camera :
+    also how the edges depend on the camera's parameters.
+    """
+    tubes = view.tubes
+    look = look_under(view, T_camera_base[None], np.zeros(1, dtype=int), SILHOUETTE_SAMPLES)
+    mixture = look.mixture(first_mixture(1), 10, WIDEST_SCATTER)
+    legs = legs_in_camera(view.machine, T_camera_base, view.poses, view.joints)
+    points = edge_points(view.machine, view.camera, legs, tubes, SILHOUETTE_SAMPLES)
+    clear = unobstructed(view.machine, view.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
+    scale = view.tables.scale
+    # how a distance grows as the edge moves outward by a pixel of the tables
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.nan_to_num(np.clip(look.slope * scale / points.gain, -1, 1))
+    position = -scale * look.found * np.sign(slope)
+    weight = look.own(mixture) * slope**2
+    found = clear & (look.length > 0) & (weight > LEAST_OWN)
+    position = np.where(found, position, 0.0)
+    sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(found, weight, 1.0))
+    fits = fit_edges(points, position, sigma, found)
+    by_camera = view.camera.project_jacobians(points.point)[1] if refine_camera else None
+    edges = edge_set(points, fits, tubes, station, view.configuration, fits.good, by_camera)
+    edges = replace(edges, coarse=np.ones(len(edges), dtype=bool))
+    k, e, s = np.nonzero(fits.used & fits.good[..., None])
+    xy = points.pixel[k, e, s] + position[k, e, s, None] * points.outward[k, e, s]
+    number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
+    return StationEdges(edges, (), xy, number[k, e], float("nan"), float("nan"))
