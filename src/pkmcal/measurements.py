@@ -149,8 +149,9 @@ class EdgeSet:
     def empty(cls) -> EdgeSet:
         """No edge, for sessions of boards alone."""
         none = np.zeros(0, dtype=int)
-        shapes = ((3,), (3, 2), (2, 2), (2,), (2,))
-        return cls(none, none, none, none, none, *(np.zeros((0, *shape)) for shape in shapes))
+        each = [np.zeros((0, *shape)) for shape in ((3,), (3, 2), (2, 2), (2,), (2,))]
+        normal, basis, covariance, shift, span = each
+        return cls(none, none, none, none, none, normal, basis, covariance, shift, span)
 
     def __len__(self) -> int:
         return len(self.station)

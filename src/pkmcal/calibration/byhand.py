@@ -130,19 +130,19 @@ def search_by_hand(
         half = (len(clearer) + 1) // 2
         step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
         ask(clearer[:half])
-        so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
+        so_far = _with_sure(session, at, room, so_far, believed(), boards)
         step(f"Asking the others, with {len(so_far.placed)} photographs placed", 0.25)
         ask(clearer[half:])
         for k, one in _on_board(found(), boards).items():
             answers[k] = replace(answers[k], places=one)
-        before, so_far = drawn, _with_sure(session, at, room, so_far, answers, believed(), boards)
+        before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
         while so_far is not before:
             before, T = so_far, believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any()]
             placed = len(by_hand) - len(unsure)
             step(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
             ask(unsure)
-            so_far = _with_sure(session, at, room, so_far, answers, believed(), boards)
+            so_far = _with_sure(session, at, room, so_far, believed(), boards)
     out = believed()
     for k in by_hand:
         if k in so_far.scene.edges:
@@ -180,7 +180,6 @@ def _with_sure(
     photographs: Mapping[int, legs.Photographs],
     room: Surroundings,
     so_far: _SoFar,
-    answers: Mapping[int, _Answer],
     believed: Array,
     boards: Boards,
 ) -> _SoFar:

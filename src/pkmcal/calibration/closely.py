@@ -234,4 +234,3 @@ def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     order = np.argsort(-worth, kind="stable")
     order = order[distinct(view, at[order])]
     return Alone(at[order], worth[order], 1.0)
-

@@ -67,7 +67,7 @@ MACHINE_FOLDS = (2, 3, 4, 6)
 JOINT_ON_JOINT_DISTANCE = 0.2
 """Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
 equal that they could be exchanged, and yet from a photograph they could."""
-NEAR_ROUNDS, NEAR_STARTS = 3, 64
+NEAR_ROUNDS, NEAR_STARTS = 3, 32
 """How often, and from how many places at once, the likeliest place near one is looked for."""
 NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
 """How far these are turned about the machine (rad), and shifted, in the camera's distance: legs
@@ -135,9 +135,7 @@ def finest_view(
 ) -> StationView:
     """What places of one photograph are weighed on; joints, poses : of all configurations."""
     tables = distance_tables([photograph.images[0]], *FINEST_TABLES)
-    return StationView(
-        machine, photograph.camera, photograph.configuration, joints, poses, tables
-    )
+    return StationView(machine, photograph.camera, photograph.configuration, joints, poses, tables)
 
 
 def likeliest_near(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:
