@@ -313,7 +313,7 @@ def misplaced(
     poses = measurements.poses.station
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
     shown = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
-    used = estimate.edge_weights >= 0.5
+    used = measured & (estimate.edge_weights >= 0.5)
     shown[station[used], measurements.edges.leg[used]] = True
     few = shown.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
     lost = ((2 * kept < count) | (kept < FEWEST_EDGES) | few) & ~by_board
