@@ -33,8 +33,8 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import legs, surroundings
-from pkmcal.observe.alone import Alone, find_alone, turned_about
-from pkmcal.observe.evidence import StationView
+from pkmcal.observe.alone import Alone, find_alone, finest_view, turned_about
+from pkmcal.observe.evidence import StationView, evidence_of
 from pkmcal.observe.images import decode
 from pkmcal.observe.stations import SECOND_PLACE_DOUBT
 from pkmcal.observe.surroundings import Texture
@@ -605,21 +605,33 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     assert alone.doubt < 1e-3
 
 
+def evidence_there(known, view):
+    """Evidence of the third photograph's place by what is known."""
+    here = replace(view, machine=known.machine, all_poses=known.T_base_platform)
+    return evidence_of(here, known.T_camera_base[[2]], np.zeros(1, dtype=int), 16).sum()
+
+
 def test_photographs_join_what_is_known(looked):
-    """One of the same machine costs the others nothing; with another's readings no leg is there."""
+    """One of the same machine costs the others little; with another's readings it is elsewhere."""
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
     drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     known = join(session, at, drawn, places, Boards())
     assert sorted(known.edges) == [0, 1]
-    right, paid = ask(session, at[2], known, truth.T_camera_base[2])
+    T = truth.T_camera_base[2]
+    view = finest_view(session.machine, at[2], session.joints, poses)
+    right, paid = ask(session, known, 2, T, view)
     assert sorted(right.edges) == [2]
     assert len(right.edges[2]) > 6
-    assert paid < 3
-    other = replace(at[2], configuration=at[0].configuration, joints=at[0].joints)
+    # half the squares of what its edges tell, two numbers each
+    assert paid < len(right.edges[2])
+    other = replace(view, configuration=at[0].configuration)
+    wrong, _ = ask(session, known, 2, T, other)
+    assert evidence_there(right, view) > 3 * evidence_there(wrong, other)
+    nowhere = perturb(np.eye(4), np.array([np.pi, 0, 0, 0, 0, 0])) @ T
     with pytest.raises(InputError, match="neither an edge"):
-        ask(session, other, known, truth.T_camera_base[2])
+        ask(session, known, 2, nowhere, view)
 
 
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
@@ -638,9 +650,9 @@ def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     found = Alone(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
     monkeypatch.setattr(closely, "bundle", counted)
     one, asked = look_closer(session, at[2], known, found, true)
-    assert estimated == [1] * len(closely.LOOKS_BY_TOLD_MACHINE)
+    assert estimated == [1] * closely.LOOKS_BY_TOLD_MACHINE
     again, both = look_closer(session, at[2], known, found, true, asked)
-    assert estimated == [1] * len(closely.LOOKS_BY_TOLD_MACHINE)
+    assert estimated == [1] * closely.LOOKS_BY_TOLD_MACHINE
     assert len(both.paid) == len(asked.paid)
     np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 

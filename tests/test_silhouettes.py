@@ -1,0 +1,124 @@
+"""Where a whole machine's silhouettes lie on the edges of one photograph."""
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.recognise import platform_poses, read_photographs
+from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
+from pkmcal.measurements import Observation
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe.alone import finest_view, likeliest_near
+from pkmcal.observe.evidence import LAST_REACH
+from pkmcal.observe.predict import edge_points, legs_in_camera
+from pkmcal.observe.silhouettes import silhouette_edges
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.truth import load_truth
+from rendered import rendered
+
+SETTINGS = Settings(configurations=4, repeats=1, handheld=True, tolerance=0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("silhouettes") / "session"
+    rendered(out, load_mechanism("gough-stewart"), camera_of_size((640, 480)), SETTINGS, seed=3)
+    return out
+
+
+@pytest.fixture(scope="module")
+def views(folder):
+    """Each photograph's view, with a machine that is known exactly, and its true place."""
+    session = load_session(folder)
+    poses, truth = platform_poses(session), load_truth(folder, session.machine)
+    photographs = read_photographs(session)
+    views = [finest_view(session.machine, p, session.joints, poses) for p in photographs]
+    return list(zip(views, truth.T_camera_base, strict=True))
+
+
+def off_truth(view, T, edges):
+    """How far edges lie outward of where they truly are (n, 2): in the middle and at the end, in
+    what each states.
+    """
+    legs = legs_in_camera(view.machine, T, view.poses, view.joints)
+    points = edge_points(view.machine, view.camera, legs, view.tubes, 2)
+    tubes = view.tubes
+    number = {
+        key: e
+        for e, key in enumerate(zip(tubes.leg, tubes.tube, tubes.side, strict=True))
+    }  # fmt: skip
+    e = [number[key] for key in zip(edges.leg, edges.tube, edges.side, strict=True)]
+    off = np.einsum("nij,ni->nj", edges.basis, points.normal[0, e] - edges.normal)
+    return np.linalg.solve(np.linalg.cholesky(edges.covariance), off[..., None])[..., 0]
+
+
+def test_silhouettes_lie_on_the_machine(views):
+    """From a place a few pixels off they are where it truly is, as far as they say."""
+    rng = np.random.default_rng(0)
+    found = []
+    for view, T in views:
+        near = perturb(T, rng.normal(size=6) * np.repeat([1e-3, 1e-3], 3))
+        look = silhouette_edges(view, near, 7)
+        edges = look.edges
+        assert np.all(edges.station == 7)
+        assert np.all(edges.coarse)
+        assert len(look.points) == len(look.point_edge)
+        assert set(look.point_edge.tolist()) == set(range(len(edges)))
+        found.append(off_truth(view, T, edges))
+    off = np.concatenate(found)
+    assert len(off) > 40
+    # stated with what scatters at most; a machine that is known well is closer
+    assert 0.1 < np.sqrt(np.median(np.sum(off**2, axis=1)) / 1.386) < 1
+    assert np.mean(np.sum(off**2, axis=1) > 9.2) < 0.05
+
+
+def test_silhouettes_say_how_they_depend_on_the_camera(views):
+    """As their pixels' rays turn with its parameters, so do the planes through them."""
+    view, T = views[0]
+    look = silhouette_edges(view, T, 0, refine_camera=True)
+    by_camera = look.edges.by_intrinsics
+    seen = Observation(look.edges, (), look.points, look.point_edge, T[None])
+    by_rays = edges_by_camera(seen, [view.camera])
+    size = np.linalg.norm(by_rays[:, 0], axis=-1)
+    off = np.linalg.norm((by_camera - by_rays)[:, 0], axis=-1)
+    # pixels weigh by how surely they are the machine's, rays all the same
+    assert np.median(off / size) < 0.05
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
+    view, T = views[1]
+    turn = rotation(np.radians(6.0) * np.eye(3)[axis])
+    middle = view.machine.base_centers().mean(axis=0) + np.array([0.0, 0.0, 0.15])
+    away = T @ pose(turn, middle - turn @ middle)
+    found, evidence = likeliest_near(view, away, LAST_REACH / 4)
+    assert np.degrees(angle_between(found, T)) < 0.7
+    eye = inverse(np.stack([found, T]))[:, :3, 3]
+    assert np.linalg.norm(eye[0] - eye[1]) < 0.02
+    _, here = likeliest_near(view, T, LAST_REACH / 4)
+    assert evidence == pytest.approx(here, rel=0.03)
+
+
+def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
+    """Of a photograph by hand: once each, measured or coarse, and not among what is left out."""
+
+    def place(session, photographs, boards, _rng, _told):
+        T = load_truth(folder, session.machine).T_camera_base
+        known = KnownScene.as_drawn(session.machine, T, session.joints)
+        return SeenSession(session, photographs, boards, known)
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    found = calibrate_session(folder).observation
+    edges = found.edges
+    assert 0 < edges.coarse.sum() < (~edges.coarse).sum()
+    each = np.stack([edges.station, edges.leg, edges.tube, edges.side], axis=1)
+    assert len(np.unique(each, axis=0)) == len(edges)
+    given_up = {
+        (r.station, r.leg, r.tube, r.side) for r in found.rejected if "disagree" not in r.reason
+    }
+    assert not given_up & set(map(tuple, each.tolist()))
+    assert set(found.point_edge.tolist()) == set(range(len(edges)))
