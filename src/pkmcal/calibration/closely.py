@@ -48,6 +48,8 @@ from pkmcal.session.load import Session
 PLACES_LOOKED_AT_CLOSER, MOST_BEHIND_BEST = 8, 12.0
 """Most places of a photograph that are asked about, and by how many measurements of the search one
 may be behind the best: what is further behind has odds of one in a hundred thousand."""
+PLACES_LOOKED_ABOUT = 4
+"""Places about which likelier ones are looked for, once others have told the machine."""
 LOOKS_BY_DRAWING, LOOKS_BY_TOLD_MACHINE = 4, 2
 """Looks at silhouettes, each from the estimate before: the drawing is off by pixels, a machine that
 photographs have told is not."""
@@ -193,9 +195,9 @@ def look_closer(
     places = np.concatenate([found.T_camera_base[near][:PLACES_LOOKED_AT_CLOSER], others])
     # the machine as it is known; where it fits better changed, that is taken
     settled, evidence = settle_by_evidence(view, places, one, 16, 6, SILHOUETTE_SCATTER)
-    if before.edges:  # what is known of the machine changes little: what is near is told at once
-        nearer = [likeliest_near(view, T, SILHOUETTE_SCATTER) for T in settled]
-        settled, evidence = (np.array(part) for part in zip(*nearer, strict=True))
+    if before.edges:  # what is known of the machine changes little: look about the likeliest places
+        for k in np.argsort(-evidence, kind="stable")[:PLACES_LOOKED_ABOUT]:
+            settled[k], evidence[k] = likeliest_near(view, settled[k], SILHOUETTE_SCATTER)
         places = settled
     seen = AskedPlaces.nothing() if asked is None else asked
     order = np.argsort(-evidence, kind="stable")

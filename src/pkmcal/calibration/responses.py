@@ -180,7 +180,7 @@ def _scored(
 
 def _way(edges: EdgeSet, other: EdgeSet) -> Array:
     """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
-    those that it does not have.
+    those that it does not have, nor of coarse ones, which no response moves.
     """
     every = np.concatenate(
         [
@@ -190,9 +190,9 @@ def _way(edges: EdgeSet, other: EdgeSet) -> Array:
     )
     place = np.unique(every, axis=0, return_inverse=True)[1].ravel()
     number: Integers = np.full(len(every), -1)
-    number[place[len(edges) :]] = np.arange(len(other))
+    number[place[len(edges) :]] = np.where(other.coarse, -1, np.arange(len(other)))
     match = number[place[: len(edges)]]
-    both = match >= 0
+    both = (match >= 0) & ~edges.coarse
     turn = np.zeros((len(edges), 2, 1))
     moved = other.normal[match[both]] - edges.normal[both]
     turn[both, :, 0] = np.einsum("nij,ni->nj", edges.basis[both], moved)

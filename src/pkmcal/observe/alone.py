@@ -25,7 +25,6 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, dot, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.evidence import (
-    LAST_REACH,
     StationView,
     descend,
     distinct_silhouettes,
@@ -67,8 +66,9 @@ MACHINE_FOLDS = (2, 3, 4, 6)
 JOINT_ON_JOINT_DISTANCE = 0.2
 """Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
 equal that they could be exchanged, and yet from a photograph they could."""
-NEAR_ROUNDS, NEAR_STARTS = 3, 32
-"""How often, and from how many places at once, the likeliest place near one is looked for."""
+NEAR_ROUNDS, NEAR_STARTS, NEAR_THAT_GO_ON = 3, 32, 8
+"""How often, and from how many places at once, the likeliest place near one is looked for; how many
+of these are settled closely."""
 NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
 """How far these are turned about the machine (rad), and shifted, in the camera's distance: legs
 move by their own width then, by which the search that found the place may be off."""
@@ -154,8 +154,9 @@ def likeliest_near(view: StationView, T_camera_base: Array, scatter: float) -> t
         starts = best @ pose(turn, middle - turn @ middle)
         away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
         starts[1:, :3, 3] += away * rng.normal(size=(NEAR_STARTS - 1, 3)) * NEAR_SHIFT
-        for widest in (LAST_REACH, scatter):
-            starts, evidence = settle_by_evidence(view, starts, one, 16, 10, widest)
+        starts, evidence = settle_by_evidence(view, starts, one, 8, 6)
+        starts = starts[np.argsort(-evidence)[:NEAR_THAT_GO_ON]]
+        starts, evidence = settle_by_evidence(view, starts, one, 16, 10, scatter)
         k = int(np.argmax(evidence))
         if evidence[k] > most:
             best, most = starts[k], float(evidence[k])
