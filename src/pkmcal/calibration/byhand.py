@@ -76,10 +76,11 @@ def place(
     if len(fixed) < len(photographs):
         found, known = search_by_hand(session, photographs, boards, known, told)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
-        lost = {k: why_lost(found[k]) for k in found if k in nowhere}
+        doubtful = {k for k in found if found[k].doubt * len(found) >= MISPLACED_PROBABILITY}
+        lost = {k: why_lost(found[k]) if k in doubtful else EDGES_DISAGREE_REASON for k in nowhere}
         for k in sorted(found.keys() & known.edges.keys()):
             turn = angle_between(known.T_camera_base[k], found[k].T_camera_base[0])
-            if turn > MOST_TURN and found[k].doubt * len(found) < MISPLACED_PROBABILITY:
+            if turn > MOST_TURN and k not in doubtful:
                 lost[k] = CAMERA_TURNED_REASON
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
@@ -136,9 +137,9 @@ def search_by_hand(
         for k, one in _on_board(found(), boards).items():
             answers[k] = replace(answers[k], places=one)
         before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
-        while so_far is not before:
+        while so_far.scene is not before.scene:
             before, T = so_far, believed()
-            unsure = [k for k in by_hand if np.isnan(T[k]).any()]
+            unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             placed = len(by_hand) - len(unsure)
             step(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
             ask(unsure)
@@ -147,17 +148,21 @@ def search_by_hand(
     for k in by_hand:
         if k in so_far.scene.edges:
             out[k] = so_far.scene.T_camera_base[k]
+        elif k in so_far.bare:
+            out[k] = np.nan
     return found(), so_far.scene._replace(T_camera_base=out)
 
 
 class _SoFar(NamedTuple):
     """What is known when a photograph is asked: the scene, the photographs that are placed, and
-    what they show of the room.
+    what they show of the room; bare : those in which too few legs can be measured from where they
+    were believed to be.
     """
 
     scene: KnownScene
     placed: Mapping[int, Neighbour] = MappingProxyType({})
     landmarks: Mapping[int, Landmarks] = MappingProxyType({})
+    bare: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -190,14 +195,32 @@ def _with_sure(
     if not new:
         return so_far
     try:
-        scene = join(session, photographs, scene, new, boards)
+        joined = join(session, photographs, scene, new, boards)
+        # silhouettes are found anywhere; legs can be measured where they are
+        bare = frozenset(
+            k for k in new if k not in boards.stations and _is_bare(joined, photographs[k])
+        )
+        if bare == new.keys():
+            return so_far._replace(bare=bare) if bare != so_far.bare else so_far
+        if bare:
+            rest = {k: T for k, T in new.items() if k not in bare}
+            joined = join(session, photographs, scene, rest, boards)
+        scene = joined
     except PkmcalError:
         return so_far  # with all that is observed it is told better why
     placed: dict[int, Neighbour] = {}
     for k in sorted(scene.edges):
         p, T = photographs[k], scene.T_camera_base[k]
         placed[k] = Neighbour(p.camera, T, _legs(session, p, scene, T)[0])
-    return _SoFar(scene, placed, room.landmarks(placed))
+    return _SoFar(scene, placed, room.landmarks(placed), bare)
+
+
+def _is_bare(scene: KnownScene, photograph: legs.Photographs) -> bool:
+    """Whether too few legs can be measured in a photograph where it is."""
+    p, machine = photograph, scene.machine
+    T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
+    shown = np.unique(legs.measure(p, machine, T, poses).edges.leg)
+    return len(shown) < min(FEWEST_LEGS, machine.n_legs)
 
 
 def _alone(session: Session, scene: KnownScene, photograph: legs.Photographs) -> Alone:
