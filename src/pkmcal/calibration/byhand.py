@@ -5,8 +5,9 @@ machine joins it to others, and from the places that it could show it is looked 
 (:mod:`pkmcal.calibration.closely`), the clearest first. A board on the base places those that see
 it beside one that is placed. Those that are sure tell the machine better than its drawing, and with
 that the others are asked, and asked again, until none is added. What stays unsure is left out and
-told, for one photograph in a wrong place spoils the rest; and where the joint estimate gives up
-most of a photograph's edges, it was in a wrong place.
+told, for one photograph in a wrong place spoils the rest; so is one in which legs cannot be
+measured where they should be, or of which the joint estimate gives up most edges: it was in a wrong
+place.
 """
 
 from __future__ import annotations
