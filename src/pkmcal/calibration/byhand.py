@@ -42,11 +42,12 @@ from pkmcal.session.photographs import label_of
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
-"""Probability that any photograph of a session is believed to be where it is not; each has an equal
-share of it."""
+"""Probability that any photograph of a session is believed to be where it is not."""
 PLACES_ASKED_AGAIN = 4
 """Places of a photograph that are asked about again, whatever the picture says to a machine that is
 known better: one in a wrong place spoils it."""
+MORE_TOLD = 1.25
+"""By what factor more photographs have told a machine when the others are asked all over again."""
 EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
 CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
 """Why one is left out that was found in one place and does not belong there."""
@@ -77,11 +78,11 @@ def place(
     if len(fixed) < len(photographs):
         found, known = search_by_hand(session, photographs, boards, known, told)
         nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
-        doubtful = {k for k in found if found[k].doubt * len(found) >= MISPLACED_PROBABILITY}
-        lost = {k: why_lost(found[k]) if k in doubtful else EDGES_DISAGREE_REASON for k in nowhere}
+        sure = _sure(found, len(found))
+        lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(found[k]) for k in nowhere}
         for k in sorted(found.keys() & known.edges.keys()):
             turn = angle_between(known.T_camera_base[k], found[k].T_camera_base[0])
-            if turn > MOST_TURN and k not in doubtful:
+            if turn > MOST_TURN and k in sure:
                 lost[k] = CAMERA_TURNED_REASON
         return _without(SeenSession(session, photographs, boards, known), lost)
     return SeenSession(session, photographs, boards, known)
@@ -172,13 +173,14 @@ class _Answer:
 
     alone : by the search in it alone. places : weighed with all that is known. asked : what was
     found out of them, None where they were not asked about. by : the machine that was known then,
-    None where it was as drawn.
+    None where it was as drawn; beside : how many photographs had told it.
     """
 
     alone: Alone
     places: Alone
     asked: AskedPlaces | None = None
     by: MachineTold | None = None
+    beside: int = 0
 
 
 def _with_sure(
@@ -248,12 +250,12 @@ def _search(
     change it by little. Places that were asked with a machine like this one are not asked again.
     """
     p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
-    alone, asked, by = before.alone, None, scene.told
+    alone, asked, by, beside = before.alone, None, scene.told, len(placed)
     if scene.told is not None:
         if before.by is None:
             alone = _alone(session, scene, p)
-        elif scene.told.like(before.by):
-            asked, by = before.asked, before.by
+        elif len(placed) < MORE_TOLD * before.beside and scene.told.like(before.by):
+            asked, by, beside = before.asked, before.by, before.beside
     likely = before.places.T_camera_base[:PLACES_ASKED_AGAIN]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
@@ -262,7 +264,7 @@ def _search(
     closer, asked = look_closer(session, p, scene, alone, others, asked)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
-    return _Answer(alone, places, asked, by)
+    return _Answer(alone, places, asked, by, beside)
 
 
 def _legs(
@@ -306,16 +308,28 @@ def _on_board(found: Mapping[int, Alone], boards: Boards) -> dict[int, Alone]:
     return {k: Alone(T[order], total[order], 1.0) for k, T in own.items()}
 
 
-def _believed(found: dict[int, Alone], count: int, boards: Boards, known: Array) -> Array:
+def _sure(found: Mapping[int, Alone], count: int) -> list[int]:
+    """The photographs whose places are believed, by the station's number: of those that were found,
+    of ``count`` by hand, the surest, as many as together leave little doubt.
+    """
+    order = sorted(found, key=lambda k: found[k].doubt)
+    together = np.cumsum([found[k].doubt for k in order])
+    return [
+        k
+        for k, doubt in zip(order, together, strict=True)
+        if doubt < MISPLACED_PROBABILITY * len(found) / count
+    ]
+
+
+def _believed(found: Mapping[int, Alone], count: int, boards: Boards, known: Array) -> Array:
     """Poses T_camera_base (S, 4, 4) with those of photographs of whose place there is little
     doubt, and those that a board on the base joins to them; NaN for the others.
 
     count : of all photographs by hand, some of which may not be found yet.
     """
     out = known.copy()
-    for k, one in found.items():
-        if one.doubt * count < MISPLACED_PROBABILITY:
-            out[k] = one.T_camera_base[0]
+    for k in _sure(found, count):
+        out[k] = found[k].T_camera_base[0]
     seen = [None if np.isnan(T).any() else T for T in out]
     joined = boards.joined(seen)
     return np.stack([np.full((4, 4), np.nan) if T is None else T for T in joined])
