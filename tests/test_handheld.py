@@ -477,6 +477,44 @@ def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
     assert "probability 0.30" in warning
 
 
+def test_places_are_believed_while_all_together_leave_little_doubt():
+    """Of those that are asked, their share of the doubt that a session may leave."""
+    one = {
+        k: Alone(np.stack([np.eye(4)] * 2), np.array([np.log(1 / doubt - 1), 0.0]), 1.0)
+        for k, doubt in enumerate([0.02, 0.3, 0.001, 0.02, 0.012])
+    }
+    assert byhand._sure(one, 5) == [2, 4, 0]
+    assert byhand._sure(one, 10) == [2, 4]
+    assert byhand._sure({}, 5) == []
+
+
+def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
+    """However well its silhouettes lie on something: it tells no machine."""
+    told = []
+
+    def bare(scene, photograph):
+        told.append(sorted(scene.edges))
+        return photograph.station == 1
+
+    monkeypatch.setattr(byhand, "_is_bare", bare)
+    found = placed(looked, monkeypatch, [1e-4, 1e-4, 1e-4])
+    assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    assert sorted(found.known.edges) == [0, 1]
+    (warning,) = found.session.warnings
+    assert warning.startswith("images/phone/0001-1.jpg: left out, for too few of its edges agree")
+    assert len(told) < 12  # it is not asked for ever
+
+
+def test_legs_are_measured_where_a_photograph_is_and_not_elsewhere(looked):
+    session, photographs, poses, truth = looked
+    p = photographs[EASIEST]
+    there = KnownScene(session.machine, truth.T_camera_base, poses)
+    assert not byhand._is_bare(there, p)
+    turn = pose(rotation(np.array([0.0, 0.0, np.radians(40.0)])), np.zeros(3))
+    elsewhere = there._replace(T_camera_base=truth.T_camera_base @ turn)
+    assert byhand._is_bare(elsewhere, p)
+
+
 def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
     found_with(monkeypatch, looked[3], [1e-4, 0.3, 1e-4])
     found = check_session(simulated)

@@ -1,5 +1,7 @@
 """Where a whole machine's silhouettes lie on the edges of one photograph."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
+from pkmcal.calibration.responses import _way
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -87,6 +90,18 @@ def test_silhouettes_say_how_they_depend_on_the_camera(views):
     off = np.linalg.norm((by_camera - by_rays)[:, 0], axis=-1)
     # pixels weigh by how surely they are the machine's, rays all the same
     assert np.median(off / size) < 0.05
+
+
+def test_coarse_edges_say_nothing_of_how_light_is_coded(views):
+    """What lies beside an edge that could not be measured moves by no response."""
+    view, T = views[0]
+    edges = silhouette_edges(view, T, 0).edges
+    measured = replace(edges, coarse=np.arange(len(edges)) % 2 == 1)
+    moved = replace(edges, normal=edges.normal + 1e-3 * edges.basis[..., 0])
+    way = _way(measured, replace(moved, coarse=np.arange(len(edges)) % 3 == 2))[..., 0]
+    tells = (np.arange(len(edges)) % 2 == 0) & (np.arange(len(edges)) % 3 < 2)
+    np.testing.assert_allclose(way[tells], np.broadcast_to([1e-3, 0], (tells.sum(), 2)), atol=1e-12)
+    assert not way[~tells].any()
 
 
 @pytest.mark.parametrize("axis", range(3))
