@@ -1,6 +1,7 @@
 """Where a whole machine's silhouettes lie on the edges of one photograph."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
+from pkmcal.calibration.turns import _scatter_of
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -137,3 +139,14 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
     }
     assert not given_up & set(map(tuple, each.tolist()))
     assert set(found.point_edge.tolist()) == set(range(len(edges)))
+
+
+def test_few_coarse_edges_do_not_tell_how_they_scatter():
+    """A few that lie well by chance would count for more than all that was measured."""
+    rows = 100
+    estimate = SimpleNamespace(
+        edge_residuals=np.full((rows, 2), 0.01), edge_weights=np.ones(rows)
+    )  # fmt: skip
+    assert _scatter_of(np.arange(rows) < 2, estimate) == 1
+    assert _scatter_of(np.zeros(rows, dtype=bool), estimate) == 1
+    assert _scatter_of(np.ones(rows, dtype=bool), estimate) == pytest.approx(0.01)

@@ -30,6 +30,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.identify.bundle import bundle, machine_told
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
@@ -88,7 +89,8 @@ def join(
         last = _looked(session, found, near, boards, view)
         # how silhouettes scatter in these photographs, their residuals tell, more or less than each
         statistics = last.estimate.statistics
-        share = statistics.chi2_edges / max(statistics.dof_edges, 1.0)
+        freedom = statistics.dof_edges
+        share = statistics.chi2_edges / freedom if freedom > LEAST_NOISE_FREEDOM else 1.0
         found = last.known._replace(scatter=found.scatter * float(np.sqrt(share)))
         near = {k: found.T_camera_base[k] for k in near}
         looks -= 1

@@ -25,6 +25,7 @@ from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.measurements import (
     EdgeSet,
@@ -345,9 +346,11 @@ def _with_silhouettes(
 
 
 def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
-    """Root mean square of the coarse edges' residuals, in what they state; 1 without any."""
+    """Root mean square of the coarse edges' residuals, in what they state; 1 where they are too few
+    to tell.
+    """
     squares = estimate.edge_residuals[coarse & (estimate.edge_weights >= 0.5)] ** 2
-    return float(np.sqrt(squares.mean())) if squares.size else 1.0
+    return float(np.sqrt(squares.mean())) if squares.size > LEAST_NOISE_FREEDOM else 1.0
 
 
 def _each(
