@@ -160,6 +160,18 @@ class EdgeSet:
         """The edges at a mask or at positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    def same_as(self, other: EdgeSet) -> tuple[Integers, Integers]:
+        """Positions in this set and in another of the edges that are in both: of one station's
+        photograph of a configuration, and one side of a leg's tube. Each is in a set once.
+        """
+        each = [
+            np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
+            for of in (self, other)
+        ]
+        number = np.unique(np.concatenate(each), axis=0, return_inverse=True)[1].ravel()
+        own, others = number[: len(self)], number[len(self) :]
+        return np.intersect1d(own, others, return_indices=True)[1:]
+
     def scaled(self, factor: float) -> EdgeSet:
         """The same, that scatter by a factor more."""
         return replace(self, covariance=self.covariance * factor**2)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, evenly
+from pkmcal.arrays import Array, evenly
 from pkmcal.cameras.response import OTHER_RESPONSE, Response
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import as_ended, bundle
@@ -182,18 +182,10 @@ def _way(edges: EdgeSet, other: EdgeSet) -> Array:
     """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
     those that it does not have, nor of coarse ones, which no response moves.
     """
-    every = np.concatenate(
-        [
-            np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
-            for of in (edges, other)
-        ]
-    )
-    place = np.unique(every, axis=0, return_inverse=True)[1].ravel()
-    number: Integers = np.full(len(every), -1)
-    number[place[len(edges) :]] = np.where(other.coarse, -1, np.arange(len(other)))
-    match = number[place[: len(edges)]]
-    both = (match >= 0) & ~edges.coarse
+    mine, theirs = edges.same_as(other)
+    both = ~edges.coarse[mine] & ~other.coarse[theirs]
+    mine, theirs = mine[both], theirs[both]
     turn = np.zeros((len(edges), 2, 1))
-    moved = other.normal[match[both]] - edges.normal[both]
-    turn[both, :, 0] = np.einsum("nij,ni->nj", edges.basis[both], moved)
+    moved = other.normal[theirs] - edges.normal[mine]
+    turn[mine, :, 0] = np.einsum("nij,ni->nj", edges.basis[mine], moved)
     return turn

@@ -327,11 +327,8 @@ def _with_silhouettes(
     T_camera_base = state.T_camera_base[photographs.station]
     coarse = silhouette_edges(view, T_camera_base, photographs.station, refine)
 
-    def each(edges: EdgeSet) -> list[tuple[int, int, int]]:
-        return list(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
-
-    measured = set(each(look.edges))
-    more = np.array([edge not in measured for edge in each(coarse.edges)], dtype=bool)
+    more = np.ones(len(coarse.edges), dtype=bool)
+    more[coarse.edges.same_as(look.edges)[0]] = False
     at, number = more[coarse.point_edge], np.cumsum(more) - 1
     added = replace(
         coarse,
@@ -339,7 +336,8 @@ def _with_silhouettes(
         points=coarse.points[at],
         point_edge=number[coarse.point_edge[at]],
     )
-    told = set(each(added.edges))
+    columns = added.edges.leg, added.edges.tube, added.edges.side
+    told = set(zip(*(column.tolist() for column in columns), strict=True))
     rejected = [r for r in look.rejected if (r.leg, r.tube, r.side) not in told]
     both = legs.joined_looks([look, added], look.blur, look.moved)
     return replace(both, rejected=tuple(rejected))
