@@ -1,5 +1,6 @@
 """Where a whole machine's silhouettes lie on the edges of one photograph."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -19,6 +20,8 @@ from pkmcal.observe.alone import finest_view, likeliest_near
 from pkmcal.observe.evidence import LAST_REACH
 from pkmcal.observe.predict import edge_points, legs_in_camera
 from pkmcal.observe.silhouettes import silhouette_edges
+from pkmcal.pages.page import page_html
+from pkmcal.report.calibration import outcome_of
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import camera_of_size
@@ -129,7 +132,8 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
         return SeenSession(session, photographs, boards, known)
 
     monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
-    found = calibrate_session(folder).observation
+    calibration = calibrate_session(folder)
+    found = calibration.observation
     edges = found.edges
     assert 0 < edges.coarse.sum() < (~edges.coarse).sum()
     each = np.stack([edges.station, edges.leg, edges.tube, edges.side], axis=1)
@@ -139,6 +143,14 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
     }
     assert not given_up & set(map(tuple, each.tolist()))
     assert set(found.point_edge.tolist()) == set(range(len(edges)))
+    # and told apart
+    told = outcome_of(calibration)
+    rows = json.loads(told.texts["calibration.json"])["residuals"]
+    coarse = [row[rows["columns"].index("coarse")] for row in rows["edges"]]
+    assert coarse == edges.coarse.tolist()
+    count = int(edges.coarse.sum())
+    said = f"{len(edges) - count} edges measured and {count} told by silhouettes"
+    assert said in page_html(told)
 
 
 def test_few_coarse_edges_do_not_tell_how_they_scatter():
@@ -150,3 +162,15 @@ def test_few_coarse_edges_do_not_tell_how_they_scatter():
     assert _scatter_of(np.arange(rows) < 2, estimate) == 1
     assert _scatter_of(np.zeros(rows, dtype=bool), estimate) == 1
     assert _scatter_of(np.ones(rows, dtype=bool), estimate) == pytest.approx(0.01)
+
+
+def test_edges_of_two_looks_are_matched(views):
+    """By where they are, whatever their order; what only one look has has no partner."""
+    edges = silhouette_edges(views[0][0], views[0][1], 0).edges
+    shuffled = np.random.default_rng(0).permutation(len(edges))[2:]
+    mine, theirs = edges.same_as(edges.select(shuffled))
+    assert sorted(mine.tolist()) == sorted(shuffled.tolist())
+    assert np.array_equal(shuffled[theirs], mine)
+    elsewhere = replace(edges, station=edges.station + 1)
+    assert [len(part) for part in edges.same_as(elsewhere)] == [0, 0]
+    assert [len(part) for part in edges.same_as(edges.select(shuffled[:0]))] == [0, 0]

@@ -53,7 +53,9 @@ CALIBRATION_CONVENTIONS = (
     " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
     " of its outer frame."
 )
-EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
+EDGE_COLUMNS = (
+    "station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt", "coarse",
+)  # fmt: skip
 """Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
 POSE_COLUMNS = (
     "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
@@ -430,6 +432,7 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
             (edges.station, edges.configuration, edges.leg, edges.tube, edges.side),
             estimate.edge_weights,
             estimate.edge_residuals,
+            edges.coarse,
         ),
         "pose_columns": POSE_COLUMNS,
         "poses": rows(

@@ -295,10 +295,15 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             f"measured without a camera; {quiet} of them given less than half their weight",
         )
     used = sum(provenance.used_photographs(session, observation))
+    coarse = int(observation.edges.coarse.sum())
+    beside = f" and {coarse} told by silhouettes" if coarse else ""
     parts = [
-        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT_EDGE_WEIGHT))} of"
+        f"{count(n, thing)} measured{more}, {int(np.sum(weights < KEPT_EDGE_WEIGHT))} of"
         " them given less than half their weight"
-        for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
+        for thing, weights, n, more in (
+            ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
+            ("pose", estimate.pose_weights, len(estimate.pose_weights), ""),
+        )
         if len(weights)
     ]
     return Figure(

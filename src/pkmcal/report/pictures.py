@@ -226,8 +226,9 @@ class _Found:
             weight = float(estimate.edge_weights[n])
             across, tilt = estimate.edge_residuals[n].tolist()
             leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
+            coarse = ", by its silhouette" if edges.coarse[n] else ""
             tip = (
-                f"{edge_name(leg, tube, side).capitalize()}:"
+                f"{edge_name(leg, tube, side).capitalize()}{coarse}:"
                 f" {number(float(shifts[n]), 2, signed=True)} px outward;"
                 f" {residual_words(across, tilt, weight)}"
             )

@@ -109,7 +109,7 @@ def _judged(
     rows = (document.get("residuals") or {}).get("edges") or []
     judged = {
         (int(leg) - 1, int(tube) - 1, int(side) - 1): _Judged(weight, shift, tilt)
-        for station, row, leg, tube, side, weight, shift, tilt in rows
+        for station, row, leg, tube, side, weight, shift, tilt, *_ in rows
         if (station, row) == (s, k + 1)
     }
     own = [viewed.station(look.station).name, viewed.session.configurations[k]]
