@@ -62,6 +62,7 @@ POSE_COLUMNS = (
 )  # fmt: skip
 """Of a row in residuals.poses, the last six whitened together, in standard deviations."""
 EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
+EDGE_RESIDUALS = slice(EDGE_COLUMNS.index("shift"), EDGE_COLUMNS.index("tilt") + 1)
 UNTOLD_TARGET_SIGMA = 1.0
 """m or rad; a target's place that is known no better is not told by the data."""
 

@@ -16,6 +16,7 @@ from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.results import (
     CALIBRATION_DOCUMENT_FILE,
     CALIBRATION_FORMAT,
+    EDGE_RESIDUALS,
     EDGE_WEIGHT,
     FORMAT_KEY,
     POSE_WEIGHT,
@@ -122,9 +123,10 @@ class SavedCalibration(ShownCalibration):
         """What it shows of itself; an older file may not have all of it."""
         document = self.document
         residuals = document.get("residuals") or {}
+        edges, poses = (residuals.get(key) or () for key in ("edges", "poses"))
         parts = [
-            [x for row in residuals.get(key) or () if row[weight] >= 0.5 for x in row[weight + 1 :]]
-            for key, weight in (("edges", EDGE_WEIGHT), ("poses", POSE_WEIGHT))
+            [x for row in edges if row[EDGE_WEIGHT] >= 0.5 for x in row[EDGE_RESIDUALS]],
+            [x for row in poses if row[POSE_WEIGHT] >= 0.5 for x in row[POSE_WEIGHT + 1 :]],
         ]
         known = {f.name for f in fields(Statistics)}
         statistics = {k: v for k, v in (document.get("statistics") or {}).items() if k in known}
