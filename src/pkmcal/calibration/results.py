@@ -433,7 +433,7 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
             (edges.station, edges.configuration, edges.leg, edges.tube, edges.side),
             estimate.edge_weights,
             estimate.edge_residuals,
-            edges.coarse,
+            edges.coarse.astype(float),
         ),
         "pose_columns": POSE_COLUMNS,
         "poses": rows(
