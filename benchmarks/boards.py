@@ -2,7 +2,7 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py BOARD.yaml PHOTOGRAPH…
 
-As `pkmcal calibrate` looks at them, on `BOARD_SEARCH_THREADS` threads; the best of ``ROUNDS``.
+As `pkmcal calibrate` looks at them, on `THREADS` threads; the best of ``ROUNDS``.
 Where other work shares the machine the wall's time says nothing: the processor's, divided by the
 threads, is then what a free machine would reach at most.
 """
@@ -13,8 +13,8 @@ import sys
 import time
 from pathlib import Path
 
+from pkmcal.arrays import THREADS
 from pkmcal.boards.board import load_board
-from pkmcal.boards.detect import BOARD_SEARCH_THREADS
 from pkmcal.boards.poses import detect_in
 from pkmcal.observe.images import Pictures
 from pkmcal.session.photographs import photograph_header
@@ -40,7 +40,7 @@ def main() -> int:
     sys.stdout.write(
         f"{found} of {n} found; {n / min(walls):.0f} a second,"
         f" {1e3 * min(processors) / n:.1f} ms of processor each:"
-        f" {n * BOARD_SEARCH_THREADS / min(processors):.0f} a second on {BOARD_SEARCH_THREADS}"
+        f" {n * THREADS / min(processors):.0f} a second on {THREADS}"
         f" free processors\n"
     )
     return 0

@@ -420,7 +420,7 @@ def found_with(monkeypatch, truth, doubts, textured=False):
     nowhere = Alone(np.eye(4)[None], np.zeros(1), 1.0)
     monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)
     monkeypatch.setattr(byhand, "look_closer", look)
-    monkeypatch.setattr(byhand, "CALIBRATION_THREADS", 1)
+    monkeypatch.setattr(byhand, "THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
         monkeypatch.setattr(surroundings, "texture_of", lambda _image, _camera: empty)

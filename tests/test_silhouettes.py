@@ -1,18 +1,23 @@
 """Where a whole machine's silhouettes lie on the edges of one photograph."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
+from pkmcal.boards.views import Boards
+from pkmcal.calibration import byhand, closely
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
 from pkmcal.calibration.turns import _scatter_of
+from pkmcal.check import check
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -27,6 +32,7 @@ from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
+from test_handheld import found_with
 
 SETTINGS = Settings(configurations=4, repeats=1, handheld=True, tolerance=0.0)
 
@@ -151,6 +157,56 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
     count = int(edges.coarse.sum())
     said = f"{len(edges) - count} edges measured and {count} told by silhouettes"
     assert said in page_html(told)
+
+
+@pytest.fixture(scope="module")
+def beside(folder, tmp_path_factory):
+    """The same photographs by hand beside a camera on a tripod, and where all truly stand."""
+    out = tmp_path_factory.mktemp("beside")
+    tripod = replace(SETTINGS, stations=1, handheld=False)
+    machine, camera = load_mechanism("gough-stewart"), camera_of_size((640, 480))
+    rendered(out / "tripod", machine, camera, tripod, seed=3)
+    shutil.copytree(folder, out / "both")
+    shutil.copytree(out / "tripod" / "images", out / "both" / "images", dirs_exist_ok=True)
+    first, second = (yaml.safe_load((out / name / "session.yaml").read_text())
+                     for name in ("both", "tripod"))  # fmt: skip
+    first["stations"] |= second["stations"]
+    (out / "both" / "session.yaml").write_text(yaml.safe_dump(first, sort_keys=False))
+    assert (out / "both" / "joints.csv").read_text() == (out / "tripod" / "joints.csv").read_text()
+    truths = [load_truth(out / name, machine) for name in ("both", "tripod")]
+    return out / "both", np.concatenate([truth.T_camera_base for truth in truths])
+
+
+def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, monkeypatch):
+    """Silhouettes are looked for in one photograph of a place: edges of others lie elsewhere."""
+    session = load_session(beside[0])
+    photographs, T = read_photographs(session), beside[1]
+    assert [len(p.images) for p in photographs] == [1, 1, 1, 1, 4]
+    joined = []
+
+    def join(*words):
+        joined.append(closely.join(*words))
+        return joined[-1]
+
+    monkeypatch.setattr(byhand, "join", join)
+    found_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
+    seen = byhand.place(session, photographs, Boards(), np.random.default_rng(0))
+    known = seen.known
+    assert [len(p.images) for p in seen.photographs] == [1, 1, 1, 1, 4]
+    assert sorted(known.edges) == [0, 1, 2, 3, 4]
+    for k, p in enumerate(photographs):
+        assert set(known.edges[k].configuration.tolist()) == {p.configuration[0]}
+    # and lie there where the machine truly is
+    one = photographs[4].select(np.arange(1))
+    poses = platform_poses(session)
+    view = finest_view(session.machine, one, session.joints, poses)
+    off = off_truth(view, T[4], known.edges[4])
+    assert np.median(np.abs(off)) < 1
+
+
+def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
+    monkeypatch.setattr(check, "search_by_hand", pytest.fail)
+    assert check.check_session(beside[0].parent / "tripod").stations
 
 
 def test_few_coarse_edges_do_not_tell_how_they_scatter():

@@ -1,5 +1,5 @@
-"""The one array type of the project, so that signatures stay readable, what it is told as, and its
-plain figures.
+"""The one array type of the project, so that signatures stay readable, what it is told as, its
+plain figures, and how many threads work on arrays.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 Integers = NDArray[np.integer[Any]]
 Booleans = NDArray[np.bool_]
+THREADS = 2
+"""Threads beside one another: decoding and array work release Python's lock."""
 
 
 def rms(values: Array) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
     LEAST_CORNERS_FOUND,
@@ -45,7 +45,6 @@ LEAST_MARKER = 10.0
 LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
-BOARD_SEARCH_THREADS = 2
 
 
 def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:
@@ -56,7 +55,7 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     """
     files = [Path(path) for path in paths]
     size = _common_size(files)
-    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
         if not any(detection.found for detection in found):
             # Before all that can be tried is tried on photographs of something else.

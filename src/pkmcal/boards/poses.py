@@ -24,9 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, evenly
+from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly
 from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.detect import BOARD_SEARCH_THREADS
 from pkmcal.boards.find import detect_board
 from pkmcal.boards.fit import (
     BoardPoses,
@@ -113,7 +112,7 @@ def detect_in(
         # Taken in the thread, so that photographs may be decoded there.
         return detect_board(images[k], board, names[k], quick=True)
 
-    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         return tuple(pool.map(detect, range(len(names))))
 
 
@@ -129,7 +128,7 @@ def detect_again(
         return tuple(found)
     chosen = [missed[k] for k in evenly(len(missed), most)]
     out = list(found)
-    with ThreadPoolExecutor(BOARD_SEARCH_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
         for k, detection in zip(chosen, again, strict=True):
             out[k] = detection

@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress, station_poses
+from pkmcal.calibration.recognise import CalibrationProgress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MachineTold
@@ -102,7 +102,8 @@ def search_by_hand(
     stations that are placed already, NaN for the others. told : called with the step in words and
     the share done.
     """
-    at = {p.station: p for p in photographs}
+    one = np.zeros(1, dtype=int)  # of a camera on a tripod the first photograph stands for all
+    at = {p.station: p.select(one) for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _Answer] = {}
@@ -123,7 +124,7 @@ def search_by_hand(
     def believed() -> Array:
         return _believed(found(), len(by_hand), boards, known.T_camera_base)
 
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         alone = pool.map(partial(_alone, session, known), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _Answer(one, one)

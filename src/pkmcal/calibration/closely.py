@@ -21,11 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import KnownScene
-from pkmcal.calibration.recognise import CALIBRATION_THREADS
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.identify.bundle import bundle, machine_told
@@ -145,7 +144,7 @@ def _looked(
     def look(k: int) -> EdgeSet:
         return silhouette_edges(view(k, known), places[k], k).edges.scaled(known.scatter)
 
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         edges = dict(zip(stations, pool.map(look, stations), strict=True))
     only = replace(session.of_stations(stations), trackers=())
     shown = boards.of(np.array(stations, dtype=int))

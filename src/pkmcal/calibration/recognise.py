@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
@@ -33,8 +33,6 @@ FEWEST_AT_A_STATION = 8
 """However many stations there are: what a search looks at."""
 CalibrationProgress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share that is done, 0 to 1."""
-CALIBRATION_THREADS = 2
-"""Threads beside one another: decoding and array work release Python's lock."""
 ALLOWED_LEG_MISS = 2.0
 """Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
 LEAST_REACHED_SHARE = 0.5
@@ -73,7 +71,7 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         size = station.camera.image_size
         kept.append(min(fitting(size, room), len(station.photographs)))
         room -= kept[-1] * size[0] * size[1]
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(read, numbers, kept))
 
 
@@ -207,15 +205,18 @@ def recognise(
         tables = distance_tables(p.images)
         return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
 
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
-        few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
-        views = tuple(pool.map(view, few))
     at = [p.station for p in photographs]
     known = [station.T_camera_base for station in session.stations]
     if starts is not None:
         told = zip(known, starts[: len(known)], strict=True)
         known = [T if T is not None or np.isnan(start).any() else start for T, start in told]
-    found = _searched(views, [known[s] for s in at], [None] * len(at), rngs)
+    with ThreadPoolExecutor(THREADS) as pool:
+        few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
+        ready = [pool.submit(view, p) for p in few]
+        # a station is searched while the next one's tables are worked out
+        coming = (one.result() for one in ready)
+        found = _searched(coming, [known[s] for s in at], [None] * len(at), rngs)
+        views = tuple(one.result() for one in ready)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
     good: list[Array | None] = [None] * len(known)
@@ -230,7 +231,7 @@ Search = FoundStation | None
 
 
 def _searched(
-    views: tuple[StationView, ...],
+    views: Iterable[StationView],
     starts: list[Array | None],
     before: Sequence[Search],
     rngs: list[np.random.Generator],
@@ -258,7 +259,7 @@ def _anywhere(
             return before
         return _better(find_station(view, None, rng), before)
 
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(search, views, before, rngs))
 
 

@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import THREADS, Array, Booleans
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import CALIBRATION_THREADS, CalibrationProgress
+from pkmcal.calibration.recognise import CalibrationProgress
 from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
@@ -355,7 +355,7 @@ def _each(
     photographs: list[legs.Photographs],
     look: Callable[[legs.Photographs], legs.StationEdges],
 ) -> list[legs.StationEdges]:
-    with ThreadPoolExecutor(CALIBRATION_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         return [combined(seen) for seen in pool.map(look, photographs)]
 
 

@@ -47,6 +47,7 @@ from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
+from pkmcal.observe.alone import Alone
 from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
@@ -272,8 +273,10 @@ def _observed(
     places = {p.station: found for p, found in zip(fixed, recognition.found, strict=True)}
     nowhere = np.full((len(session.stations), 4, 4), np.nan)
     known = KnownScene(session.machine, nowhere if starts is None else starts, poses)
-    alone, _ = search_by_hand(session, whole, boards.boards, known)
-    for k, one in alone.items():  # what chance is to others, another place is to one alone
+    by_hand: dict[int, Alone] = {}
+    if len(fixed) < len(whole):
+        by_hand, _ = search_by_hand(session, whole, boards.boards, known)
+    for k, one in by_hand.items():  # what chance is to others, another place is to one alone
         places[k] = FoundStation(
             one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True
         )

@@ -19,14 +19,13 @@ from typing import Any, overload
 
 import numpy as np
 
-from pkmcal.arrays import Integers
+from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import check_regular, read_exif, stated_size
 from pkmcal.observe.complaints import decoded_and_fault
 
 KEPT_PHOTOGRAPH_BYTES = 128 * 2**20
 """Bytes of decoded photographs that are kept: 160 of 1024x768, 10 of a telephone's."""
-DECODING_THREADS = 2
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
 CAMERA_BIT_DEPTHS, UNSHIFTED_GREY_LEVEL = (8, 10, 12), 15
@@ -215,7 +214,7 @@ class Pictures(LazyPictures):
             image = out[number]  # a fault is told here, before any work
             return image if number < most else None
 
-        with ThreadPoolExecutor(DECODING_THREADS) as pool:
+        with ThreadPoolExecutor(THREADS) as pool:
             found = list(pool.map(look, range(len(out))))
         out._kept = {number: image for number, image in enumerate(found) if image is not None}
         return out

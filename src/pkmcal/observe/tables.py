@@ -10,12 +10,13 @@ the floor and the wall do not say where the machine is.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import THREADS, Array, Booleans, Integers
 
 EDGE_DIRECTIONS = 8
 """Edge directions told apart; each table takes the neighbouring directions in as well."""
@@ -82,9 +83,9 @@ class DirectionTables:
         """Work out what there is not yet of directions (...)."""
         if self.ready.take(direction).all():
             return
-        for k in np.unique(direction):
-            if not self.ready[k]:
-                self._work_out(k)
+        missing = [k for k in np.unique(direction) if not self.ready[k]]
+        with ThreadPoolExecutor(THREADS) as pool:
+            list(pool.map(self._work_out, missing))
 
     def _work_out(self, direction: int) -> None:
         rows, taken_in = len(self.picture), alike(direction, len(self.ready))

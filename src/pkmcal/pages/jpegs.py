@@ -8,14 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from pkmcal.arrays import Integers
+from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
 from pkmcal.observe.images import Pictures
 
 LARGE_JPEG_WIDTH, SMALL_JPEG_WIDTH = 640, 256
 """Widths, px: to look at one, and to look over all."""
 PAGE_JPEG_QUALITY = 70
-JPEG_THREADS = 2
 JPEGS_DECODED_AT_ONCE = 32
 """Photographs that are decoded before it is asked whether there is room for more."""
 
@@ -36,7 +35,7 @@ def small_and_large(
     photographs : each as a station's, and its number among them.
     """
     left, waiting = room, len(photographs)
-    with ThreadPoolExecutor(JPEG_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
             some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
             for small, large in pool.map(

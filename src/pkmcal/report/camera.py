@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
+from pkmcal.arrays import THREADS
 from pkmcal.boards.camera import COVERAGE_CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
 from pkmcal.pages.drawn import Arrow, Picture
-from pkmcal.pages.jpegs import JPEG_THREADS, jpeg
+from pkmcal.pages.jpegs import jpeg
 from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
@@ -203,7 +204,7 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
     """All views, each by its file's name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
-    with ThreadPoolExecutor(JPEG_THREADS) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
         return tuple(_photograph(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
