@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,12 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.bundle import as_ended, bundle, machine_told, solve_batch
-from pkmcal.identify.covariance import Information, identifiability, machine_covariance
+from pkmcal.identify.covariance import (
+    Information,
+    covariance_by_noise,
+    identifiability,
+    machine_covariance,
+)
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
@@ -486,3 +492,38 @@ def test_measurements_are_not_changed():
     estimate(scene, m, rng)
     np.testing.assert_array_equal(m.edges.normal, copy.edges.normal)
     np.testing.assert_array_equal(m.joints, copy.joints)
+
+
+def test_what_noise_makes_of_a_covariance_is_not_what_was_known_before():
+    """Of least squares with rows that are measured, J, and rows that are known, P."""
+    rng = np.random.default_rng(0)
+    J, P = rng.normal(size=(2, 9, 4)), rng.normal(size=(3, 4))
+    C = np.linalg.inv(J.mT @ J + P.T @ P)
+    info = SimpleNamespace(problem=SimpleNamespace(prior=P), covariance=C)
+    np.testing.assert_allclose(covariance_by_noise(info), C @ (J.mT @ J) @ C, rtol=1e-9)
+
+
+def test_what_looks_scatter_by_is_in_the_deviations_and_nowhere_else():
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng)
+    measurements = scene.measurements(rng)
+    found = bundle(scene.machine, measurements, scene.state())
+    measurements = replace(measurements, look_variance=0.5)
+    more = bundle(scene.machine, measurements, scene.state())
+    np.testing.assert_array_equal(more.state.theta, found.state.theta)
+    np.testing.assert_array_equal(more.edge_residuals, found.edge_residuals)
+    assert more.statistics.look_scatter == pytest.approx(np.sqrt(0.5))
+    assert found.statistics.look_scatter == 0
+    larger = np.linalg.eigvalsh(more.joint_covariance - found.joint_covariance)
+    assert larger.min() > -1e-9 * larger.max()
+    n = len(found.data_share)
+    before, after = (np.diag(e.joint_covariance)[:n] for e in (found, more))
+    told, drawn = found.data_share > 0.99, (found.data_share < 0.01) & (before > 0)
+    assert told.any()
+    # readings' scales, radii, shading have part in what edges tell, and are drawn in part
+    assert np.all(after[told] > 1.1 * before[told])
+    assert np.all(after <= 1.5001 * before)
+    np.testing.assert_allclose(after[drawn], before[drawn], rtol=0.02)
+    assert np.all(more.data_share > -0.01)  # no less is known than was drawn
+    for name in ("edge_shift_sigma", "line_shift_sigma"):
+        assert np.all(getattr(more, name) >= getattr(found, name))

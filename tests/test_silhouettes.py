@@ -16,9 +16,10 @@ from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
-from pkmcal.calibration.turns import _scatter_of
+from pkmcal.calibration.turns import _between, _scatter_of
 from pkmcal.check import check
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
+from pkmcal.identify.bundle import bundle
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.alone import finest_view, likeliest_near
@@ -156,7 +157,33 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
     assert coarse == edges.coarse.tolist()
     count = int(edges.coarse.sum())
     said = f"{len(edges) - count} edges measured and {count} told by silhouettes"
-    assert said in page_html(told)
+    page = page_html(told)
+    assert said in page
+    # what depends on where they were looked for is in the deviations, and said
+    variance = calibration.measurements.look_variance
+    assert 0.02 < variance < 2
+    assert calibration.estimate.statistics.look_scatter == pytest.approx(np.sqrt(variance))
+    assert f"results scatter by {np.sqrt(variance):.1f} of the deviations" in page
+
+
+def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
+    """Machines that scatter as noise lets them have one, twice as far apart they have four; where
+    hardly any look ends, as much again as noise is believed.
+    """
+    calibration = calibrate_session(beside[0].parent / "tripod")
+    assert calibration.measurements.look_variance == 0  # painted, and from one place
+    measurements, estimate = calibration.measurements, calibration.estimate
+    again = bundle(
+        calibration.session.machine, replace(measurements, look_variance=1.0), estimate.state
+    )
+    n = len(estimate.state.theta)
+    noise = (again.joint_covariance - estimate.joint_covariance)[:n, :n]
+    value, vectors = np.linalg.eigh(noise)
+    half = vectors * np.sqrt(np.maximum(value, 0.0))
+    drawn = estimate.state.theta + np.random.default_rng(0).normal(size=(300, n)) @ half.T
+    assert _between(drawn, measurements, estimate) == pytest.approx(1, rel=0.1)
+    apart = estimate.state.theta + 2 * (drawn - estimate.state.theta)
+    assert _between(apart, measurements, estimate) == pytest.approx(4, rel=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -275,7 +275,8 @@ class Measurements:
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
     gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
     they were measured, in BREATHING_SIGMA; empty where none breathes. level : (S,) stations whose z
-    axis is the base's, exactly; empty where there is none.
+    axis is the base's, exactly; empty where there is none. look_variance : by what part of its
+    variance by noise a result varies besides, with where its edges were looked for.
     """
 
     edges: EdgeSet
@@ -290,6 +291,7 @@ class Measurements:
     shaded: bool = False
     breathing_at: Array = field(default_factory=lambda: np.zeros(0))
     level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    look_variance: float = 0.0
 
     __repr__ = short_repr
 

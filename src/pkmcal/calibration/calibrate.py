@@ -41,7 +41,7 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
-from pkmcal.calibration.turns import Turns, identify_poses, take_turns
+from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bundle import as_ended
@@ -234,6 +234,7 @@ def _identify(
     session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     if seen.photographs:
         turns = take_turns(seen, cameras, clock.told, clock.lap)
+        turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
     else:
         turns = identify_poses(session, seen.boards, seen.known.T_camera_base, cameras, clock.told)
     clock.lap("identify")

@@ -7,11 +7,12 @@ tables of poses need no prediction: they are measured once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from threading import Lock
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +24,14 @@ from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import CalibrationProgress
 from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
-from pkmcal.identify.bundle import bundle
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
+from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -42,6 +47,7 @@ from pkmcal.observe.profiles import EDGE_SHIFTS
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
+from pkmcal.solver.ranks import RANK_TOLERANCE
 from pkmcal.wording import listed
 
 MOST_EDGE_LOOKS = 3
@@ -53,6 +59,9 @@ far."""
 ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
+LOOKS_AGAIN = 4
+"""Looks from machines as likely as the one that was found: with some thirty numbers told in each,
+what they scatter by is known to a seventh."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
@@ -67,13 +76,21 @@ _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all oth
 
 
 class Turns(NamedTuple):
-    """What the last turn left."""
+    """What the last turn left.
+
+    photographs : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
+    edges, see :class:`KnownScene`. start : from where the estimate was sought.
+    """
 
     observation: Observation
     measurements: Measurements
     estimate: Estimate
     cameras: CameraRefinement
     responses: tuple[ResponseTold, ...] = ()
+    photographs: Sequence[legs.Photographs] = ()
+    blur: Mapping[int, float | None] = MappingProxyType({})
+    scatter: float = 1.0
+    start: State | None = None
 
 
 def take_turns(
@@ -93,15 +110,13 @@ def take_turns(
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses: tuple[ResponseTold, ...] = ()
-    scatter = seen.known.scatter
+    scatter, start = seen.known.scatter, estimate.state
     for turn in range(MOST_EDGE_LOOKS):
         share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
-        look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active, done=done)
-        whole = partial(_with_silhouettes, session, estimate, scatter, cameras.active)
-        looks = _each(photographs, lambda p, look=look, whole=whole: whole(p, look(p)))
+        looks = _looked(session, photographs, estimate, blur, scatter, cameras.active, done)
         blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
@@ -148,7 +163,99 @@ def take_turns(
         if moved < SETTLED_EDGE_DISTANCE and not cameras.active:
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
-    return Turns(observation, measurements, estimate, cameras, responses)
+    return Turns(
+        observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start
+    )
+
+
+def looked_again(
+    seen: SeenSession, turns: Turns, rng: np.random.Generator, told: CalibrationProgress
+) -> Turns:
+    """The same, with what depends on where edges were looked for among the deviations.
+
+    Which border is a leg's, where two lie side by side, is found by where the leg should be, and no
+    residual shows it: all edges of a look are where that look's machine has them. So they are
+    looked for from machines as likely as the one that was found, and the variance between the
+    estimates is added to that of one (Rubin, Multiple imputation for nonresponse in surveys, 1987,
+    3.1). Of painted legs on a tripod the edges are the same from anywhere, and nothing is asked.
+    """
+    session, estimate = seen.session, turns.estimate
+    by_hand = any(session.stations[p.station].handheld for p in turns.photographs)
+    if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
+        return turns
+    cameras = turns.cameras.moved(estimate)
+    photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
+    found: list[Array] = []
+    for number, drawn in enumerate(_as_likely(session, estimate, rng)):
+        told(f"Looking from another place: {number + 1} of {LOOKS_AGAIN}", 0.85)
+        try:
+            looks = _looked(session, photographs, drawn, turns.blur, turns.scatter, cameras.active)
+            measurements = measurements_of(session, seen.boards, _edges(looks), cameras)
+            ended = bundle(session.machine, measurements, _at_cameras(drawn.state, cameras))
+        except PkmcalError:
+            continue
+        found.append(ended.state.theta)
+    variance = _between(np.stack(found), turns.measurements, estimate) if len(found) > 1 else 1.0
+    measurements = replace(turns.measurements, look_variance=variance)
+    again = bundle(session.machine, measurements, turns.start)
+    return turns._replace(measurements=measurements, estimate=again)
+
+
+def _as_likely(
+    session: Session, estimate: Estimate, rng: np.random.Generator
+) -> Iterator[Estimate]:
+    """Estimates as likely as one, in pairs to both sides of it: machine, stations, and platforms as
+    the readings then have them.
+    """
+    machine, state = estimate.machine, estimate.state
+    n, count = len(machine.values), len(state.T_camera_base)
+    value, vectors = np.linalg.eigh(estimate.joint_covariance[: n + 6 * count, : n + 6 * count])
+    half = vectors * np.sqrt(np.maximum(value, 0.0))
+    for step in rng.normal(size=(LOOKS_AGAIN // 2, len(half))) @ half.T:
+        for away in (step, -step):
+            other = machine.with_values(machine.values + away[:n])
+            closed = other.forward_result(session.joints, state.T_base_platform)
+            poses = np.where(
+                closed.converged[:, None, None], closed.T_base_platform, state.T_base_platform
+            )
+            stations = perturb(state.T_camera_base, away[n:].reshape(count, 6))
+            there = replace(
+                state, theta=other.values, T_camera_base=stations, T_base_platform=poses
+            )
+            yield replace(estimate, machine=other, state=there)
+
+
+def _between(values: Array, measurements: Measurements, estimate: Estimate) -> float:
+    """Variance of the machine's parameters, values (N, P), in that which the noise gives them."""
+    machine, n = estimate.machine, len(estimate.machine.values)
+    info = as_ended(measurements, estimate)[1]
+    shared = covariance_by_noise(info)[0]
+    gauge = default_gauge(machine)
+    noise = machine_covariance(info.problem, machine, estimate.state, shared, gauge)[:n, :n]
+    covariance = estimate.joint_covariance[:n, :n]
+    size = np.sqrt(np.diag(covariance))
+    size[size == 0] = np.inf  # of what is exactly known
+    value, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+    known = value > RANK_TOLERANCE * value[-1]
+    white = vectors[:, known] / np.sqrt(value[known]) / size[:, None]
+    away = (values - values.mean(axis=0)) @ white
+    told = max(float(np.trace(white.T @ noise @ white)), 1.0)
+    return float(np.sum(away**2)) / (len(values) - 1) / told
+
+
+def _looked(
+    session: Session,
+    photographs: Sequence[legs.Photographs],
+    estimate: Estimate,
+    blur: Mapping[int, float | None],
+    scatter: float,
+    refine: bool,
+    done: legs.PhotographsLookedAt | None = None,
+) -> list[legs.StationEdges]:
+    """The edges of all photographs, where an estimate has them."""
+    look = partial(_measure, estimate=estimate, blur=blur, refine=refine, done=done)
+    whole = partial(_with_silhouettes, session, estimate, scatter, refine)
+    return _each(photographs, lambda p: whole(p, look(p)))
 
 
 def _counted(
@@ -291,7 +398,7 @@ def _whole_legs(
 def _measure(
     photographs: legs.Photographs,
     estimate: Estimate,
-    blur: dict[int, float | None],
+    blur: Mapping[int, float | None],
     refine: bool,
     done: legs.PhotographsLookedAt | None = None,
 ) -> legs.StationEdges:
@@ -352,7 +459,7 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
 
 
 def _each(
-    photographs: list[legs.Photographs],
+    photographs: Sequence[legs.Photographs],
     look: Callable[[legs.Photographs], legs.StationEdges],
 ) -> list[legs.StationEdges]:
     with ThreadPoolExecutor(THREADS) as pool:

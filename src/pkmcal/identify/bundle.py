@@ -17,6 +17,7 @@ from pkmcal.identify.alike import covariance_of_alike
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Information,
+    covariance_by_noise,
     data_share,
     machine_covariance,
     reduced_rows,
@@ -453,6 +454,8 @@ def _estimate(
     """The result in the gauge, with everything that a report asks for."""
     found, problem = result.solution.state, result.info.problem
     shared, u = result.covariance[0], problem.unknowns
+    if measurements.look_variance:
+        shared = shared + measurements.look_variance * covariance_by_noise(result.info)[0]
     solved = state_of(assembled, found, start)
     full = machine_covariance(problem, machine, solved, shared, gauge)
     state = in_gauge(machine, solved, gauge)
@@ -483,7 +486,7 @@ def _estimate(
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.seen,
-        statistics=_statistics(result, assembled, value),
+        statistics=_statistics(result, assembled, value, measurements.look_variance),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
@@ -509,7 +512,9 @@ def _with_unseen_poses(
     return replace(state, T_base_platform=poses, internal=internal)
 
 
-def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Statistics:
+def _statistics(
+    result: BatchResult, assembled: Assembled, value: Array, look_variance: float
+) -> Statistics:
     """What the residuals (1, K, r) and their number say of the fit."""
     problem, state = result.info.problem, result.info.state
     kinds = np.array(assembled.priors)
@@ -548,6 +553,7 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
         reading_range=_range(found, READING_ROWS_KIND, result.reading_scale),
         pose_range=_range(found, POSE_ROWS_KIND, result.scale.poses),
         shading=float(np.median(problem.data.shading[0])),
+        look_scatter=float(np.sqrt(look_variance)),
     )
 
 

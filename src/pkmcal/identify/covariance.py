@@ -148,6 +148,14 @@ class Information:
         return half @ half.mT
 
 
+def covariance_by_noise(info: Information) -> Array:
+    """The part of the shared unknowns' covariance (B, na, na) that the noise of what was measured
+    makes; the rest is how little is known beforehand.
+    """
+    known = info.problem.prior @ info.covariance
+    return info.covariance - known.mT @ known
+
+
 def reduced_rows(
     info: Information, keep: tuple[Name, ...], silent: tuple[Name, ...] | None = None
 ) -> tuple[Array, Array]:

@@ -62,7 +62,8 @@ class Statistics:
     standard deviation of what the edges of one side of a tube at one station have in common.
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
     reading_range, pose_range : factors on the stated noise that the data allow, smallest and
-    largest, None for no end (:mod:`pkmcal.identify.noise`).
+    largest, None for no end (:mod:`pkmcal.identify.noise`). look_scatter : what the result scatters
+    by with where edges were looked for, in the deviations that noise gives it; they contain it.
     """
 
     chi2: float
@@ -86,6 +87,7 @@ class Statistics:
     reading_scale: float = 1.0
     reading_range: tuple[float, float | None] = (0.0, None)
     pose_range: tuple[float, float | None] = (0.0, None)
+    look_scatter: float = 0.0
 
     @property
     def chi2_as_stated(self) -> float:
