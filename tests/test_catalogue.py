@@ -267,7 +267,7 @@ def test_a_simulated_session_calibrates(machine):
 
 
 # With photographs: three places for machines whose platform hides legs or moves them little
-RENDERED = {name: 1 if name in ("3-rpr", "3-upu") else 3 for name in NAMES}
+RENDERED = {name: 1 if name == "3-rpr" else 3 for name in NAMES}
 
 
 @pytest.mark.slow

@@ -10,13 +10,13 @@ import pytest
 import yaml
 
 from pkmcal.boards.views import Boards
-from pkmcal.calibration import byhand, closely
+from pkmcal.calibration import byhand, closely, turns
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
-from pkmcal.calibration.turns import _between, _scatter_of
+from pkmcal.calibration.turns import _scatter_of, _variance
 from pkmcal.check import check
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.identify.bundle import bundle
@@ -181,9 +181,9 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
     value, vectors = np.linalg.eigh(noise)
     half = vectors * np.sqrt(np.maximum(value, 0.0))
     drawn = estimate.state.theta + np.random.default_rng(0).normal(size=(300, n)) @ half.T
-    assert _between(drawn, measurements, estimate) == pytest.approx(1, rel=0.1)
-    apart = estimate.state.theta + 2 * (drawn - estimate.state.theta)
-    assert _between(apart, measurements, estimate) == pytest.approx(4, rel=0.1)
+    changes = drawn - estimate.state.theta
+    assert _variance(changes, measurements, estimate) == pytest.approx(1, rel=0.1)
+    assert _variance(2 * changes, measurements, estimate) == pytest.approx(4, rel=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -234,6 +234,16 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
 def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
     monkeypatch.setattr(check, "search_by_hand", pytest.fail)
     assert check.check_session(beside[0].parent / "tripod").stations
+
+
+def test_a_machine_that_does_not_settle_is_refused(beside, monkeypatch):
+    """Here none does, for each look moves any machine by a little."""
+    monkeypatch.setattr(turns, "SETTLED_MACHINE_CHANGE", 1e-9)
+    monkeypatch.setattr(turns, "MOST_LOOKS_ASTRAY", 4)
+    calibration = calibrate_session(beside[0].parent / "tripod")
+    (reason,) = [r for r in calibration.verdict.reasons if "settle" in r]
+    assert not calibration.verdict.usable
+    assert "the last of 4 looks at its edges still moved it by" in reason
 
 
 def test_few_coarse_edges_do_not_tell_how_they_scatter():

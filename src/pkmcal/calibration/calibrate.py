@@ -315,6 +315,7 @@ def _judge(
         doubts=(
             *scale_doubt(session, found.estimate),
             *noise_doubt(session, found.estimate),
+            *found.turns.doubts,
             *(one.sentence for one in departed if one.against),
         ),
         cautions=(

@@ -51,7 +51,14 @@ from pkmcal.solver.ranks import RANK_TOLERANCE
 from pkmcal.wording import listed
 
 MOST_EDGE_LOOKS = 3
-"""Most looks at the edges, each from the estimate before."""
+"""Most looks at the edges, each from the estimate before, of a machine that settles."""
+MOST_LOOKS_ASTRAY = 9
+"""Most looks of one that does not."""
+SETTLED_MACHINE_CHANGE = 2.0
+"""Standard deviations by which a look may move a machine that has settled: the second look moves it
+by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
+a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
+and each look moves the machine by four or more."""
 SETTLED_EDGE_DISTANCE = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
@@ -79,7 +86,8 @@ class Turns(NamedTuple):
     """What the last turn left.
 
     photographs : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
-    edges, see :class:`KnownScene`. start : from where the estimate was sought.
+    edges, see :class:`KnownScene`. start : from where the estimate was sought. change : by how many
+    of its deviations the last look has moved the machine.
     """
 
     observation: Observation
@@ -91,6 +99,18 @@ class Turns(NamedTuple):
     blur: Mapping[int, float | None] = MappingProxyType({})
     scatter: float = 1.0
     start: State | None = None
+    change: float = 0.0
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the result is not to be used, if it did not settle."""
+        if self.change < SETTLED_MACHINE_CHANGE:
+            return ()
+        return (
+            f"The machine does not settle: the last of {MOST_LOOKS_ASTRAY} looks at its edges still"
+            f" moved it by {self.change:.1f} of its standard deviations. A station's pose by hand,"
+            " or a drawing that is nearer to the machine, gives it a better start.",
+        )
 
 
 def take_turns(
@@ -111,8 +131,9 @@ def take_turns(
     measurements = measurements_of(session, boards)
     responses: tuple[ResponseTold, ...] = ()
     scatter, start = seen.known.scatter, estimate.state
-    for turn in range(MOST_EDGE_LOOKS):
-        share = 0.45 + 0.5 * turn / MOST_EDGE_LOOKS
+    change = 0.0
+    for turn in range(MOST_LOOKS_ASTRAY):
+        share = 0.45 + 0.5 * min(turn / MOST_EDGE_LOOKS, 0.9)
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
@@ -160,12 +181,17 @@ def take_turns(
                 ]
                 blur = {}
                 continue
-        if moved < SETTLED_EDGE_DISTANCE and not cameras.active:
-            break
+        usual = moved < SETTLED_EDGE_DISTANCE and not cameras.active
+        if usual or turn + 1 >= MOST_EDGE_LOOKS:
+            away = (estimate.state.theta - before.state.theta)[None]
+            change = float(np.sqrt(_variance(away, measurements, estimate)))
+            if change < SETTLED_MACHINE_CHANGE:
+                break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(
-        observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start
-    )
+        observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start,
+        change,
+    )  # fmt: skip
 
 
 def looked_again(
@@ -195,7 +221,10 @@ def looked_again(
         except PkmcalError:
             continue
         found.append(ended.state.theta)
-    variance = _between(np.stack(found), turns.measurements, estimate) if len(found) > 1 else 1.0
+    variance = 1.0
+    if len(found) > 1:
+        apart = np.stack(found) - np.mean(found, axis=0)
+        variance = _variance(apart, turns.measurements, estimate) * len(found) / (len(found) - 1)
     measurements = replace(turns.measurements, look_variance=variance)
     again = bundle(session.machine, measurements, turns.start)
     return turns._replace(measurements=measurements, estimate=again)
@@ -225,8 +254,10 @@ def _as_likely(
             yield replace(estimate, machine=other, state=there)
 
 
-def _between(values: Array, measurements: Measurements, estimate: Estimate) -> float:
-    """Variance of the machine's parameters, values (N, P), in that which the noise gives them."""
+def _variance(changes: Array, measurements: Measurements, estimate: Estimate) -> float:
+    """Mean square of changes (N, P) of the machine's parameters, in the variance that the noise
+    gives them.
+    """
     machine, n = estimate.machine, len(estimate.machine.values)
     info = as_ended(measurements, estimate)[1]
     shared = covariance_by_noise(info)[0]
@@ -238,9 +269,8 @@ def _between(values: Array, measurements: Measurements, estimate: Estimate) -> f
     value, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     known = value > RANK_TOLERANCE * value[-1]
     white = vectors[:, known] / np.sqrt(value[known]) / size[:, None]
-    away = (values - values.mean(axis=0)) @ white
     told = max(float(np.trace(white.T @ noise @ white)), 1.0)
-    return float(np.sum(away**2)) / (len(values) - 1) / told
+    return float(np.mean(np.sum((changes @ white) ** 2, axis=1))) / told
 
 
 def _looked(

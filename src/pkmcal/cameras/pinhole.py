@@ -85,9 +85,10 @@ def in_pixels(parameters: Array, good: Booleans, distorted: Array) -> Array:
     of a camera whose focal lengths and centre come first.
     """
     focal, center = parameters[:2].tolist(), parameters[2:4].tolist()
-    return of_components(
-        *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
-    )
+    with np.errstate(over="ignore"):  # of a focal length beyond all sense: far away is far away
+        return of_components(
+            *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
+        )
 
 
 def moved_in_pixels(parameters: Array, moved: Sequence[Array], by_xy: Array | None) -> Array:
