@@ -390,9 +390,9 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
         out.append(
             f"Light moves single edges of every tube by {shading.min():.2f} px or more, as on"
             " polished metal. What it does to a leg in all photographs alike no residual shows;"
-            " errors of such sessions were a fifth larger than their deviations, some a third, and"
-            " of photographs by hand some a half. What helps: a further place, softer light, a"
-            " white sheet behind the machine, chalk on the tubes."
+            " errors of such sessions were as large as their deviations, of some a fifth larger."
+            " What helps: a further place, softer light, a white sheet behind the machine, chalk on"
+            " the tubes."
         )
     return out
 
