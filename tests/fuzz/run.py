@@ -257,7 +257,9 @@ def _written(case: Case, code: int, before, after) -> list[str]:
     """Faults of what was written: outside the output, in part, or over a result in spite of 2."""
     changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
     outside = sorted(n for n in changed if n != case.out and not n.startswith(f"{case.out}/"))
-    if case.words[0] in ("calibrate", "diff") and code != 2:  # what stood there is kept beside it, dated
+    if (
+        case.words[0] in ("calibrate", "diff") and code != 2
+    ):  # what stood there is kept beside it, dated
         kept = re.compile(rf"{re.escape(case.out)}-\d{{4}}-\d\d-\d\dT\d{{4}}(/[^/]+)?")
         outside = [name for name in outside if not kept.fullmatch(name) or name in before]
     faults = []

@@ -213,7 +213,7 @@ def looked_again(
     photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
     found: list[Array] = []
     for number, drawn in enumerate(_as_likely(session, estimate, rng)):
-        told(f"Looking from another place: {number + 1} of {LOOKS_AGAIN}", 0.85)
+        told(f"Looking by a machine as likely: {number + 1} of {LOOKS_AGAIN}", 0.85)
         try:
             looks = _looked(session, photographs, drawn, turns.blur, turns.scatter, cameras.active)
             measurements = measurements_of(session, seen.boards, _edges(looks), cameras)
@@ -242,14 +242,17 @@ def _as_likely(
     half = vectors * np.sqrt(np.maximum(value, 0.0))
     for step in rng.normal(size=(LOOKS_AGAIN // 2, len(half))) @ half.T:
         for away in (step, -step):
-            other = machine.with_values(machine.values + away[:n])
+            values = machine.parameters.unit_axes(machine.values + away[:n])
+            other = machine.with_values(values)
             closed = other.forward_result(session.joints, state.T_base_platform)
-            poses = np.where(
-                closed.converged[:, None, None], closed.T_base_platform, state.T_base_platform
-            )
-            stations = perturb(state.T_camera_base, away[n:].reshape(count, 6))
+            reached = closed.converged[:, None]
+            poses = np.where(reached[..., None], closed.T_base_platform, state.T_base_platform)
             there = replace(
-                state, theta=other.values, T_camera_base=stations, T_base_platform=poses
+                state,
+                theta=values,
+                T_camera_base=perturb(state.T_camera_base, away[n:].reshape(count, 6)),
+                T_base_platform=poses,
+                internal=np.where(reached, closed.internal, state.internal),
             )
             yield replace(estimate, machine=other, state=there)
 
