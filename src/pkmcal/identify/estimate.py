@@ -85,8 +85,8 @@ class Statistics:
     dof_poses: float = 0.0
     shading: float = SHADING_SIGMA
     reading_scale: float = 1.0
-    reading_range: tuple[float, float | None] = (0.0, None)
-    pose_range: tuple[float, float | None] = (0.0, None)
+    reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
+    pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     look_scatter: float = 0.0
 
     @property
