@@ -390,7 +390,7 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
         out.append(
             f"Light moves single edges of every tube by {shading.min():.2f} px or more, as on"
             " polished metal. What it does to a leg in all photographs alike no residual shows;"
-            " errors of such sessions were as large as their deviations, of some a fifth larger."
+            " errors of such sessions were as large as their deviations, of some a third larger."
             " What helps: a further place, softer light, a white sheet behind the machine, chalk on"
             " the tubes."
         )
