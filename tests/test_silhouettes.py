@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pkmcal.boards.views import Boards
-from pkmcal.calibration import byhand, closely, turns
+from pkmcal.calibration import byhand, turns
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.known import KnownScene, SeenSession
@@ -18,7 +18,7 @@ from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
 from pkmcal.calibration.turns import _scatter_of, _variance
 from pkmcal.check import check
-from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
+from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -167,9 +167,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
 
 
 def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
-    """Machines that scatter as noise lets them have one, twice as far apart they have four; where
-    hardly any look ends, as much again as noise is believed.
-    """
+    """Machines that scatter as noise lets them have one, twice as far apart they have four."""
     calibration = calibrate_session(beside[0].parent / "tripod")
     assert calibration.measurements.look_variance == 0  # painted, and from one place
     measurements, estimate = calibration.measurements, calibration.estimate
@@ -209,13 +207,6 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
     session = load_session(beside[0])
     photographs, T = read_photographs(session), beside[1]
     assert [len(p.images) for p in photographs] == [1, 1, 1, 1, 4]
-    joined = []
-
-    def join(*words):
-        joined.append(closely.join(*words))
-        return joined[-1]
-
-    monkeypatch.setattr(byhand, "join", join)
     found_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
     seen = byhand.place(session, photographs, Boards(), np.random.default_rng(0))
     known = seen.known
@@ -232,8 +223,37 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
 
 
 def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
-    monkeypatch.setattr(check, "search_by_hand", pytest.fail)
+    monkeypatch.setattr(check, "search_by_hand", lambda *_: pytest.fail("searched"))
     assert check.check_session(beside[0].parent / "tripod").stations
+
+
+def test_where_no_look_ends_as_much_again_as_noise_is_believed(folder, monkeypatch):
+    def place(session, photographs, boards, _rng, _told):
+        T = load_truth(folder, session.machine).T_camera_base
+        known = KnownScene.as_drawn(session.machine, T, session.joints)
+        return SeenSession(session, photographs, boards, known)
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    monkeypatch.setattr(turns, "_as_likely", lambda *_: iter(()))
+    assert calibrate_session(folder).estimate.statistics.look_scatter == 1
+
+
+def test_machines_as_likely_scatter_as_the_covariance_says(beside, monkeypatch):
+    """Parameters and stations, in pairs to both sides."""
+    calibration = calibrate_session(beside[0].parent / "tripod")
+    estimate, session = calibration.estimate, calibration.session
+    monkeypatch.setattr(turns, "LOOKS_AGAIN", 400)
+    drawn = list(turns._as_likely(session, estimate, np.random.default_rng(0)))
+    away = np.stack([one.state.theta - estimate.state.theta for one in drawn])
+    np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-12)
+    n = away.shape[1]
+    stated = np.sqrt(np.diag(estimate.joint_covariance))
+    np.testing.assert_allclose(away.std(axis=0), stated[:n], rtol=0.2, atol=1e-10)
+    moved = pose_difference(
+        np.concatenate([one.state.T_camera_base for one in drawn]),
+        np.broadcast_to(estimate.state.T_camera_base, (len(drawn), 4, 4)),
+    )
+    np.testing.assert_allclose(moved.std(axis=0), stated[n : n + 6], rtol=0.2)
 
 
 def test_a_machine_that_does_not_settle_is_refused(beside, monkeypatch):

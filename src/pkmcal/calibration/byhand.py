@@ -102,8 +102,8 @@ def search_by_hand(
     stations that are placed already, NaN for the others. told : called with the step in words and
     the share done.
     """
-    one = np.zeros(1, dtype=int)  # of a camera on a tripod the first photograph stands for all
-    at = {p.station: p.select(one) for p in photographs}
+    first = np.zeros(1, dtype=int)  # of a camera on a tripod it stands for all
+    at = {p.station: p.select(first) for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _Answer] = {}
@@ -202,7 +202,11 @@ def _with_sure(
         joined = join(session, photographs, scene, new, boards)
         # silhouettes are found anywhere; legs can be measured where they are
         bare = frozenset(
-            k for k in new if k not in boards.stations and _is_bare(joined, photographs[k])
+            k
+            for k in new
+            if session.stations[k].handheld
+            and k not in boards.stations
+            and _is_bare(joined, photographs[k])
         )
         if bare == new.keys():
             return so_far._replace(bare=bare) if bare != so_far.bare else so_far

@@ -51,11 +51,13 @@ from pkmcal.solver.ranks import RANK_TOLERANCE
 from pkmcal.wording import listed
 
 MOST_EDGE_LOOKS = 3
-"""Most looks at the edges, each from the estimate before, of a machine that settles."""
+"""Looks at the edges, each from the estimate before, after which nothing but the machine itself is
+asked to have settled, and before which refined cameras are not."""
 MOST_LOOKS_ASTRAY = 9
 """Most looks of one that does not."""
 SETTLED_MACHINE_CHANGE = 2.0
-"""Standard deviations by which a look may move a machine that has settled: the second look moves it
+"""Standard deviations, root mean square over what the data tell, by which a look may move a machine
+that has settled: the second look moves it
 by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
 a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
 and each look moves the machine by four or more."""
@@ -68,7 +70,7 @@ ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
 over the profiles' reach, so that the median of hundreds of places is half of it."""
 LOOKS_AGAIN = 4
 """Looks from machines as likely as the one that was found: with some thirty numbers told in each,
-what they scatter by is known to a seventh."""
+what they scatter by is known to a tenth."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
@@ -86,8 +88,8 @@ class Turns(NamedTuple):
     """What the last turn left.
 
     photographs : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
-    edges, see :class:`KnownScene`. start : from where the estimate was sought. change : by how many
-    of its deviations the last look has moved the machine.
+    edges, see :class:`KnownScene`. start : from where the estimate was sought. change : by how
+    many of its deviations the last look has moved the machine, as SETTLED_MACHINE_CHANGE has it.
     """
 
     observation: Observation
@@ -133,7 +135,7 @@ def take_turns(
     scatter, start = seen.known.scatter, estimate.state
     change = 0.0
     for turn in range(MOST_LOOKS_ASTRAY):
-        share = 0.45 + 0.5 * min(turn / MOST_EDGE_LOOKS, 0.9)
+        share = 0.45 + 0.35 * min(turn / MOST_EDGE_LOOKS, 0.9)
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
@@ -203,7 +205,9 @@ def looked_again(
     residual shows it: all edges of a look are where that look's machine has them. So they are
     looked for from machines as likely as the one that was found, and the variance between the
     estimates is added to that of one (Rubin, Multiple imputation for nonresponse in surveys, 1987,
-    3.1). Of painted legs on a tripod the edges are the same from anywhere, and nothing is asked.
+    3.1). One look is kept, not their mean: its residuals and weights are those that are told. What
+    looks scatter by hardly follows the machine that is drawn, so it counts as independent, in pairs
+    too. Of painted legs on a tripod the edges are the same from anywhere, and nothing is asked.
     """
     session, estimate = seen.session, turns.estimate
     by_hand = any(session.stations[p.station].handheld for p in turns.photographs)
@@ -213,15 +217,15 @@ def looked_again(
     photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
     found: list[Array] = []
     for number, drawn in enumerate(_as_likely(session, estimate, rng)):
-        told(f"Looking by a machine as likely: {number + 1} of {LOOKS_AGAIN}", 0.85)
+        told(f"Looking by a machine as likely: {number + 1} of {LOOKS_AGAIN}", 0.87)
         try:
             looks = _looked(session, photographs, drawn, turns.blur, turns.scatter, cameras.active)
             measurements = measurements_of(session, seen.boards, _edges(looks), cameras)
             ended = bundle(session.machine, measurements, _at_cameras(drawn.state, cameras))
-        except PkmcalError:
+        except (PkmcalError, np.linalg.LinAlgError):
             continue
         found.append(ended.state.theta)
-    variance = 1.0
+    variance = 1.0  # as much again as noise, where hardly a look ends
     if len(found) > 1:
         apart = np.stack(found) - np.mean(found, axis=0)
         variance = _variance(apart, turns.measurements, estimate) * len(found) / (len(found) - 1)
