@@ -24,7 +24,7 @@ from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import CalibrationProgress
 from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
-from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.assembly import state_of
 from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate, State
@@ -68,9 +68,9 @@ far."""
 ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
-LOOKS_AGAIN = 4
+LOOKS_AGAIN = 6
 """Looks from machines as likely as the one that was found: with some thirty numbers told in each,
-what they scatter by is known to a tenth."""
+the deviations that they make larger are known to a twentieth."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
@@ -213,11 +213,11 @@ def looked_again(
     by_hand = any(session.stations[p.station].handheld for p in turns.photographs)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
-    cameras = turns.cameras.moved(estimate)
-    photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
     found: list[Array] = []
-    for number, drawn in enumerate(_as_likely(session, estimate, rng)):
+    for number, drawn in enumerate(_as_likely(session, turns.measurements, estimate, rng)):
         told(f"Looking by a machine as likely: {number + 1} of {LOOKS_AGAIN}", 0.87)
+        cameras = turns.cameras.moved(drawn)
+        photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
         try:
             looks = _looked(session, photographs, drawn, turns.blur, turns.scatter, cameras.active)
             measurements = measurements_of(session, seen.boards, _edges(looks), cameras)
@@ -235,29 +235,25 @@ def looked_again(
 
 
 def _as_likely(
-    session: Session, estimate: Estimate, rng: np.random.Generator
+    session: Session, measurements: Measurements, estimate: Estimate, rng: np.random.Generator
 ) -> Iterator[Estimate]:
-    """Estimates as likely as one, in pairs to both sides of it: machine, stations, and platforms as
-    the readings then have them.
+    """Estimates as likely as one, in pairs to both sides of it: machine, stations, cameras, and
+    platforms as the readings then have them.
     """
-    machine, state = estimate.machine, estimate.state
-    n, count = len(machine.values), len(state.T_camera_base)
-    value, vectors = np.linalg.eigh(estimate.joint_covariance[: n + 6 * count, : n + 6 * count])
-    half = vectors * np.sqrt(np.maximum(value, 0.0))
-    for step in rng.normal(size=(LOOKS_AGAIN // 2, len(half))) @ half.T:
+    assembled, info = as_ended(measurements, estimate)
+    problem, half = info.problem, info.root[0]
+    still = np.zeros((1, assembled.seen.sum(), problem.layout.own_motion.shape[1]))
+    for step in rng.normal(size=(LOOKS_AGAIN // 2, half.shape[1])) @ half.T:
         for away in (step, -step):
-            values = machine.parameters.unit_axes(machine.values + away[:n])
-            other = machine.with_values(values)
-            closed = other.forward_result(session.joints, state.T_base_platform)
+            moved = problem.moved(info.state, away[None], still)
+            there = state_of(assembled, moved, estimate.state)
+            values = estimate.machine.parameters.unit_axes(there.theta)
+            other = estimate.machine.with_values(values)
+            closed = other.forward_result(session.joints, there.T_base_platform)
             reached = closed.converged[:, None]
-            poses = np.where(reached[..., None], closed.T_base_platform, state.T_base_platform)
-            there = replace(
-                state,
-                theta=values,
-                T_camera_base=perturb(state.T_camera_base, away[n:].reshape(count, 6)),
-                T_base_platform=poses,
-                internal=np.where(reached, closed.internal, state.internal),
-            )
+            poses = np.where(reached[..., None], closed.T_base_platform, there.T_base_platform)
+            internal = np.where(reached, closed.internal, there.internal)
+            there = replace(there, theta=values, T_base_platform=poses, internal=internal)
             yield replace(estimate, machine=other, state=there)
 
 
