@@ -13,7 +13,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand, turns
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
-from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
 from pkmcal.calibration.turns import _scatter_of, _variance
@@ -33,7 +32,7 @@ from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
-from test_handheld import found_with
+from test_handheld import at_truth, found_with
 
 SETTINGS = Settings(configurations=4, repeats=1, handheld=True, tolerance=0.0)
 
@@ -132,13 +131,7 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
 
 def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
     """Of a photograph by hand: once each, measured or coarse, and not among what is left out."""
-
-    def place(session, photographs, boards, _rng, _told):
-        T = load_truth(folder, session.machine).T_camera_base
-        known = KnownScene.as_drawn(session.machine, T, session.joints)
-        return SeenSession(session, photographs, boards, known)
-
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    at_truth(monkeypatch, folder)
     calibration = calibrate_session(folder)
     found = calibration.observation
     edges = found.edges
@@ -228,12 +221,7 @@ def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
 
 
 def test_where_no_look_ends_as_much_again_as_noise_is_believed(folder, monkeypatch):
-    def place(session, photographs, boards, _rng, _told):
-        T = load_truth(folder, session.machine).T_camera_base
-        known = KnownScene.as_drawn(session.machine, T, session.joints)
-        return SeenSession(session, photographs, boards, known)
-
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    at_truth(monkeypatch, folder)
     monkeypatch.setattr(turns, "_as_likely", lambda *_: iter(()))
     assert calibrate_session(folder).estimate.statistics.look_scatter == 1
 
@@ -243,12 +231,7 @@ def test_machines_as_likely_have_their_edges_near(folder, monkeypatch):
     is predicted far from where it is.
     """
 
-    def place(session, photographs, boards, _rng, _told):
-        T = load_truth(folder, session.machine).T_camera_base
-        known = KnownScene.as_drawn(session.machine, T, session.joints)
-        return SeenSession(session, photographs, boards, known)
-
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    at_truth(monkeypatch, folder)
     found = calibrate_session(folder)
     estimate, session = found.estimate, found.session
     rng = np.random.default_rng(0)

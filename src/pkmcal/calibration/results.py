@@ -56,7 +56,8 @@ CALIBRATION_CONVENTIONS = (
 EDGE_COLUMNS = (
     "station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt", "coarse",
 )  # fmt: skip
-"""Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
+"""Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations;
+coarse is 1 where the edge was not measured but told by its silhouette, else 0."""
 POSE_COLUMNS = (
     "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
 )  # fmt: skip
