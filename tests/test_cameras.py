@@ -339,6 +339,19 @@ def test_derivatives_of_ray_undo_those_of_project(case, place):
         np.testing.assert_allclose(rays[:, None] @ turn, 0, atol=1e-12 * np.abs(turn).max())
 
 
+def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
+    _, camera = case
+    points, small = seen_points(camera, 0), camera.binned(3)
+    assert small.image_size == tuple(n // 3 for n in camera.image_size)
+    pixels = (camera.project(points) + 0.5) / 3 - 0.5
+    np.testing.assert_allclose(small.project(points), pixels, atol=1e-9, rtol=0)
+    (by_point, by_own), (whole, by_whole) = (c.project_jacobians(points) for c in (small, camera))
+    np.testing.assert_allclose(by_point, whole / 3, rtol=1e-9, atol=1e-12)
+    by_own[..., :4] /= 3  # focal lengths and centre are smaller by three
+    np.testing.assert_allclose(by_own, by_whole / 3, rtol=1e-9, atol=1e-9)
+    assert camera.binned(1) is camera
+
+
 @pytest.mark.parametrize(("model", "name"), [pair for pair in ALL if pair[0] in OPENCV])
 def test_opencv_agrees(model, name):
     example, camera = made(model, name)

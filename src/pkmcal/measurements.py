@@ -213,6 +213,8 @@ class Observation:
         for pictures and residuals.
     T_camera_base : (S, 4, 4) poses of the stations as the search left them.
     poses : of boards, and of trackers' targets.
+    binning : (S,) pixels of each station's photographs across, and down, that were one where edges
+        were looked for: what of an edge is in pixels, is in these.
     """
 
     edges: EdgeSet
@@ -221,8 +223,14 @@ class Observation:
     point_edge: Integers
     T_camera_base: Array
     poses: PoseSet = field(default_factory=PoseSet.empty)
+    binning: Integers = field(default_factory=lambda: np.ones(0, dtype=int))
 
     __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Where nothing is said of binning, there is none."""
+        if not len(self.binning):
+            object.__setattr__(self, "binning", np.ones(len(self.T_camera_base), dtype=int))
 
 
 Set = TypeVar("Set", PoseSet, EdgeSet)

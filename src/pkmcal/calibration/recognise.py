@@ -63,7 +63,10 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         images = Pictures.read(paths, station.camera.image_size, labels, most)
         rows = np.array([p.configuration for p in station.photographs])
         readings = session.joints[rows]
-        return legs.Photographs(number, station.camera, rows, readings, images, station.response)
+        return legs.Photographs(
+            number, station.camera, rows, readings, images, station.response,
+            legs.first_binning(station.camera.image_size),
+        )  # fmt: skip
 
     numbers, room, kept = legs_stations(session), KEPT_PHOTOGRAPH_BYTES, list[int]()
     for number in numbers:

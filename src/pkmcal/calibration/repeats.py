@@ -216,7 +216,10 @@ class _Look:
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration
         camera = calibration.cameras.at_station(int(s))
-        numbered = replace(photographs, camera=camera, configuration=np.arange(len(rows)))
+        binning = int(calibration.observation.binning[s])
+        numbered = replace(
+            photographs, camera=camera, configuration=np.arange(len(rows)), binning=binning
+        )
         poses, T_camera_base = state.T_base_platform[rows], state.T_camera_base[s]
         edges = legs.measure(numbered, machine, T_camera_base, poses).edges
         photo = edges.configuration

@@ -268,6 +268,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
                 "name": name,
                 "camera": file,
                 "response": response,
+                "binning": None if response is None else calibration.observation.binning[s],
                 "T_base_camera": inverse(T_camera_base),
                 "sigma_rotation": sigma[:3],
                 "sigma_translation": sigma[3:],
@@ -368,16 +369,17 @@ def _inverse_errors(transform: Array) -> Array:
 
 
 def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
-    """Each camera file once, with its edge shift, px outward."""
+    """Each camera file once, with its edge shift, px of its photographs outward."""
     estimate, numbers = calibration.estimate, calibration.measurements.camera_of_station.tolist()
     stations = calibration.session.stations
     # trackers, whose number means nothing, come last
     files = {c: station.camera_file for c, station in zip(numbers, stations, strict=False)}
+    pixels = dict(zip(numbers, calibration.observation.binning.tolist(), strict=False))
     return [
         {
             "file": files[c],
-            "edge_shift": estimate.state.edge_shift[c],
-            "sigma": estimate.edge_shift_sigma[c],
+            "edge_shift": estimate.state.edge_shift[c] * pixels[c],
+            "sigma": estimate.edge_shift_sigma[c] * pixels[c],
             **_refined(calibration, files[c]),
         }
         for c in sorted(files)

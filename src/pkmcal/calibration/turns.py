@@ -43,7 +43,7 @@ from pkmcal.measurements import (
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.alone import finest_view
-from pkmcal.observe.profiles import EDGE_SHIFTS
+from pkmcal.observe.profiles import EDGE_SHIFTS, USUAL_BLUR
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
@@ -188,8 +188,11 @@ def take_turns(
             away = (estimate.state.theta - before.state.theta)[None]
             change = float(np.sqrt(_variance(away, measurements, estimate)))
             if change < SETTLED_MACHINE_CHANGE:
-                break
-    observation = observation_of(session, looks, boards, measurements, estimate)
+                finer = _binned_less(session, photographs, blur)
+                if all(one.binning == p.binning for one, p in zip(finer, photographs, strict=True)):
+                    break
+                photographs, blur = finer, dict.fromkeys(blur)
+    observation = observation_of(session, looks, boards, measurements, estimate, photographs)
     return Turns(
         observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start,
         change,
@@ -289,6 +292,24 @@ def _looked(
     look = partial(_measure, estimate=estimate, blur=blur, refine=refine, done=done)
     whole = partial(_with_silhouettes, session, estimate, scatter, refine)
     return _each(photographs, lambda p: whole(p, look(p)))
+
+
+def _binned_less(
+    session: Session, photographs: Sequence[legs.Photographs], blur: Mapping[int, float | None]
+) -> list[legs.Photographs]:
+    """The photographs as they are looked at next, where their edges, so blurred (px) by station,
+    are sharper than they need be; all of one camera alike, for its lens is the same.
+    """
+    of_camera: dict[str, list[float]] = {}
+    for p in photographs:
+        file = session.stations[p.station].camera_file
+        of_camera.setdefault(file, []).append(blur[p.station] or USUAL_BLUR)
+    middle = {file: float(np.median(all_of_it)) for file, all_of_it in of_camera.items()}
+    return [
+        replace(p, binning=legs.finer_binning(p.binning, middle[file]))
+        for p in photographs
+        for file in [session.stations[p.station].camera_file]
+    ]
 
 
 def _counted(
@@ -516,8 +537,14 @@ def observation_of(
     boards: Boards,
     measurements: Measurements,
     estimate: Estimate,
+    photographs: Sequence[legs.Photographs] = (),
 ) -> Observation:
-    """The last looks joined, with what the estimate gave up among the rejected."""
+    """The last looks joined, with what the estimate gave up among the rejected. photographs : as
+    they were looked at.
+    """
+    binning = np.ones(len(estimate.state.T_camera_base), dtype=int)
+    for p in photographs:
+        binning[p.station] = p.binning
     seen = legs.joined_looks(looks, float("nan"), float("nan"))
     given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
@@ -530,6 +557,7 @@ def observation_of(
         point_edge=seen.point_edge,
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
+        binning=binning,
     )
 
 

@@ -12,7 +12,7 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
@@ -213,6 +213,21 @@ class Camera(ABC):
             **own,
             "distortion": p[4 + len(own) :],
         }
+
+    def binned(self, count: int) -> Self:
+        """The camera of pictures in which ``count`` x ``count`` pixels are averaged to one; what is
+        left of a row or a column at its end is not in them.
+
+        Derivatives by its parameters are by the binned ones, of which focal lengths and centre,
+        always the first four, are smaller.
+        """
+        if count == 1:
+            return self
+        parameters = self.parameters.copy()
+        parameters[:4] /= count
+        parameters[2:4] += (1 / count - 1) / 2  # pixel centres are at integers
+        size = self.image_size[0] // count, self.image_size[1] // count
+        return replace(self, image_size=size, parameters=parameters, covariance=None)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
         """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""

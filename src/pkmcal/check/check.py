@@ -91,7 +91,7 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     told("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
     rng = np.random.default_rng(seed)
-    seen = _observed(session, photographs, motion.poses, rng)
+    seen = _observed(session, photographs, motion.poses, rng, told)
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
     findings += [note(text) for text in numbering_told(session)]
@@ -163,8 +163,9 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], kept)  # fmt: skip
         whole = legs.Photographs(
-            number, station.camera, at, session.joints[at], images, station.response
-        )
+            number, station.camera, at, session.joints[at], images, station.response,
+            legs.first_binning(station.camera.image_size),
+        )  # fmt: skip
         out.append(whole if rows else None)
     return out, findings
 
@@ -236,6 +237,7 @@ def _observed(
     photographs: list[legs.Photographs | None],
     poses: Array | None,
     rng: np.random.Generator,
+    progress: CalibrationProgress,
 ) -> _Observed:
     """What the photographs of every station show, and what is to be said of it."""
     whole = [p for p in photographs if p is not None]
@@ -275,7 +277,9 @@ def _observed(
     known = KnownScene(session.machine, nowhere if starts is None else starts, poses)
     by_hand: dict[int, Alone] = {}
     if len(fixed) < len(whole):
-        by_hand, _ = search_by_hand(session, whole, boards.boards, known)
+        by_hand, _ = search_by_hand(
+            session, whole, boards.boards, known, lambda text, share: progress(text, 0.4 + share)
+        )
     for k, one in by_hand.items():  # what chance is to others, another place is to one alone
         places[k] = FoundStation(
             one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True

@@ -156,7 +156,10 @@ def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
         T_camera_base,
         numbered(look.session.camera_of_station[[s.photographs.station for s in stations]]),
         look.session.joint_noise,
-        tuple(LegsFrom(k, s.photographs.camera, T, pools) for k, (s, T, pools) in enumerate(seen)),
+        tuple(
+            LegsFrom(k, s.photographs.camera.binned(s.photographs.binning), T, pools)
+            for k, (s, T, pools) in enumerate(seen)
+        ),
         shading=first.estimate.statistics.shading,
     )
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))

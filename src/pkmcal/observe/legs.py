@@ -30,7 +30,7 @@ from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
-from pkmcal.observe.images import Selected, fitting
+from pkmcal.observe.images import Selected, binned, fitting
 from pkmcal.observe.levels import levels_at
 from pkmcal.observe.predict import (
     EdgePoints,
@@ -42,6 +42,9 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.observe.profiles import FEWEST_PLACES_FOR_TILT, EdgeFits, edge_set, fit_edges
 
+USUAL_PICTURE_LENGTH = 1024
+"""Pixels along the longer side of pictures in which a drawing is off by pixels, tubes are some tens
+of them wide, and all lengths below are meant: photographs are binned to about as many."""
 PHOTOGRAPHS_A_WINDOW = 32
 """Photographs that are looked at together: their profiles take some 80 MB."""
 WINDOW_BYTES = 96 * 2**20
@@ -89,6 +92,18 @@ _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 PhotographsLookedAt = Callable[[int], None]
 """Called with how many photographs more were looked at."""
+
+
+def first_binning(image_size: tuple[int, int]) -> int:
+    """How many pixels of photographs of a size are one where their edges are looked for first."""
+    return max(round(max(image_size) / USUAL_PICTURE_LENGTH), 1)
+
+
+def finer_binning(binning: int, blur: float) -> int:
+    """How many pixels are one where edges, so blurred (px) at a binning, are as sharp as usual:
+    averaging fewer of those over which the lens spreads an edge tells no more of it.
+    """
+    return min(max(int(binning * blur / profiles.USUAL_BLUR), 1), binning)
 
 
 @dataclass(frozen=True)
@@ -225,7 +240,8 @@ class Photographs:
 
     station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
     images : K grey-level arrays (height, width), decoded or when they are looked at. response : how
-    their levels code light.
+    their levels code light. binning : count of their pixels across, and down, that are one where
+    edges are looked for (:meth:`binned`).
     """
 
     station: int
@@ -234,6 +250,7 @@ class Photographs:
     joints: Array
     images: Sequence[Integers]
     response: Response = "linear"
+    binning: int = 1
 
     def select(self, numbers: Integers) -> Photographs:
         """Some of the photographs."""
@@ -257,12 +274,21 @@ class Photographs:
         """The same with every photograph decoded; for no more than a window of them."""
         return replace(self, images=list(self.images))
 
+    def binned(self) -> Photographs:
+        """The same as edges are looked for in them, decoded; for no more than a window of them.
+
+        Levels are averaged, not the light that they code: over the pixels of one bin, in which a
+        blurred edge rises by a third, the code bends by half a level.
+        """
+        images = [binned(image, self.binning) for image in self.images]
+        return replace(self, camera=self.camera.binned(self.binning), images=images, binning=1)
+
     def windows(self) -> Iterator[tuple[slice, Photographs]]:
-        """All photographs, decoded, a window at a time, each with its place among them."""
+        """All photographs, binned, a window at a time, each with its place among them."""
         for first in range(0, len(self.images), self.window):
             part = slice(first, first + self.window)
             numbers = np.arange(len(self.images))[part]
-            yield part, self.select(numbers).decoded()
+            yield part, self.select(numbers).binned()
 
 
 @dataclass(frozen=True)
@@ -280,6 +306,17 @@ class StationEdges:
     point_edge: Integers
     blur: float
     moved: float
+
+    def unbinned(self, count: int) -> StationEdges:
+        """What was seen in binned photographs, in the whole ones: points in their pixels, and edges
+        by their camera's parameters. What is in pixels of an edge itself stays in binned ones.
+        """
+        if count == 1:
+            return self
+        by_intrinsics = self.edges.by_intrinsics.copy()
+        by_intrinsics[..., :4] /= count  # as in `Camera.binned`
+        edges = replace(self.edges, by_intrinsics=by_intrinsics)
+        return replace(self, edges=edges, points=(self.points + 0.5) * count - 0.5)
 
 
 def search(
@@ -344,14 +381,14 @@ def measure(
     ready: _Seen | None = None
     if blur is None:
         few = photographs.spread(photographs.window)
-        seen = _seen(photographs.select(few).decoded(), machine, T_camera_base, poses[few])
+        seen = _seen(photographs.select(few).binned(), machine, T_camera_base, poses[few])
         blur = profiles.estimate_blur(seen.across) if seen.full.any() else profiles.USUAL_BLUR
         ready = seen if len(few) == len(photographs.images) else None
         del seen
     for part, window in photographs.windows():
         seen = ready or _seen(window, machine, T_camera_base, poses[part])
         look, away = _measured(window, seen, blur, refine_camera)
-        looks.append(look)
+        looks.append(look.unbinned(photographs.binning))
         moved.append(away)
         if done is not None:
             done(len(window.images))

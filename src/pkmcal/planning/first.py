@@ -178,7 +178,7 @@ def _told(
     ideal, _ = simulate_edges(
         machine,
         state.T_camera_base,
-        tuple(p.camera for p in few),
+        tuple(p.camera.binned(p.binning) for p in few),
         state.T_base_platform,
         EXACT_EDGE_NOISE,
         np.random.default_rng(FIRST_EDGES_SEED),

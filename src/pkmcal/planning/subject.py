@@ -294,10 +294,10 @@ def _rig(
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
-        pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
+        eyes, pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
         words.append(told)
-        for s, pool in zip(legs, pools, strict=True):
-            instruments.append(LegsFrom(s, session.stations[s].camera, T_camera_base[s], pool))
+        for s, eye, pool in zip(legs, eyes, pools, strict=True):
+            instruments.append(LegsFrom(s, eye, T_camera_base[s], pool))
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         place = _saved_target(saved, table.name)
         mounts.append(Mount(table.name, "platform"))
@@ -396,8 +396,8 @@ def _places(
 
 def _edge_noise(
     session: Session, legs: list[int], seen: _Photographed, T_camera_base: Array, edge: float
-) -> tuple[tuple[Pools, ...], float, str]:
-    """What each station's edges tell, the shading, and where that comes from."""
+) -> tuple[tuple[Camera, ...], tuple[Pools, ...], float, str]:
+    """What each station's edges tell in whose pixels, the shading, and where that comes from."""
     why = "no photograph tells it yet"
     if len(seen.photographs) == len(legs):
         rows = [
@@ -413,9 +413,11 @@ def _edge_noise(
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
-            return first.pools, first.estimate.statistics.shading, words
+            eyes = tuple(p.camera.binned(p.binning) for p in seen.photographs)
+            return eyes, first.pools, first.estimate.statistics.shading, words
+    eyes = tuple(session.stations[s].camera for s in legs)
     pools = (nominal_pools(session.machine, edge),) * len(legs)
-    return pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
+    return eyes, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:

@@ -66,8 +66,11 @@ def stations(
         photographs = count(taken, "photograph")
         if used[s] < taken:
             photographs = f"{used[s]} of {photographs} in use"
-        shift = float(estimate.state.edge_shift[camera[s]])
-        sigma = float(estimate.edge_shift_sigma[camera[s]])
+        pixels = int(observation.binning[s])
+        shift = float(estimate.state.edge_shift[camera[s]]) * pixels
+        sigma = float(estimate.edge_shift_sigma[camera[s]]) * pixels
+        if pixels > 1:
+            photographs += f", {pixels} × {pixels} pixels as one"
         places = decimals(sigma)
         cells = (
             *_place(estimate, s),

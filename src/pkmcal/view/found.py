@@ -72,6 +72,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         pane.joints[None],
         [viewed.image(look.station, look.photograph)],
         pane.response,
+        legs.first_binning(pane.camera.image_size),
     )
     take = legs.measure if look.shown == "calibration" else legs.search
     seen = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])

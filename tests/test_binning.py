@@ -1,0 +1,149 @@
+"""Photographs of more pixels than their lens resolves: binned, and less so where they are sharp."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.results import calibration_document
+from pkmcal.observe import legs
+from pkmcal.observe.images import binned
+from pkmcal.observe.legs import finer_binning, first_binning, measure
+from test_observe_drawing import FRONT, machine, poses
+from test_observe_measure import taken
+
+TIMES = 2
+
+
+def larger():
+    """Photographs in which each pixel is four, through the camera that takes such."""
+    small = taken()
+    images = [np.kron(image, np.ones((TIMES, TIMES), np.uint8)) for image in small.images]
+    parameters = small.camera.parameters.copy()
+    parameters[:2] *= TIMES
+    parameters[2:4] = (parameters[2:4] + 0.5) * TIMES - 0.5
+    size = tuple(TIMES * n for n in small.camera.image_size)
+    camera = replace(small.camera, image_size=size, parameters=parameters)
+    return replace(small, camera=camera, images=images, binning=TIMES)
+
+
+def test_pixels_are_averaged():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (13, 8), dtype=np.uint8)
+    mean = image[:12, :6].reshape(4, 3, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(binned(image, 3), mean, atol=0.5)
+    np.testing.assert_array_equal(binned(image, 1), image)
+
+
+@pytest.mark.parametrize(
+    ("size", "count"),
+    [((640, 480), 1), ((1280, 720), 1), ((1920, 1080), 2), ((3000, 4000), 4), ((20, 10), 1)],
+)
+def test_the_longer_side_says_how_many(size, count):
+    assert first_binning(size) == count
+
+
+def test_what_is_sharper_is_binned_less():
+    """A lens of 1.6 px is as sharp as usual over two pixels; one of 0.6 px over one. Nothing is
+    binned more than before.
+    """
+    blur = np.arange(0.3, 2.0, 0.05)
+    for binning in (1, 2, 4):
+        next_ones = [finer_binning(binning, b) for b in blur]
+        assert all(1 <= n <= binning for n in next_ones)
+        assert all(one <= two for one, two in pairwise(next_ones))
+    assert finer_binning(4, 1.63 / 4) == 2
+    assert finer_binning(2, 1.63 / 2) == 2
+    assert finer_binning(2, 0.45) == 1
+
+
+def test_binned_photographs_give_the_edges_of_small_ones():
+    small, large = (measure(p, machine(), FRONT, poses()) for p in (taken(), larger()))
+    assert len(small.edges) > 50
+    np.testing.assert_array_equal(large.edges.leg, small.edges.leg)
+    np.testing.assert_allclose(large.edges.normal, small.edges.normal, atol=1e-9)
+    np.testing.assert_allclose(large.edges.covariance, small.edges.covariance, rtol=1e-6)
+    np.testing.assert_allclose(large.points, (small.points + 0.5) * TIMES - 0.5, atol=1e-5)
+
+
+def test_edges_move_with_the_parameters_of_the_whole_camera():
+    """Against planes through an edge's two ends, held in the picture, as each parameter changes."""
+    p = larger()
+    look = measure(p, machine(), FRONT, poses(), refine_camera=True)
+
+    def normals(camera):
+        """Of the planes through each edge's first and last place (N, 3)."""
+        first, last = (
+            np.array([look.points[look.point_edge == k][end] for k in range(len(look.edges))])
+            for end in (0, -1)
+        )
+        n = np.cross(camera.ray(first), camera.ray(last))
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        return n * np.sign(np.sum(n * look.edges.normal, axis=1, keepdims=True))
+
+    for k, step in enumerate((1.0, 1.0, 1.0, 1.0, 1e-3)):
+        both = [
+            replace(p.camera, parameters=p.camera.parameters + sign * step * np.eye(9)[k])
+            for sign in (1, -1)
+        ]
+        by = (normals(both[0]) - normals(both[1])) / (2 * step)
+        seen = np.einsum("nij,ni->nj", look.edges.basis, by)
+        size = np.abs(seen).max()
+        # planes are fitted to all places, weighted, and not to the ends alone
+        off = np.abs(look.edges.by_intrinsics[..., k] - seen).max(axis=1)
+        assert np.median(off) < 0.05 * size
+
+
+@pytest.fixture
+def blurred(session):
+    """The demonstration's session, each photograph four times as large and no sharper."""
+    times = 4
+    for file in (session / "cameras").glob("*.yaml"):
+        document = yaml.safe_load(file.read_text())
+        document["image_size"] = [times * n for n in document["image_size"]]
+        document["focal"] = [times * f for f in document["focal"]]
+        document["center"] = [(c + 0.5) * times - 0.5 for c in document["center"]]
+        document.pop("covariance", None)
+        file.write_text(yaml.safe_dump(document))
+    for path in (session / "images").rglob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path), cv2.resize(image, None, fx=times, fy=times))
+    return session
+
+
+def away(found, other):
+    """Largest difference of two calibrations' machines, in the deviations of one."""
+    sigma = np.sqrt(np.diag(other.estimate.covariance))
+    apart = np.abs(found.machine.values - other.machine.values)
+    return float((apart[sigma > 0] / sigma[sigma > 0]).max())
+
+
+def test_photographs_larger_than_sharp(blurred, calibrated):
+    """They give the machine that the sharp small ones give. Edge for edge as they are they lie
+    blurred over three pixels, where hardly one is found.
+    """
+    found = calibrate_session(blurred)
+    np.testing.assert_array_equal(found.observation.binning, 2)
+    assert found.verdict.usable
+    assert away(found, calibrated) < 3
+    # what is said of cameras is in pixels of the photographs
+    document = calibration_document(found)
+    assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
+    shift = document["cameras"][0]["edge_shift"]
+    assert shift == pytest.approx(2 * found.estimate.state.edge_shift[0])
+
+
+def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):
+    """Looked at first as if half their pixels were too many; the last looks are at all of them."""
+    width = calibrated.session.stations[0].camera.image_size[0]
+    monkeypatch.setattr(legs, "USUAL_PICTURE_LENGTH", width // 2)
+    found = calibrate_session(session)
+    np.testing.assert_array_equal(found.observation.binning, 1)
+    # looks from elsewhere find some edges a tenth of a pixel beside, as others do
+    assert away(found, calibrated) < 1
