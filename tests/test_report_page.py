@@ -247,9 +247,11 @@ def loaded(page: str, *acts: str) -> str:
 
 
 def test_page_runs_in_a_browser(page, tmp_path):
-    """On a telephone: the plot stands, the table sorts, a picture opens."""
-    document, console = browse(loaded(page, OPENED), tmp_path, 390)
-    fine(document, console)
+    """On a telephone: plots stand, the table sorts, a picture opens; a bar's link and a plot's
+    point go to their photograph; on paper, plots are as wide as it, and light.
+    """
+    document, console = browse(loaded(page, OPENED, LED), tmp_path, 390)
+    root = fine(document, console)
     tags = Found(document).tags
     assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
     assert any(tag == "canvas" for tag, _ in tags)
@@ -264,14 +266,6 @@ def test_page_runs_in_a_browser(page, tmp_path):
     large = re.search(r'data-large="([^"]+)"', page)
     assert large is not None
     assert f"base64,{large[1]}" in shown
-
-
-def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
-    """On a screen: a bar's link and a plot's point go to their photograph; on paper, plots are as
-    wide as it.
-    """
-    document, console = browse(loaded(page, OPENED, LED), tmp_path, 1280)
-    root = fine(document, console)
     assert str(root["data-bar"]).startswith("#photograph-")
     assert root["data-point"] == "#photograph-1-2"
     assert root["data-paper"] == "672"
@@ -283,9 +277,11 @@ def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
 
 
 def test_the_browser_test_sees_errors(page, tmp_path):
+    """And a page whose script fails has its text and its tables, on a wide screen as well."""
     broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)
-    document, console = browse(broken, tmp_path, 800)
+    document, console = browse(broken, tmp_path, 1280)
     root = Found(document).tags[0][1]
+    assert root["data-overhang"] == "0"
     assert "missing is not defined" in root["data-errors"]
     assert "blocked https://example.org" in root["data-errors"]
     assert "missing is not defined" in console
