@@ -94,7 +94,8 @@ def near(tube, T_camera_base, rays):
     ends = [R @ (tube.start + s * tube.axis) + t for s in (0.0, tube.length)]
     low = np.min([(e[:2] - 1.5 * tube.radius) / e[2] for e in ends], axis=0)
     high = np.max([(e[:2] + 1.5 * tube.radius) / e[2] for e in ends], axis=0)
-    return np.all((rays[:, :2] > low) & (rays[:, :2] < high), axis=1)
+    x, y = rays[:, 0], rays[:, 1]
+    return (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
 
 
 @cache
