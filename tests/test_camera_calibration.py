@@ -55,6 +55,14 @@ DEPTH = {"pinhole": 0.42, "fisheye": 0.16, "unified": 0.2}
 TERMS = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2"), "unified": ()}
 
 
+ONE_MODEL = pytest.mark.parametrize(
+    "true",
+    [pytest.param(true, id=name, marks=() if name == "unified" else pytest.mark.slow)
+     for name, true in TRUE.items()],
+)  # fmt: skip
+"""What is the same for all of them, however rays go."""
+
+
 def poses_for(camera, count, seed, tilt=0.6):
     """Poses with the whole board in the picture, in many directions, tilted to all sides."""
     rng = np.random.default_rng(seed)
@@ -101,12 +109,26 @@ def true(request):
 
 
 @pytest.fixture(scope="module")
-def calibrated():
+def wide_views():
+    return detections(TRUE["unified"], poses_for(TRUE["unified"], 10, 1), 2)
+
+
+@pytest.fixture(scope="module")
+def wide_pool(wide_views):
+    """Every model's fit to these views, which does not depend on the model that is asked for."""
+    return camera_candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
+
+
+@pytest.fixture(scope="module")
+def calibrated(wide_views, wide_pool):
     """One calibration a model, chosen by itself."""
-    return {
-        model: calibrate_camera(detections(camera, poses_for(camera, 10, 1), 2), BOARD)
-        for model, camera in TRUE.items()
+    found = {
+        model: calibrate_camera(detections(TRUE[model], poses_for(TRUE[model], 10, 1), 2), BOARD)
+        for model in ("pinhole", "fisheye")
     }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
+        return {**found, "unified": calibrate_camera(wide_views, BOARD)}
 
 
 def test_the_truth_comes_back(true, calibrated):
@@ -125,8 +147,9 @@ def test_the_truth_comes_back(true, calibrated):
     np.testing.assert_array_equal(found.camera.covariance, found.covariance)
 
 
-def test_photographs_give_the_camera(tmp_path):
+def test_photographs_give_the_camera(tmp_path, monkeypatch):
     """From rendered pictures, corners and all."""
+    alone(monkeypatch, "pinhole")
     camera, board = CAMERAS["pinhole"], chessboard((8, 5), 0.03)
     turns = ((0.5, 0.1, 0.1), (-0.5, 0.2, 0.0), (0.1, 0.6, 0.3), (0.0, -0.6, 0.0), (0.3, 0.4, 1.0))
     at = ((0.05, 0.02), (-0.06, 0.0), (0.0, -0.05), (0.04, 0.05), (0.0, 0.0))
@@ -142,6 +165,7 @@ def test_photographs_give_the_camera(tmp_path):
     assert found.held_out.rms < 0.1
 
 
+@ONE_MODEL
 def test_sigma_is_honest(true):
     """Over many runs, deviations over sigma have the spread 1 that they should have."""
     poses = poses_for(true, 8, 5)
@@ -176,11 +200,7 @@ def test_opencv_agrees():
     np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
 
 
-@pytest.mark.parametrize(
-    "true",
-    [pytest.param(true, id=name, marks=() if name == "unified" else pytest.mark.slow)
-     for name, true in TRUE.items()],
-)  # fmt: skip
+@ONE_MODEL
 def test_single_bad_corners_do_no_harm(true, monkeypatch):
     alone(monkeypatch, true.model)
     found = calibrate_camera(
@@ -248,20 +268,9 @@ def test_lines_are_great_circles(true):
 # What is refused, and what is only said
 
 
-@pytest.fixture(scope="module")
-def wide_views():
-    true = TRUE["unified"]
-    return detections(true, poses_for(true, 8, 1), 2)
-
-
-@pytest.fixture(scope="module")
-def wide_pool(wide_views):
-    return camera_candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
-
-
 @pytest.fixture
 def fitted_once(wide_pool, monkeypatch):
-    """Every model's fit to these views, which does not depend on the model that is asked for."""
+    """A calibration finds these fits in place of its own."""
     monkeypatch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
 
 
@@ -299,7 +308,8 @@ def test_views_that_are_all_alike(monkeypatch):
     assert "tilted by" in caught.value.found
 
 
-def test_corners_of_no_board(wide_views):
+def test_corners_of_no_board(wide_views, monkeypatch):
+    alone(monkeypatch, "pinhole")
     rng = np.random.default_rng(0)
     wild = [replace(d, pixels=d.pixels + rng.normal(0, 25, d.pixels.shape)) for d in wide_views]
     with pytest.raises((ResultError, InputError)) as caught:
@@ -312,7 +322,7 @@ def test_a_photograph_without_a_board_is_not_dropped_silently(wide_views):
     nothing = replace(wide_views[0], name="dark.png", ids=np.zeros(0, dtype=int), reason="too dark")
     found = calibrate_camera([*wide_views, nothing], BOARD, "unified")
     assert found.views == tuple(d.name for d in wide_views)
-    assert "1 of 9 photographs are not used: dark.png (too dark)." in found.warnings
+    assert "1 of 11 photographs are not used: dark.png (too dark)." in found.warnings
     assert found.document()["not_used"] == {"dark.png": "too dark"}
 
 
