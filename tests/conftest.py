@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
 
+from pkmcal.calibration.turns import LOOKS_AGAIN as ALL_LOOKS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once
@@ -81,6 +82,22 @@ def pytest_collection_finish():
 def unhurried(monkeypatch):
     """No line about the progress on stderr, which tests compare, however slow the machine is."""
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 3600.0)
+
+
+@pytest.fixture(autouse=True)
+def few_looks(request, monkeypatch):
+    """Two looks from machines as likely as the one found, which are half of a calibration's time,
+    do where their scatter is not the question. Where it is, in slow tests and in what tests share,
+    there are as many as for everybody.
+    """
+    if not request.node.get_closest_marker("slow"):
+        monkeypatch.setattr("pkmcal.calibration.turns.LOOKS_AGAIN", 2)
+
+
+@pytest.fixture
+def all_looks(few_looks, monkeypatch):
+    """As many looks as for everybody."""
+    monkeypatch.setattr("pkmcal.calibration.turns.LOOKS_AGAIN", ALL_LOOKS)
 
 
 @dataclass(frozen=True)
