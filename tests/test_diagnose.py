@@ -82,9 +82,12 @@ def given(by_hand):
     return rough_pose(4) if by_hand else None
 
 
-@pytest.mark.parametrize("by_hand", [also(True), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("by_hand", [True, False])
 def test_nothing_is_said_of_what_is_right(by_hand):
-    """Though its drawing is 2 mm wrong."""
+    """Though its drawing is 2 mm wrong. Whole sessions that are right are calibrated in many tests,
+    one without a pose by hand in test_check.py.
+    """
     rng = np.random.default_rng(0)
     station = looked_for(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
     assert station.found.sure
@@ -248,6 +251,7 @@ def test_photographs_of_nothing_are_refused():
     assert "not recognised in the photographs of front" in str(error)
 
 
+@pytest.mark.slow
 def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
     """Each leg ends in its neighbour's joint: no mix-up of the session explains that."""
     values = machine().values.copy()

@@ -267,7 +267,7 @@ def test_samples_that_cannot_be_are_refused():
 # ------------------------------------------------------------------ photographs
 
 
-@pytest.mark.parametrize("view", ["perspective", "mirror"])
+@pytest.mark.parametrize("view", ["perspective", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_photographs_lead_to_the_goal_and_past_a_painted_leg(view):
     """Rendered photographs close the loop: in seven samples from 22 mm and 6 degrees to what one
     photograph tells. A mirror image of that size has a third of the pixels a radian.

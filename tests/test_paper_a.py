@@ -196,7 +196,7 @@ def near():
     return study(runs=30, seed=5)
 
 
-@pytest.mark.parametrize("error", [0.005, 0.02])
+@pytest.mark.parametrize("error", [pytest.param(0.005, marks=pytest.mark.slow), 0.02])
 def test_thirty_of_thirty_starts(near, error):
     """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
     found = study(runs=30, start_error=error, seed=5)

@@ -136,6 +136,7 @@ def test_every_figure_of_the_prototype_is_compared(short):
     assert not figure._replace(found=Summary(0.09, 0.001)).tolerable
 
 
+@pytest.mark.slow
 def test_noise_twice_as_large_is_not_a_reproduction():
     quiet = H4ByBoard()
     loud = study(runs=4, turn=2 * quiet.turn, shift=2 * quiet.shift)

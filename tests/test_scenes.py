@@ -14,7 +14,7 @@ import pytest
 from pkmcal.geometry.rigid import apply, pose, rotation
 
 FILE = Path(__file__).parents[1] / "benchmarks" / "scenes.py"
-DRAWS = 200
+DRAWS = 100
 
 
 @pytest.fixture(scope="module")
