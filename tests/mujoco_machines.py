@@ -109,7 +109,15 @@ TURNED = {
     "barred delta": ("delta", "[0.0, 0.0, -0.22]", "[0, 0, 0.1]"),
     "turned h4-rods": ("h4-rods", "[0.02, 0.0, -0.45]", "[0, 0, 0.2]"),
 }
-ALL = [*CATALOGUE, *(f"wrong {n}" for n in CATALOGUE), *MADE, *TURNED]
+BUILT_WRONG = ("3-rps", "delta", "gough-stewart", "h4-rods")
+"""Of either motion and every kind of closure; the other machines, built wrong, are slow tests."""
+ALL = [
+    *CATALOGUE,
+    *(pytest.param(f"wrong {n}", marks=() if n in BUILT_WRONG else pytest.mark.slow)
+      for n in CATALOGUE),
+    *MADE,
+    *TURNED,
+]  # fmt: skip
 
 
 def made(text):

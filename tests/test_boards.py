@@ -224,12 +224,12 @@ def photographs(folder, board, count=3, size=None, start=0):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Three photographs of each board."""
+    """Three photographs of either board."""
     folder = tmp_path_factory.mktemp("boards")
     boards = {}
-    for kind, text in FILES.items():
+    for kind in ("charuco", "chessboard"):
         (folder / kind).mkdir()
-        board = board_of(folder / kind, text)
+        board = board_of(folder / kind, FILES[kind])
         boards[kind] = board, photographs(folder / kind, board)
     return boards
 

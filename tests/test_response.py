@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -145,22 +147,32 @@ def test_a_session_that_is_as_usual_says_nothing(calibrated):
     assert not any("levels of the photographs" in hint for hint in calibrated.verdict.advice)
 
 
-@pytest.mark.parametrize(
-    ("kind", "table", "found", "usual"),
-    [
-        (".png", SRGB, "sRGB (as telephones write it)", "linear (as sensors count light)"),
-        (".jpg", None, "linear (as sensors count light)", "sRGB (as telephones write it)"),
-    ],
-)  # fmt: skip
-def test_the_edges_overrule_what_is_usual(demo, session, kind, table, found, usual):
+@pytest.fixture(scope="module")
+def coded(demo, tmp_path_factory):
+    """The demonstration's photographs, coded as no PNG files are usually, and what is found."""
+    folder = shutil.copytree(demo.session, tmp_path_factory.mktemp("coded") / "session")
+    recode(folder, ".png", SRGB)
+    return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
+
+
+SAID = {"srgb": "sRGB (as telephones write it)", "linear": "linear (as sensors count light)"}
+
+
+def check_overruled(calibration, found, usual, demo):
     """And the machine is found as well as where it is as usual."""
-    recode(session, kind, table)
-    calibration = calibrate_session(session)
     (hint,) = [text for text in calibration.verdict.advice if "levels of the photographs" in text]
-    assert f"are {found}, not {usual}, as is usual for such files" in hint
+    assert f"are {SAID[found]}, not {SAID[usual]}, as is usual for such files" in hint
     check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
-    response = {station.response for station in calibration.session.stations}
-    assert response == {"srgb" if table is not None else "linear"}
+    assert {station.response for station in calibration.session.stations} == {found}
+
+
+def test_the_edges_overrule_what_is_usual_for_png_files(demo, coded):
+    check_overruled(coded.calibration, "srgb", "linear", demo)
+
+
+def test_the_edges_overrule_what_is_usual_for_jpeg_files(demo, session):
+    recode(session, ".jpg")
+    check_overruled(calibrate_session(session), "linear", "srgb", demo)
 
 
 def test_a_stated_response_is_not_asked_about(session):
@@ -207,11 +219,10 @@ def test_each_camera_is_asked_by_itself(session):
     assert len(said) == 1
 
 
-def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(session):
-    recode(session, ".png", SRGB)
-    pkmcal.calibrate(session).save(session / "calibration")
-    saved = load(session / "calibration")
+def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(coded, tmp_path):
+    coded.calibration.save(tmp_path / "calibration")
+    saved = load(tmp_path / "calibration")
     assert {row["response"] for row in saved.document["stations"]} == {"srgb"}
-    fresh = _as_then(saved, load_session(session))
+    fresh = _as_then(saved, load_session(coded.folder))
     assert {station.response for station in fresh} == {"srgb"}
     assert all(station.response_told for station in fresh)
