@@ -196,6 +196,7 @@ def quick_plans():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
         patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
+        patch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
         yield
 
 

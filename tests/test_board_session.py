@@ -190,10 +190,10 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     T = station_poses(session, photographs, boards, np.random.default_rng(1))
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     # without the board too: a pose by hand that shows nothing is only where the search begins
-    rngs = [np.random.default_rng(seed) for seed in (0, 1)]
-    alone = recognise(session, photographs, platform_poses(session), rngs)
+    rng = np.random.default_rng(1)
+    alone = recognise(session, photographs[1:], platform_poses(session), [rng])
     assert alone.complete
-    off = pose_difference(alone.found[1].T_camera_base, T[1])
+    off = pose_difference(alone.found[0].T_camera_base, T[1])
     assert np.rad2deg(np.linalg.norm(off[:3])) < 3
     assert np.linalg.norm(off[3:]) < 0.06
 

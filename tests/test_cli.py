@@ -442,7 +442,7 @@ def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
 def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
     """Barely enough for them: told apart as comparison, or refused with [A]'s own condition."""
     monkeypatch.setattr(
-        "pkmcal.papers.methods.SIGMA_REPETITIONS", 12
+        "pkmcal.papers.methods.SIGMA_REPETITIONS", 3
     )  # asked: the verdict, no deviation
     done = run("calibrate", session, "--method", "four-step", "--json")
     assert done.code == 1
