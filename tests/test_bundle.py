@@ -184,7 +184,7 @@ def test_stated_noise_is_kept_when_asked():
     )
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize("share", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_wrong_edges_change_nothing_that_matters(share):
     """Edges replaced by another leg's: the same answer within 1.5 of its standard deviations."""
     for seed in range(4):

@@ -165,10 +165,11 @@ def test_a_missing_board_file_and_another_camera(folder):
         load_session(folder)
 
 
-def test_the_method_of_paper_c_says_nothing_of_the_size(rendered, tmp_path, monkeypatch):
+def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path, monkeypatch):
     """It estimates none, so none is told, though board.yaml's tolerance makes it unsure."""
     monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # of its deviations nothing is asked
-    done = run("calibrate", rendered, "-o", tmp_path / "out", "--method", "inverse-kinematic")
+    change(folder, lambda station: station.update(observe="board"))
+    done = run("calibrate", folder, "-o", tmp_path / "out", "--method", "inverse-kinematic")
     assert done.code in (0, 1)
     target = json.loads((tmp_path / "out" / "calibration.json").read_text())["targets"][0]
     assert "size" not in target

@@ -393,7 +393,9 @@ def test_the_bundle_starts_from_the_steps(name):
     np.testing.assert_allclose(again.state.theta, best.state.theta, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["3-rpr", "3-rps", "6-spu-passive"])
+@pytest.mark.parametrize(
+    "name", ["3-rpr", "3-rps", pytest.param("6-spu-passive", marks=pytest.mark.slow)]
+)
 def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     """``--method four-step``: deviations by repetition, residuals, a mechanism that can be read."""
     monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 20)

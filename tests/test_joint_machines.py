@@ -129,8 +129,12 @@ def test_truth_is_found_without_noise(name):
     assert np.median(np.abs(error[told])) < 3e-6
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [name if name == "3-rps" else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
+)
 def test_errors_are_as_large_as_they_say(name):
+    """The others by another simulation in test_catalogue.py."""
     squares, shares = [], []
     for seed in range(6):
         session = Session(load_mechanism(name), seed=seed)

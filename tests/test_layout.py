@@ -32,10 +32,15 @@ def file_of(name: str) -> Path | None:
     return next((path for path in files if path.is_file()), None)
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports(path: Path) -> set[Path]:
     """Files of the package that a file imports, at its top or inside its functions."""
     found: set[Path | None] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {file_of(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -97,7 +102,7 @@ def test_a_public_name_exists_once():
     """So that it means one thing wherever it is read; but for what a caller asks of files alike."""
     homes: dict[str, set[str]] = {}
     for path in SOURCE.rglob("*.py"):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in parsed(path).body:
             for name in defined(node):
                 if not name.startswith("_"):
                     homes.setdefault(name, set()).add(str(path.relative_to(SOURCE)))
@@ -119,7 +124,7 @@ def test_private_names_are_used_in_their_own_file_and_nowhere_else():
     wrong: list[str] = []
     for path in SOURCE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        tree, where = ast.parse(text), path.relative_to(SOURCE)
+        tree, where = parsed(path), path.relative_to(SOURCE)
         made = (n for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef))
         names = (node.name for node in made if not node.decorator_list and is_private(node.name))
         alone = (name for name in names if len(re.findall(rf"\b{name}\b", text)) == 1)

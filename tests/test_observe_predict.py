@@ -179,7 +179,7 @@ def outline_away(shape, tubes, points, k):
     return away
 
 
-@pytest.mark.parametrize("clearance", [0.0, 5.0])
+@pytest.mark.parametrize("clearance", [pytest.param(0.0, marks=pytest.mark.slow), 5.0])
 def test_obstructed_points_are_those_behind_or_beside_other_legs(clearance):
     legs, tubes, points = predicted()
     clear = unobstructed(machine(), camera_of(), legs, tubes, points, clearance)

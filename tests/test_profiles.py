@@ -162,7 +162,7 @@ BRIGHT_TUBE = {"albedo": (120, 230), "ground": (20, 60)}
 DARK_TUBE = {"albedo": (60, 120), "ground": (150, 235)}
 
 
-@pytest.mark.parametrize("blur", [0.55, 0.7, 0.8])
+@pytest.mark.parametrize("blur", [0.55, pytest.param(0.7, marks=pytest.mark.slow), 0.8])
 @pytest.mark.parametrize("scene", [BRIGHT_TUBE, DARK_TUBE], ids=["bright tube", "dark tube"])
 def test_well_exposed_edges_are_unbiased(blur, scene):
     """A hundredth of a pixel off in the mean, for any width, light and contrast above 40 levels.
@@ -318,7 +318,11 @@ def test_paint_with_the_light_behind_it_shows_no_highlight():
     assert highlight.mean() < 0.01
 
 
-@pytest.mark.parametrize("blur", [0.5, 0.55, 0.63, 0.7, 0.85, 1.0, 1.2])
+@pytest.mark.parametrize(
+    "blur",
+    [0.5, 0.7, 1.2,
+     *(pytest.param(blur, marks=pytest.mark.slow) for blur in (0.55, 0.63, 0.85, 1.0))],
+)  # fmt: skip
 def test_the_blur_is_recovered(blur):
     """To 0.03 px: half a hundredth of a pixel in the edges' places comes from 0.005 px of it."""
     assert estimate_blur(make(6, 300, blur=blur).profiles) == pytest.approx(blur, abs=0.03)

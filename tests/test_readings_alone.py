@@ -94,7 +94,7 @@ def whitened(found, truth):
     [
         (lambda: load_mechanism("four-belt"), NOISE, 25),
         (four_rpr, 1e-4, 40),
-        (seven_legs, 1e-4, 40),
+        pytest.param(seven_legs, 1e-4, 40, marks=pytest.mark.slow),
     ],
     ids=["four-belt", "4-rpr", "7 legs"],
 )

@@ -193,7 +193,7 @@ def test_limits_keep_the_direction():
 # ------------------------------------------------------------------ standing still
 
 
-@pytest.mark.parametrize("delay", [0, 2])
+@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_predicted_stillness_is_what_the_loop_does(eye, delay):
     goals = np.repeat(ways_of(eye, 1)[1], 32, axis=0)
     noise = EdgeNoise(0.05, 0.05)

@@ -140,7 +140,10 @@ def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
 # the map
 
 
-@pytest.mark.parametrize("name", sorted(catalogue()))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n == "h4-rods" else n for n in sorted(catalogue())],
+)
 def test_every_machine_has_a_map(name):
     drawing = load_mechanism(name)
     machine = true_machine(drawing, 0.2, np.random.default_rng(3))
