@@ -36,9 +36,9 @@ def pictures(count=6):
     ]
 
 
-def said(*words, **more):
+def said(*words, seed=0, **more):
     """What is said of one station; see :func:`looked_for`."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     return mistake([looked_for(rng, *words, **more)], rng)
 
 
@@ -95,13 +95,16 @@ def test_nothing_is_said_of_what_is_right(by_hand):
 
 
 @pytest.mark.parametrize(
-    ("pair", "by_hand"), [((0, 3), True), also((2, 4), True), also((0, 3), False)]
+    ("pair", "by_hand", "seed"),
+    [((0, 3), True, 1), also((0, 3), True, 0), also((2, 4), True, 0), also((0, 3), False, 0)],
 )
-def test_two_columns_exchanged(pair, by_hand):
-    """Without a pose by hand six photographs leave it to chance, once in 62 times."""
+def test_two_columns_exchanged(pair, by_hand, seed):
+    """By seed 1 the machine is recognised all the same, by the other four legs. Without a pose by
+    hand six photographs leave it to chance, once in 62 times.
+    """
     order, count = np.arange(6), 6 if by_hand else 9
     order[list(pair)] = order[list(pair)[::-1]]
-    error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand))
+    error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
     a, b = pair
     assert str(error) == (
         f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the photographs"
