@@ -182,6 +182,15 @@ def checked(demo, common) -> Told[SessionCheck]:
     return told_once(common / "checked", partial(check_session, demo.session))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_core_a_worker():
+    """Where the tests take all cores, a study takes one: another process is a second to start."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "PYTEST_XDIST_WORKER" in os.environ:
+            patch.setattr("pkmcal.studies.workers.cores", lambda: 1)
+        yield
+
+
 @pytest.fixture
 def one_process(monkeypatch):
     """Studies in this process: other ones take a second to start."""
