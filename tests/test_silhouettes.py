@@ -129,10 +129,15 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
     assert evidence == pytest.approx(here, rel=0.03)
 
 
-def test_edges_that_could_not_be_measured_are_found_whole(folder, monkeypatch):
+@pytest.fixture(scope="module")
+def calibration(folder):
+    with pytest.MonkeyPatch.context() as patch:
+        at_truth(patch, folder)
+        return calibrate_session(folder)
+
+
+def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     """Of a photograph by hand: once each, measured or coarse, and not among what is left out."""
-    at_truth(monkeypatch, folder)
-    calibration = calibrate_session(folder)
     found = calibration.observation
     edges = found.edges
     assert 0 < edges.coarse.sum() < (~edges.coarse).sum()
@@ -226,21 +231,18 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(folder, monkeypat
     assert calibrate_session(folder).estimate.statistics.look_scatter == 1
 
 
-def test_machines_as_likely_have_their_edges_near(folder, monkeypatch):
+def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
     """In pairs to both sides; places, focal lengths and machine are drawn together, so that no leg
     is predicted far from where it is.
     """
-
-    at_truth(monkeypatch, folder)
-    found = calibrate_session(folder)
-    estimate, session = found.estimate, found.session
+    estimate, session = calibration.estimate, calibration.session
     rng = np.random.default_rng(0)
-    drawn = list(turns._as_likely(session, found.measurements, estimate, rng))
+    drawn = list(turns._as_likely(session, calibration.measurements, estimate, rng))
     away = np.stack([one.state.theta - estimate.state.theta for one in drawn])
     assert len(drawn) == turns.LOOKS_AGAIN
     np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-4)
     for one in drawn:
-        cameras = found.cameras.moved(one)
+        cameras = calibration.cameras.moved(one)
         seen = [replace(p, camera=cameras.at_station(p.station)) for p in read_photographs(session)]
         looks = turns._looked(session, seen, one, {}, 1.0, True)
         moved = [look.moved for look in looks]
