@@ -51,6 +51,13 @@ def small(subject, monkeypatch, **more):
     return plan_measurements(subject, count=5, **more)
 
 
+@pytest.fixture(scope="module")
+def planned():
+    """Of a hexapod's legs, seen from two places."""
+    with pytest.MonkeyPatch.context() as patch:
+        return small(hexapod(), patch)
+
+
 # ------------------------------------------------------------------ the promise
 
 
@@ -77,7 +84,7 @@ def stated_by(rig, measurements, work):
 
 
 @pytest.mark.parametrize("seen", ["legs", "board", "points", "together"])
-def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch):
+def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned):
     if seen == "board":
         machine = load_mechanism("h4")
         board = board_for(machine, "platform")
@@ -87,7 +94,7 @@ def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch):
         subject = of_machine(machine, [], machine.joint_names, tracker=(2e-5, None))
     else:
         subject = hexapod()
-    found = small(subject, monkeypatch, together=seen == "together")
+    found = planned if seen == "legs" else small(subject, monkeypatch, together=seen == "together")
     rig, n = found.subject.rig, len(found.names)
     numbers = {name: k for k, name in enumerate(rig.names)}
     pairs = np.array([(numbers[s], k) for k in range(n) for s in found.stations[k]])
@@ -101,15 +108,14 @@ def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch):
     assert found.promised.orientation == pytest.approx(stated[1], rel=0.03, abs=1e-9)
 
 
-def test_a_plan_is_far_better_than_chance(monkeypatch):
-    found = small(hexapod(), monkeypatch)
-    assert found.promised.position < 0.5 * found.by_chance.position
-    assert found.value < found.at_random
-    assert found.now.position > 5 * found.by_chance.position
+def test_a_plan_is_far_better_than_chance(planned):
+    assert planned.promised.position < 0.5 * planned.by_chance.position
+    assert planned.value < planned.at_random
+    assert planned.now.position > 5 * planned.by_chance.position
 
 
-def test_configurations_are_possible_and_their_way_is_short(monkeypatch):
-    found = small(hexapod(), monkeypatch)
+def test_configurations_are_possible_and_their_way_is_short(planned):
+    found = planned
     machine = found.subject.rig.machine
     low, high = machine.joint_ranges.T
     margin = READING_RANGE_SHARES[0] * (high - low) - 1e-9
@@ -123,12 +129,11 @@ def test_configurations_are_possible_and_their_way_is_short(monkeypatch):
     assert sorted(found.rank.tolist()) == sorted([*range(1, 6)] * 2)
 
 
-def test_more_configurations_never_tell_less(monkeypatch):
-    found = small(hexapod(), monkeypatch)
-    positions = [a.position for a in found.curve]
+def test_more_configurations_never_tell_less(planned):
+    positions = [a.position for a in planned.curve]
     assert all(after < before for before, after in itertools.pairwise(positions))
     # noise of photographs alone would go with the root; what all share falls more slowly
-    assert found.curve[-1].position > 0.4 * found.promised.position
+    assert planned.curve[-1].position > 0.4 * planned.promised.position
 
 
 # ------------------------------------------------------------------ the choice

@@ -125,7 +125,11 @@ def folder(tmp_path):
     return tmp_path / "session"
 
 
-@pytest.mark.parametrize("name", ["gough-stewart", "6-rus", "h4", "3-upu", "delta"])
+@pytest.mark.parametrize(
+    "name",
+    ["gough-stewart", "h4", "delta",
+     *(pytest.param(name, marks=pytest.mark.slow) for name in ("6-rus", "3-upu"))],
+)  # fmt: skip
 def test_whole_poses_calibrate_any_machine(folder, name):
     made = make(folder, name)
     result = calibrate_session(folder)

@@ -127,7 +127,7 @@ def test_held_leaves_radii_alone_free():
 def test_residuals_scatter_as_promised(hexapod):
     drawing, true, estimate, _ = hexapod
     chi2 = []
-    for seed in range(60, 66):
+    for seed in range(60, 63):
         _, _, stations, data = legs_case(seed, true)
         chi2.append(judged_on(drawing, estimate, estimate.machine, data, stations).promise)
     share = np.mean([test.chi2 / test.dof for test in chi2])
