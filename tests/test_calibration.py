@@ -164,9 +164,12 @@ def test_one_station_alone(demo, calibrated):
     assert any("configurations" in w for w in found.verdict.warnings)
 
 
-@pytest.mark.parametrize("method", [pytest.param("four-step", marks=pytest.mark.slow), "linear"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["four-step", "linear"])
 def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, method):
-    """They run on the same edges and come nowhere near; the verdict names the better method."""
+    """They run on the same edges and come nowhere near; the verdict names the better method. By
+    the command in test_cli.py; how good they are by themselves in the tests of the papers.
+    """
     found = pkmcal.calibrate(demo.session, method=method)
     assert found.method == method
     worse = compare_with_truth(found, demo.session).calibrated.centre

@@ -25,7 +25,7 @@ from test_identify_scene import make_scene
 
 # ------------------------------------------------------------------ what chance does
 
-PAIRS = 12
+PAIRS = 8
 
 
 def of_configurations(measurements, keep):
@@ -63,7 +63,7 @@ def changes(pairs):
 
 @pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
 def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
-    """Of 12 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.06."""
+    """Of 8 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.07."""
     found = changes(pairs[kind])
     dof = sum(c.dof for c in found)
     assert sum(c.chi2 for c in found) / dof == pytest.approx(1, abs=0.2)
