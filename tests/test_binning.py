@@ -1,4 +1,4 @@
-"""Photographs of more pixels than their lens resolves: binned, and less so where they are sharp."""
+"""Photographs of more pixels than their lens resolves are binned, less so where it is sharp."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.results import calibration_document
 from pkmcal.observe import legs
 from pkmcal.observe.images import binned
-from pkmcal.observe.legs import finer_binning, first_binning, measure
+from pkmcal.observe.legs import first_binning, measure, sharp_binning
+from pkmcal.observe.profiles import BLURS_TRIED
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
@@ -51,16 +52,17 @@ def test_the_longer_side_says_how_many(size, count):
 
 def test_what_is_sharper_is_binned_less():
     """A lens of 1.6 px is as sharp as usual over two pixels; one of 0.6 px over one. Nothing is
-    binned more than before.
+    binned more than before but where profiles do not reach.
     """
-    blur = np.arange(0.3, 2.0, 0.05)
+    blur = np.arange(0.3, BLURS_TRIED[-1] - 0.01, 0.05)
     for binning in (1, 2, 4):
-        next_ones = [finer_binning(binning, b) for b in blur]
+        next_ones = [sharp_binning(binning, b) for b in blur]
         assert all(1 <= n <= binning for n in next_ones)
         assert all(one <= two for one, two in pairwise(next_ones))
-    assert finer_binning(4, 1.63 / 4) == 2
-    assert finer_binning(2, 1.63 / 2) == 2
-    assert finer_binning(2, 0.45) == 1
+    assert sharp_binning(4, 1.63 / 4) == 2
+    assert sharp_binning(2, 1.63 / 2) == 2
+    assert sharp_binning(2, 0.45) == 1
+    assert [sharp_binning(k, BLURS_TRIED[-1]) for k in (1, 2)] == [2, 4]
 
 
 def test_binned_photographs_give_the_edges_of_small_ones():
@@ -137,6 +139,22 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
     assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
     shift = document["cameras"][0]["edge_shift"]
     assert shift == pytest.approx(2 * found.estimate.state.edge_shift[0])
+
+
+@pytest.mark.parametrize("spread", [1.6, 2.4])
+def test_photographs_out_of_focus(session, calibrated, spread):
+    """Profiles do not explain edges blurred over so much; of half the pixels they do. What is lost
+    is stated.
+    """
+    for path in (session / "images").rglob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path), cv2.GaussianBlur(image, (0, 0), spread))
+    found = calibrate_session(session)
+    np.testing.assert_array_equal(found.observation.binning, 2)
+    assert found.verdict.usable
+    sigma, sharp = (c.estimate.covariance.diagonal() ** 0.5 for c in (found, calibrated))
+    assert np.median(sigma[sharp > 0] / sharp[sharp > 0]) > 1.5
+    assert away(calibrated, found) < 3
 
 
 def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):

@@ -44,6 +44,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.alone import finest_view
 from pkmcal.observe.profiles import EDGE_SHIFTS, USUAL_BLUR
+from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
@@ -71,6 +72,14 @@ over the profiles' reach, so that the median of hundreds of places is half of it
 LOOKS_AGAIN = 6
 """Looks from machines as likely as the one that was found: with some thirty numbers told in each,
 the deviations that they make larger are known to a twentieth."""
+MOST_BINNING = 4
+"""Times that photographs are binned as at first, at most: to pictures of 256 pixels, in which a
+machine is still recognised."""
+FEW_MEASURED = 1 / 3
+"""Share of the edges by which the machine was found below which too few of them can be measured one
+by one, so that it is asked whether they are too blurred."""
+PHOTOGRAPHS_FOR_WIDTH = 4
+"""Photographs of a station that are asked about that: a lens blurs all alike."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
@@ -139,8 +148,16 @@ def take_turns(
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
-        looks = _looked(session, photographs, estimate, blur, scatter, cameras.active, done)
-        blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
+        look = partial(_looked, session, estimate=estimate, scatter=scatter, refine=cameras.active)
+        looks = look(photographs, blur=blur, done=done)
+        blur = _blur_of(looks, photographs)
+        if len(_joined(looks)) < FEW_MEASURED * len(estimate.edge_weights):
+            blur |= _width_of_edges(photographs, estimate)
+        # edges too blurred to be measured must not lead anything astray
+        while coarser := _binned(session, photographs, blur, more=True):
+            photographs = coarser
+            looks = look(photographs, blur={})
+            blur = _blur_of(looks, photographs)
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
         told("Identifying", share + 0.05)
@@ -188,8 +205,8 @@ def take_turns(
             away = (estimate.state.theta - before.state.theta)[None]
             change = float(np.sqrt(_variance(away, measurements, estimate)))
             if change < SETTLED_MACHINE_CHANGE:
-                finer = _binned_less(session, photographs, blur)
-                if all(one.binning == p.binning for one, p in zip(finer, photographs, strict=True)):
+                finer = _binned(session, photographs, blur, more=False)
+                if not finer:
                     break
                 photographs, blur = finer, dict.fromkeys(blur)
     observation = observation_of(session, looks, boards, measurements, estimate, photographs)
@@ -294,22 +311,53 @@ def _looked(
     return _each(photographs, lambda p: whole(p, look(p)))
 
 
-def _binned_less(
-    session: Session, photographs: Sequence[legs.Photographs], blur: Mapping[int, float | None]
+def _blur_of(
+    looks: Sequence[legs.StationEdges], photographs: Sequence[legs.Photographs]
+) -> dict[int, float | None]:
+    """Px, by station."""
+    return {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
+
+
+def _width_of_edges(
+    photographs: Sequence[legs.Photographs], estimate: Estimate
+) -> dict[int, float | None]:
+    """Px, by station, by how far the steps of some photographs reach: profiles tell no blur that is
+    wider than they are. Nothing of stations whose edges do not tell it.
+    """
+    out: dict[int, float | None] = {}
+    for p in photographs:
+        few = p.select(p.spread(PHOTOGRAPHS_FOR_WIDTH))
+        T = estimate.state.T_camera_base[p.station]
+        poses = estimate.state.T_base_platform[few.configuration]
+        blur = quality(few, estimate.machine, T, poses).blur
+        if np.isfinite(blur).any():
+            out[p.station] = float(np.nanmedian(blur))
+    return out
+
+
+def _binned(
+    session: Session,
+    photographs: Sequence[legs.Photographs],
+    blur: Mapping[int, float | None],
+    *,
+    more: bool,
 ) -> list[legs.Photographs]:
-    """The photographs as they are looked at next, where their edges, so blurred (px) by station,
-    are sharper than they need be; all of one camera alike, for its lens is the same.
+    """The photographs as they should be looked at, where their edges, so blurred (px) by station,
+    ask for ``more`` pixels as one, or for fewer; nothing where none does. All of one camera alike,
+    for its lens is the same.
     """
     of_camera: dict[str, list[float]] = {}
-    for p in photographs:
-        file = session.stations[p.station].camera_file
+    files = [session.stations[p.station].camera_file for p in photographs]
+    for file, p in zip(files, photographs, strict=True):
         of_camera.setdefault(file, []).append(blur[p.station] or USUAL_BLUR)
-    middle = {file: float(np.median(all_of_it)) for file, all_of_it in of_camera.items()}
-    return [
-        replace(p, binning=legs.finer_binning(p.binning, middle[file]))
-        for p in photographs
-        for file in [session.stations[p.station].camera_file]
-    ]
+    out: list[legs.Photographs] = []
+    for file, p in zip(files, photographs, strict=True):
+        binning = legs.sharp_binning(p.binning, float(np.median(of_camera[file])))
+        most = MOST_BINNING * legs.first_binning(p.camera.image_size)
+        wanted = max(binning, p.binning) if more else min(binning, p.binning)
+        out.append(replace(p, binning=min(wanted, most)))
+    changed = any(one.binning != p.binning for one, p in zip(out, photographs, strict=True))
+    return out if changed else []
 
 
 def _counted(
@@ -520,8 +568,12 @@ def _each(
         return [combined(seen) for seen in pool.map(look, photographs)]
 
 
+def _joined(looks: Sequence[legs.StationEdges]) -> EdgeSet:
+    return concatenate([look.edges for look in looks])
+
+
 def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
-    edges = concatenate([look.edges for look in looks])
+    edges = _joined(looks)
     if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
         raise ResultError(
             f"only {len(edges)} edges of legs were found in all photographs",

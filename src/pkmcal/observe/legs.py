@@ -45,6 +45,8 @@ from pkmcal.observe.profiles import FEWEST_PLACES_FOR_TILT, EdgeFits, edge_set, 
 USUAL_PICTURE_LENGTH = 1024
 """Pixels along the longer side of pictures in which a drawing is off by pixels, tubes are some tens
 of them wide, and all lengths below are meant: photographs are binned to about as many."""
+BLUR_ROUNDING = 1e-6
+"""Pixels by which the last of the blurs that are tried may be missed."""
 PHOTOGRAPHS_A_WINDOW = 32
 """Photographs that are looked at together: their profiles take some 80 MB."""
 WINDOW_BYTES = 96 * 2**20
@@ -99,10 +101,13 @@ def first_binning(image_size: tuple[int, int]) -> int:
     return max(round(max(image_size) / USUAL_PICTURE_LENGTH), 1)
 
 
-def finer_binning(binning: int, blur: float) -> int:
+def sharp_binning(binning: int, blur: float) -> int:
     """How many pixels are one where edges, so blurred (px) at a binning, are as sharp as usual:
-    averaging fewer of those over which the lens spreads an edge tells no more of it.
+    averaging fewer of those over which the lens spreads an edge tells no more of it. Twice as many
+    as now where edges are blurred beyond what profiles are explained with.
     """
+    if blur > profiles.BLURS_TRIED[-1] - BLUR_ROUNDING:
+        return 2 * binning
     return min(max(int(binning * blur / profiles.USUAL_BLUR), 1), binning)
 
 
