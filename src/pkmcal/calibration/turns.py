@@ -206,7 +206,7 @@ def take_turns(
             change = float(np.sqrt(_variance(away, measurements, estimate)))
             if change < SETTLED_MACHINE_CHANGE:
                 finer = _binned(session, photographs, blur, more=False)
-                if not finer:
+                if not finer or turn + 1 == MOST_LOOKS_ASTRAY:
                     break
                 photographs, blur = finer, dict.fromkeys(blur)
     observation = observation_of(session, looks, boards, measurements, estimate, photographs)
