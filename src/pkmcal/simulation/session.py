@@ -275,6 +275,8 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
         name = truth.stations[station].removeprefix(f"{HANDHELD_STATION_NAME}-")
         path = stage / "images" / HANDHELD_STATION_NAME / f"{name}.jpg"
         camera, T_camera_base = studio.cameras[station], truth.T_camera_base[station]
+        if truth.focal_scale is not None:  # telephones write one focal length, however they focus
+            camera = _breathed(camera, 1 / float(truth.focal_scale[station]))
         path.write_bytes(_as_by_telephone(picture, camera, T_camera_base))
         return
     folder = stage / "images" / truth.stations[station]
