@@ -21,6 +21,7 @@ from pkmcal.check.pictures import (
     CAPTION_BAR_HEIGHT,
     PANE_GAP,
     leg_colours,
+    picture,
     picture_names,
     with_pictures,
     write_pictures,
@@ -28,6 +29,7 @@ from pkmcal.check.pictures import (
 from pkmcal.check.words import outcome_of
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
+from pkmcal.observe.images import binned
 from pkmcal.observe.predict import tubes_of
 from pkmcal.outcome import Level
 from pkmcal.planning.first import EdgesOf
@@ -225,6 +227,24 @@ def test_pictures_of_all_photographs(found, tmp_path):
         assert np.abs(after.astype(int) - colour).max(axis=-1).min() < 60
 
 
+def test_pictures_of_large_photographs_are_binned(found):
+    station = found.look.stations[0]
+    large = replace(station, photographs=replace(station.photographs, binning=2))
+    width, height = station.photographs.camera.image_size
+    size = width // 2, height // 2
+    drawn = []
+    for look, grey in (
+        (station, photo := station.photographs.images[0]),
+        (large, binned(photo, 2)),
+    ):
+        pane = picture(found.look, look, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
+        changed = np.any(np.abs(pane.astype(int) - grey[..., None]) > 40, axis=-1)
+        drawn.append(cv2.resize(changed.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0)
+    # what is drawn lies where it lay
+    near = cv2.dilate(drawn[0].astype(np.uint8), np.ones((5, 5))) > 0
+    assert np.mean(near[drawn[1]]) > 0.9
+
+
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the photograph changes; under those by hand, that are off, it does less."""
     from pkmcal.check.pictures import drawing_over_photograph
@@ -234,7 +254,9 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
         slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
-        for edge in drawing_over_photograph(found.look, station, T_camera_base, k)[0]:
+        for edge in drawing_over_photograph(
+            found.look, station, station.photographs.camera, T_camera_base, k
+        )[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
         return float(np.median(slope[mask > 0]))
 
@@ -246,7 +268,8 @@ def test_each_number_stands_once_and_apart(found):
     from pkmcal.check.pictures import drawing_over_photograph
 
     station = found.look.stations[0]
-    _, spots = drawing_over_photograph(found.look, station, station.found, 0)
+    eye = station.photographs.camera
+    _, spots = drawing_over_photograph(found.look, station, eye, station.found, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 

@@ -1,6 +1,6 @@
 """A check's photographs with the drawing laid over, before and after the station's pose was found.
 
-On the page, and as PNG files in full size.
+On the page, and as PNG files, of large photographs binned as their edges are looked for.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
 from pkmcal.check.look import Look, StationLook
 from pkmcal.files import staged_folder
 from pkmcal.outcome import Part
@@ -41,7 +42,8 @@ def with_pictures(look: Look) -> Part:
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
             for said, T_camera_base in poses_of(station):
-                edges, spots = drawing_over_photograph(look, station, T_camera_base, int(k))
+                eye = station.photographs.camera
+                edges, spots = drawing_over_photograph(look, station, eye, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
@@ -70,15 +72,15 @@ def poses_of(station: StationLook) -> tuple[tuple[str, Array], ...]:
 
 
 def drawing_over_photograph(
-    look: Look, station: StationLook, T_camera_base: Array, k: int
+    look: Look, station: StationLook, camera: Camera, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
-    joint centres.
+    joint centres. camera : the station's, or that of binned photographs.
     """
     configuration = int(station.photographs.configuration[k])
     return machine_laid_over(
         look.session.machine,
-        station.photographs.camera,
+        camera,
         T_camera_base,
         look.session.joints[configuration],
         look.poses[configuration],
@@ -115,10 +117,11 @@ def picture(look: Look, station: StationLook, k: int) -> Any:
     import cv2
 
     name = look.session.configurations[int(station.photographs.configuration[k])]
+    small = station.photographs.select(np.array([k])).binned()
     panes: list[Any] = []
     for said, T_camera_base in poses_of(station):
-        pane: Any = cv2.cvtColor(np.asarray(station.photographs.images[k]), cv2.COLOR_GRAY2BGR)
-        edges, spots = drawing_over_photograph(look, station, T_camera_base, k)
+        pane: Any = cv2.cvtColor(np.asarray(small.images[0]), cv2.COLOR_GRAY2BGR)
+        edges, spots = drawing_over_photograph(look, station, small.camera, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
         text = f"{station.name} / {name}: {said}"
