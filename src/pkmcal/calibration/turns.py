@@ -148,16 +148,9 @@ def take_turns(
         done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
-        look = partial(_looked, session, estimate=estimate, scatter=scatter, refine=cameras.active)
-        looks = look(photographs, blur=blur, done=done)
-        blur = _blur_of(looks, photographs)
-        if len(_joined(looks)) < FEW_MEASURED * len(estimate.edge_weights):
-            blur |= _width_of_edges(photographs, estimate)
-        # edges too blurred to be measured must not lead anything astray
-        while coarser := _binned(session, photographs, blur, more=True):
-            photographs = coarser
-            looks = look(photographs, blur={})
-            blur = _blur_of(looks, photographs)
+        looks, photographs, blur = _looked_through(
+            session, photographs, estimate, blur, scatter, cameras.active, done
+        )
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
         told("Identifying", share + 0.05)
@@ -309,6 +302,30 @@ def _looked(
     look = partial(_measure, estimate=estimate, blur=blur, refine=refine, done=done)
     whole = partial(_with_silhouettes, session, estimate, scatter, refine)
     return _each(photographs, lambda p: whole(p, look(p)))
+
+
+def _looked_through(
+    session: Session,
+    photographs: Sequence[legs.Photographs],
+    estimate: Estimate,
+    blur: Mapping[int, float | None],
+    scatter: float,
+    refine: bool,
+    done: legs.PhotographsLookedAt,
+) -> tuple[list[legs.StationEdges], Sequence[legs.Photographs], dict[int, float | None]]:
+    """A look, the photographs as they were looked at, and their blur: binned more where edges are
+    too blurred to be measured, which must not lead an estimate astray.
+    """
+    look = partial(_looked, session, estimate=estimate, scatter=scatter, refine=refine)
+    looks = look(photographs, blur=blur, done=done)
+    found = _blur_of(looks, photographs)
+    if sum(len(one.edges) for one in looks) < FEW_MEASURED * len(estimate.edge_weights):
+        found |= _width_of_edges(photographs, estimate)
+    while coarser := _binned(session, photographs, found, more=True):
+        photographs = coarser
+        looks = look(photographs, blur={})
+        found = _blur_of(looks, photographs)
+    return looks, photographs, found
 
 
 def _blur_of(
@@ -568,12 +585,8 @@ def _each(
         return [combined(seen) for seen in pool.map(look, photographs)]
 
 
-def _joined(looks: Sequence[legs.StationEdges]) -> EdgeSet:
-    return concatenate([look.edges for look in looks])
-
-
 def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
-    edges = _joined(looks)
+    edges = concatenate([look.edges for look in looks])
     if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
         raise ResultError(
             f"only {len(edges)} edges of legs were found in all photographs",
