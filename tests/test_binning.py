@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import yaml
 
+from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.results import calibration_document
+from pkmcal.calibration.turns import observation_of
 from pkmcal.observe import legs
 from pkmcal.observe.images import binned
-from pkmcal.observe.legs import first_binning, measure, sharp_binning
+from pkmcal.observe.legs import Photographs, first_binning, measure, sharp_binning
 from pkmcal.observe.profiles import BLURS_TRIED
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
@@ -139,6 +141,15 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
     assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
     shift = document["cameras"][0]["edge_shift"]
     assert shift == pytest.approx(2 * found.estimate.state.edge_shift[0])
+
+
+def test_stations_of_one_camera_are_binned_alike(calibrated):
+    """One that shows no legs, too: the camera's edge shift is in these pixels."""
+    c = calibrated
+    taken = [Photographs(0, c.session.stations[0].camera, *[np.zeros(0, int)] * 2, [], binning=2)]
+    found = observation_of(c.session, [], Boards(), c.measurements, c.estimate, taken)
+    assert len({station.camera_file for station in c.session.stations}) == 1
+    np.testing.assert_array_equal(found.binning, 2)
 
 
 @pytest.mark.parametrize("spread", [1.6, 2.4])

@@ -607,9 +607,11 @@ def observation_of(
     """The last looks joined, with what the estimate gave up among the rejected. photographs : as
     they were looked at.
     """
+    # a station that observes a board alone has that of its camera, whose edge shift is in it
+    of_camera = {session.stations[p.station].camera_file: p.binning for p in photographs}
     binning = np.ones(len(estimate.state.T_camera_base), dtype=int)
-    for p in photographs:
-        binning[p.station] = p.binning
+    for k, station in enumerate(session.stations):
+        binning[k] = of_camera.get(station.camera_file, 1)
     seen = legs.joined_looks(looks, float("nan"), float("nan"))
     given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
