@@ -39,6 +39,7 @@ from pkmcal.identify.robust import anneal, norms, settled_weights
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
+from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
@@ -97,8 +98,11 @@ class BatchResult:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (B, na, na) of the shared unknowns, with what edges have in common."""
-        return covariance_of_alike(self.info)
+        """Covariance (B, na, na) of the shared unknowns, with what edges have in common and what
+        wrong ones do unnoticed.
+        """
+        unnoticed = covariance_of_unnoticed(self.info, self.weight.edges)
+        return covariance_of_alike(self.info) + unnoticed
 
     @property
     def noise_scale(self) -> Array:

@@ -1,0 +1,116 @@
+"""What edges that are another thing's, and go unnoticed, add to the covariance of an estimate.
+
+Some edges are not the leg's: a highlight's, another leg's, that of a cable behind it. One that all
+others contradict is given up. Where few others say anything of it, as in a photograph by hand with
+a dozen edges and seven unknowns of its own, the unknowns follow it, the next look finds it where
+they have it, and no residual shows it. What it does to the result then is its external reliability
+(Baarda, A testing procedure for use in geodetic networks, 1968); here that is counted as a
+variance, as every other error is.
+
+With probability p an edge is wrong, and its shift, and its tilt, then off by anything up to
+``most`` standard deviations. With H the hat matrix, r = 1 - H_ii of it is left in its own residual,
+which is all that speaks against it once the looks have followed; so it is noticed from
+``NOTICED_DISTANCE / r`` on. Unnoticed ones have, on average, the square
+
+    p u_i,      u = min(most, NOTICED_DISTANCE / r)^3 / (3 most),
+
+of which the noise that residuals tell has had its share: all edges of a tube are believed to err by
+the mean of it, p U with U = sum(r u) / sum(r), whoever makes it. What is added is the rest,
+
+    C J^T D J C,      D_ii = p u_i - min(p U, 1),
+
+with J the rows of the edges, the own unknowns eliminated, and C the inverse of the normal matrix. p
+is what was given up of all that would have been noticed, with Jeffreys' prior for a share: half a
+wrong one more, and half a right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.reduced_edges import ReducedEdges, reduced_edges
+from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
+from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE
+
+NOTICED_DISTANCE = (FULL_WEIGHT_DISTANCE + NO_WEIGHT_DISTANCE) / 2
+"""Standard deviations of its residual at which an edge has lost half of its weight."""
+WRONG_EDGE_REACH = 3.0
+"""Pixels by which a wrong edge lies off at most: a look takes what lies within 1.5 of where an edge
+is predicted, and what is predicted may lie as far to the other side."""
+LEAST_LEFT = 1e-3
+"""Part of an error in its own residual below which it is rounding."""
+
+
+def covariance_of_unnoticed(info: Information, weight: Array) -> Array:
+    """What wrong edges that go unnoticed add to the covariance (B, na, na) of the shared unknowns
+    at a solution; nothing where light moves no edge.
+
+    weight : (B, K, G) of edges, 0..1, their trust left out; what is missing to 1 was given up.
+    """
+    half, blocks = info.root, info.problem.blocks
+    n_runs, na = half.shape[:2]
+    moved = info.problem.kinds.edges.present & (blocks.crowd > 0)
+    if not moved.any():
+        return np.zeros_like(half)
+    n_kinds = NUMBERS_AN_EDGE * (int(blocks.tube.max()) + 1)
+    by_wrong, by_any = np.zeros((n_runs, na, na)), np.zeros((n_kinds, n_runs, na, na))
+    in_residuals, left_of_all = np.zeros((2, n_kinds, n_runs))
+    noticed = np.zeros(n_runs)
+    for piece in reduced_edges(info):
+        most = _most(piece)
+        for cut, shared in piece.shared(half):
+            far, used = np.maximum(most[:, cut], LEAST_LEFT), most[:, cut] > 0
+            left = 1 - np.sum(piece.own[:, cut] ** 2, axis=2) - np.sum(shared**2, axis=2)
+            unseen = np.minimum(NOTICED_DISTANCE / np.maximum(left, LEAST_LEFT), far)
+            square = unseen**3 / (3 * far)
+            share = np.where(used, 1 - unseen / far, 0.0)
+            noticed += np.sum(share[..., ::NUMBERS_AN_EDGE], axis=(1, 2))
+            by_wrong += _summed(shared, np.where(used, square, 0.0))
+            for kind, own in _kinds(piece, cut, n_kinds):
+                mine = (own & used).astype(float)
+                by_any[kind] += _summed(shared, mine)
+                in_residuals[kind] += np.sum(mine * left * square, axis=(1, 2))
+                left_of_all[kind] += np.sum(mine * left, axis=(1, 2))
+    lost = np.sum((1 - weight) * moved, axis=(1, 2))
+    p = (lost + 0.5) / (noticed + lost + 1)
+    counted = np.minimum(p * in_residuals / np.maximum(left_of_all, LEAST_LEFT), 1.0)
+    added = p[:, None, None] * by_wrong - np.sum(counted[..., None, None] * by_any, axis=0)
+    return half @ added @ half.mT
+
+
+def _most(piece: ReducedEdges) -> Array:
+    """By how many of its standard deviations a wrong edge's shift and tilt are off at most, (B, N,
+    r); 0 of edges that are not in use, or not moved by light.
+
+    A line through places evenly along an edge is told root three times less surely at its ends than
+    in its middle.
+    """
+    blocks, data = piece.problem.blocks, piece.problem.data
+    size = np.where(data.weight > 0, shift_squares(blocks, data), 0.0)
+    shift = np.sqrt(size / (data.own**2 * size + data.scale**2))
+    tilt = np.sqrt(size / 3) / data.scale
+    row, place = piece.at
+    most = WRONG_EDGE_REACH * np.stack([shift, tilt], axis=-1)[:, row, place]
+    most = np.where((place >= 0)[..., None], most, 0.0)
+    return most.reshape(*most.shape[:2], -1)
+
+
+def _kinds(piece: ReducedEdges, cut: slice, count: int) -> Iterator[tuple[int, Booleans]]:
+    """Each tube's shifts, and its tilts, among the numbers (N', r) of some views."""
+    row, place = piece.at
+    tube = piece.problem.blocks.tube[row, place][cut, :, None]
+    kind = NUMBERS_AN_EDGE * tube + np.arange(NUMBERS_AN_EDGE)
+    kind = kind.reshape(len(kind), -1)
+    for number in range(count):
+        yield number, kind == number
+
+
+def _summed(shared: Array, weight: Array) -> Array:
+    """``J^T diag(weight) J`` (B, na, na) of what shared unknowns take up (B, N, na, r)."""
+    root = (shared * np.sqrt(weight)[:, :, None]).swapaxes(1, 2)
+    root = root.reshape(*root.shape[:2], -1)
+    return root @ root.mT
