@@ -26,11 +26,9 @@ wrong one more, and half a right one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Integers
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.reduced_edges import ReducedEdges, reduced_edges
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
@@ -61,20 +59,25 @@ def covariance_of_unnoticed(info: Information, weight: Array) -> Array:
     in_residuals, left_of_all = np.zeros((2, n_kinds, n_runs))
     noticed = np.zeros(n_runs)
     for piece in reduced_edges(info):
-        most = _most(piece)
+        most, kinds = _most(piece), _kinds(piece)
         for cut, shared in piece.shared(half):
-            far, used = np.maximum(most[:, cut], LEAST_LEFT), most[:, cut] > 0
-            left = 1 - np.sum(piece.own[:, cut] ** 2, axis=2) - np.sum(shared**2, axis=2)
+            taken = shared.swapaxes(1, 2).reshape(n_runs, na, -1)
+            by_own = np.sum(piece.own[:, cut] ** 2, axis=2).reshape(n_runs, -1)
+            far, kind = most[:, cut].reshape(len(most), -1), kinds[cut].ravel()
+            used, far = far > 0, np.maximum(far, LEAST_LEFT)
+            left = 1 - by_own - np.sum(taken**2, axis=1)
             unseen = np.minimum(NOTICED_DISTANCE / np.maximum(left, LEAST_LEFT), far)
-            square = unseen**3 / (3 * far)
-            share = np.where(used, 1 - unseen / far, 0.0)
-            noticed += np.sum(share[..., ::NUMBERS_AN_EDGE], axis=(1, 2))
-            by_wrong += _summed(shared, np.where(used, square, 0.0))
-            for kind, own in _kinds(piece, cut, n_kinds):
-                mine = (own & used).astype(float)
-                by_any[kind] += _summed(shared, mine)
-                in_residuals[kind] += np.sum(mine * left * square, axis=(1, 2))
-                left_of_all[kind] += np.sum(mine * left, axis=(1, 2))
+            square = np.where(used, unseen**3 / (3 * far), 0.0)
+            noticed += np.sum(np.where(used, 1 - unseen / far, 0.0)[:, ::NUMBERS_AN_EDGE], axis=1)
+            for number in range(n_kinds):
+                mine = kind == number
+                part, each = taken[..., mine], (used * left)[:, mine]
+                wrong = part * np.sqrt(square)[:, None, mine]
+                known = part * used[:, None, mine]
+                by_wrong += wrong @ wrong.mT
+                by_any[number] += known @ known.mT
+                in_residuals[number] += np.sum(each * square[:, mine], axis=1)
+                left_of_all[number] += np.sum(each, axis=1)
     lost = np.sum((1 - weight) * moved, axis=(1, 2))
     p = (lost + 0.5) / (noticed + lost + 1)
     counted = np.minimum(p * in_residuals / np.maximum(left_of_all, LEAST_LEFT), 1.0)
@@ -99,18 +102,8 @@ def _most(piece: ReducedEdges) -> Array:
     return most.reshape(*most.shape[:2], -1)
 
 
-def _kinds(piece: ReducedEdges, cut: slice, count: int) -> Iterator[tuple[int, Booleans]]:
-    """Each tube's shifts, and its tilts, among the numbers (N', r) of some views."""
-    row, place = piece.at
-    tube = piece.problem.blocks.tube[row, place][cut, :, None]
+def _kinds(piece: ReducedEdges) -> Integers:
+    """Of which tube's shifts, or tilts, each number is, (N, r)."""
+    tube = piece.problem.blocks.tube[*piece.at][..., None]
     kind = NUMBERS_AN_EDGE * tube + np.arange(NUMBERS_AN_EDGE)
-    kind = kind.reshape(len(kind), -1)
-    for number in range(count):
-        yield number, kind == number
-
-
-def _summed(shared: Array, weight: Array) -> Array:
-    """``J^T diag(weight) J`` (B, na, na) of what shared unknowns take up (B, N, na, r)."""
-    root = (shared * np.sqrt(weight)[:, :, None]).swapaxes(1, 2)
-    root = root.reshape(*root.shape[:2], -1)
-    return root @ root.mT
+    return kind.reshape(len(kind), -1)
