@@ -68,6 +68,26 @@ def test_edges_are_found_within_their_sigma(view):
     assert np.rad2deg(np.linalg.norm(off[:3])) < 0.3
 
 
+def test_large_photographs_are_binned():
+    """Of three times as many pixels across, each edge spread over as many: the same legs."""
+    import cv2
+
+    small = Lab(MACHINE, PERSPECTIVE, BESIDE).photograph(AT, READINGS)
+    image = cv2.resize(small, (1920, 1440), interpolation=cv2.INTER_LINEAR)
+    larger = PERSPECTIVE.parameters * np.r_[3.0, 3, 3, 3, np.ones(len(PERSPECTIVE.parameters) - 4)]
+    larger[2:4] += 1
+    camera = replace(PERSPECTIVE, image_size=(1920, 1440), parameters=larger)
+    truth, outward = true_edges(seen_machine(MACHINE, BESIDE), AT), []
+    for picture, eye, shift in ((small, PERSPECTIVE, 0.2), (image, camera, 0.6)):
+        sight = Sight(seen_machine(MACHINE, BESIDE), eye, shift)
+        at = track(sight, first_track_state(sight.seen), picture, READINGS)
+        assert at.found.sum() >= 5
+        outward.append(np.sum(at.lines.basis[..., 0] * (at.lines.normal - truth), axis=-1) / PIXEL)
+    apart = np.abs(outward[0] - outward[1])
+    assert np.nanmax(apart) < 0.25
+    assert np.nanmedian(apart) < 0.1  # the shift that is taken off is of whole pixels
+
+
 def test_a_photograph_late_by_a_millimetre_is_followed(view):
     """The readings have gone on; the next photograph profits from what this one showed."""
     _, image, sight = view

@@ -21,7 +21,7 @@ from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, s
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
-from pkmcal.observe.legs import Photographs, StationEdges, measure, search
+from pkmcal.observe.legs import Photographs, StationEdges, first_binning, measure, search
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -250,6 +250,17 @@ class Sight:
     camera: Camera
     edge_shift: float = 0.0
 
+    def photograph(self, image: Integers, readings: Array) -> Photographs:
+        """A photograph as its edges are looked for: of a large one, some pixels are one."""
+        station, binning = np.zeros(1, dtype=int), first_binning(self.camera.image_size)
+        one = Photographs(0, self.camera, station, readings[None], [image], binning=binning)
+        return one.binned()
+
+    def misfits(self, readings: Array, T_base_platform: Array, edges: EdgeSet) -> EdgeMisfits:
+        """The :func:`edge_misfits` of edges found in one, whose pixels are the binned ones."""
+        shift = self.edge_shift / first_binning(self.camera.image_size)
+        return edge_misfits(self.seen, readings, T_base_platform, edges, shift)
+
 
 @dataclass(frozen=True)
 class TrackState:
@@ -320,8 +331,7 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         lost = replace(state, found=lines.found)
         return TrackedLegs(lines, lines.found, reasons, state.T_base_platform, False, 0.0, lost)
     closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
-    station = np.zeros(1, dtype=int)
-    photograph = Photographs(0, sight.camera, station, readings[None], [image])
+    photograph = sight.photograph(image, readings)
     predicted = perturb(closed, state.correction)
     searched = not first and _poor(state.found) and not state.searched
     if searched:
@@ -370,7 +380,7 @@ def _look(sight: Sight, photograph: Photographs, predicted: Array, blur: float) 
     seen = sight.seen
     known = None if np.isnan(blur) else blur
     look = measure(photograph, seen.machine, seen.T_camera_base, predicted[None], known)
-    rows = edge_misfits(seen, photograph.joints[0], predicted, look.edges, sight.edge_shift)
+    rows = sight.misfits(photograph.joints[0], predicted, look.edges)
     far = look.moved > LOST_EDGE_DISTANCE
     lines = LegLines.nothing(len(seen.legs)) if far else leg_lines(seen, rows)
     return _Look(predicted, look, rows, lines, far)
@@ -382,7 +392,7 @@ def _searched(sight: Sight, photograph: Photographs, predicted: Array) -> Array:
     look = search(photograph, seen.machine, seen.T_camera_base, predicted[None])
     every = np.ones(len(seen.legs), dtype=bool)
     for _ in range(SEARCH_ROUNDS):
-        rows = edge_misfits(seen, readings, predicted, look.edges, sight.edge_shift)
+        rows = sight.misfits(readings, predicted, look.edges)
         predicted = corrected_pose(seen, predicted, rows, every)
     return predicted
 
