@@ -58,6 +58,17 @@ def planned():
         return small(hexapod(), patch)
 
 
+def test_more_pixels_than_a_lens_resolves_promise_nothing():
+    """Of a camera nobody has seen the photographs of."""
+    machine = load_mechanism("gough-stewart")
+    eyes = []
+    for size in ((1024, 768), (4096, 3072)):
+        subject = of_machine(machine, [camera_of_size(size)], machine.joint_names)
+        eyes.append(subject.rig.instruments[0].camera)
+    assert eyes[0].image_size == eyes[1].image_size
+    np.testing.assert_allclose(eyes[0].parameters[:2], eyes[1].parameters[:2])
+
+
 # ------------------------------------------------------------------ the promise
 
 

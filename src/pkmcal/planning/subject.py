@@ -28,6 +28,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.start import start_mounts
 from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
+from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import Pools, first_edges, spread_over
 from pkmcal.planning.rig import (
@@ -156,7 +157,7 @@ def of_machine(
     if board is None:
         check_tubes(machine, "legs")
         pools = nominal_pools(machine, edge)
-        instruments = tuple(LegsFrom(s, camera, T, pools) for s, (camera, T) in placed)
+        instruments = tuple(LegsFrom(s, _eye(camera), T, pools) for s, (camera, T) in placed)
         mounts, T_mount = (), None
         what = f"edges of legs to {edge:g} px"
     else:
@@ -415,9 +416,14 @@ def _edge_noise(
             words = f"How good edges are is told by {count} of the photographs that there are."
             eyes = tuple(p.camera.binned(p.binning) for p in seen.photographs)
             return eyes, first.pools, first.estimate.statistics.shading, words
-    eyes = tuple(session.stations[s].camera for s in legs)
+    eyes = tuple(_eye(session.stations[s].camera) for s in legs)
     pools = (nominal_pools(session.machine, edge),) * len(legs)
     return eyes, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
+
+
+def _eye(camera: Camera) -> Camera:
+    """A camera as its photographs are looked at for edges; how sharp it is, nobody has seen."""
+    return camera.binned(first_binning(camera.image_size))
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
