@@ -48,7 +48,8 @@ class ReducedEdges:
         count, places = self.problem.blocks.present.shape
         # a place more than there are takes in the padding, -1
         out = np.zeros((len(numbers), count, places + 1, NUMBERS_AN_EDGE))
-        out[:, *self.at] = numbers.reshape(*numbers.shape[:2], -1, NUMBERS_AN_EDGE)
+        edges = numbers.shape[-1] // NUMBERS_AN_EDGE  # not -1, for there may be no configuration
+        out[:, *self.at] = numbers.reshape(*numbers.shape[:2], edges, NUMBERS_AN_EDGE)
         return out[:, :, :-1]
 
     def shared(self, half: Array) -> Iterator[tuple[slice, Array]]:

@@ -8,18 +8,19 @@ they have it, and no residual shows it. What it does to the result then is its e
 variance, as every other error is.
 
 With probability p an edge is wrong, and its shift, and its tilt, then off by anything up to
-``most`` standard deviations. With H the hat matrix, r = 1 - H_ii of it is left in its own residual,
-which is all that speaks against it once the looks have followed; so it is noticed from
-``NOTICED_DISTANCE / r`` on. Unnoticed ones have, on average, the square
+``most`` of its own standard deviations. With H the hat matrix, r = 1 - H_ii of it is left in its
+own residual, which is all that speaks against it once the looks have followed; so it is noticed
+from ``NOTICED_DISTANCE / r`` on. Unnoticed ones have, on average, the square
 
     p u_i,      u = min(most, NOTICED_DISTANCE / r)^3 / (3 most),
 
 of which the noise that residuals tell has had its share: all edges of a tube are believed to err by
 the mean of it, p U with U = sum(r u) / sum(r), whoever makes it. What is added is the rest,
 
-    C J^T D J C,      D_ii = p u_i - min(p U, 1),
+    C J^T D J C,      D_ii = s_i (p u_i - min(p U, 1)),
 
-with J the rows of the edges, the own unknowns eliminated, and C the inverse of the normal matrix. p
+with J the rows of the edges, the own unknowns eliminated, C the inverse of the normal matrix, and
+s the variance that an edge has by itself in that with which it counts among those shaded alike. p
 is what was given up of all that would have been noticed, with Jeffreys' prior for a share: half a
 wrong one more, and half a right one.
 """
@@ -59,21 +60,25 @@ def covariance_of_unnoticed(info: Information, weight: Array) -> Array:
     in_residuals, left_of_all = np.zeros((2, n_kinds, n_runs))
     noticed = np.zeros(n_runs)
     for piece in reduced_edges(info):
-        most, kinds = _most(piece), _kinds(piece)
+        kept = weight[:, piece.first : piece.first + len(piece.problem.blocks.present)]
+        most, own_share = _deviations(piece)
+        kinds, kept = _kinds(piece), np.repeat(kept[:, *piece.at], NUMBERS_AN_EDGE, axis=-1)
         for cut, shared in piece.shared(half):
-            taken = shared.swapaxes(1, 2).reshape(n_runs, na, -1)
-            by_own = np.sum(piece.own[:, cut] ** 2, axis=2).reshape(n_runs, -1)
-            far, kind = most[:, cut].reshape(len(most), -1), kinds[cut].ravel()
-            used, far = far > 0, np.maximum(far, LEAST_LEFT)
-            left = 1 - by_own - np.sum(taken**2, axis=1)
+            taken = shared.swapaxes(1, 2).reshape(n_runs, na, kinds[cut].size)
+            far, share, trust = (
+                part[:, cut].reshape(len(part), kinds[cut].size) for part in (most, own_share, kept)
+            )
+            by_own = np.sum(piece.own[:, cut] ** 2, axis=2).reshape(n_runs, kinds[cut].size)
+            kind, trust = kinds[cut].ravel(), np.where(far > 0, trust, 0.0)
+            far, left = np.maximum(far, LEAST_LEFT), 1 - by_own - np.sum(taken**2, axis=1)
             unseen = np.minimum(NOTICED_DISTANCE / np.maximum(left, LEAST_LEFT), far)
-            square = np.where(used, unseen**3 / (3 * far), 0.0)
-            noticed += np.sum(np.where(used, 1 - unseen / far, 0.0)[:, ::NUMBERS_AN_EDGE], axis=1)
+            square = unseen**3 / (3 * far)
+            noticed += np.sum((trust * (1 - unseen / far))[:, ::NUMBERS_AN_EDGE], axis=1)
             for number in range(n_kinds):
                 mine = kind == number
-                part, each = taken[..., mine], (used * left)[:, mine]
-                wrong = part * np.sqrt(square)[:, None, mine]
-                known = part * used[:, None, mine]
+                size, each = (trust * share)[:, mine], (trust * left)[:, mine]
+                wrong = taken[..., mine] * np.sqrt(size * square[:, mine])[:, None]
+                known = taken[..., mine] * np.sqrt(size)[:, None]
                 by_wrong += wrong @ wrong.mT
                 by_any[number] += known @ known.mT
                 in_residuals[number] += np.sum(each * square[:, mine], axis=1)
@@ -85,25 +90,31 @@ def covariance_of_unnoticed(info: Information, weight: Array) -> Array:
     return half @ added @ half.mT
 
 
-def _most(piece: ReducedEdges) -> Array:
-    """By how many of its standard deviations a wrong edge's shift and tilt are off at most, (B, N,
-    r); 0 of edges that are not in use, or not moved by light.
+def _deviations(piece: ReducedEdges) -> tuple[Array, Array]:
+    """By how many of its own standard deviations a wrong edge's shift and tilt are off at most, 0
+    of edges that are not in use, or not moved by light; and the part that the own variance is of
+    that with which they count. (B or 1, N, r) both.
 
     A line through places evenly along an edge is told root three times less surely at its ends than
     in its middle.
     """
     blocks, data = piece.problem.blocks, piece.problem.data
     size = np.where(data.weight > 0, shift_squares(blocks, data), 0.0)
-    shift = np.sqrt(size / (data.own**2 * size + data.scale**2))
-    tilt = np.sqrt(size / 3) / data.scale
+    counted = data.own**2 * size
+    alone = counted / np.maximum(blocks.crowd, 1.0) + data.scale**2
+    shift, tilt = np.sqrt(size / alone), np.sqrt(size / 3) / data.scale
+    share = alone / (counted + data.scale**2)
+    most = WRONG_EDGE_REACH * np.stack(np.broadcast_arrays(shift, tilt), axis=-1)
+    shares = np.stack(np.broadcast_arrays(share, 1.0), axis=-1)
     row, place = piece.at
-    most = WRONG_EDGE_REACH * np.stack([shift, tilt], axis=-1)[:, row, place]
-    most = np.where((place >= 0)[..., None], most, 0.0)
-    return most.reshape(*most.shape[:2], -1)
+    there = (place >= 0)[..., None]
+    numbers = len(place), NUMBERS_AN_EDGE * place.shape[1]
+    most, shares = (np.where(there, part[:, row, place], 0.0) for part in (most, shares))
+    return most.reshape(len(most), *numbers), shares.reshape(len(shares), *numbers)
 
 
 def _kinds(piece: ReducedEdges) -> Integers:
     """Of which tube's shifts, or tilts, each number is, (N, r)."""
     tube = piece.problem.blocks.tube[*piece.at][..., None]
     kind = NUMBERS_AN_EDGE * tube + np.arange(NUMBERS_AN_EDGE)
-    return kind.reshape(len(kind), -1)
+    return kind.reshape(len(kind), NUMBERS_AN_EDGE * tube.shape[1])
