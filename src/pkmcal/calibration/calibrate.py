@@ -13,6 +13,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
+from pkmcal.calibration.chance import chance_doubt
 from pkmcal.calibration.departures import Departed, unmodelled_departures
 from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
@@ -316,6 +317,7 @@ def _judge(
             *scale_doubt(session, found.estimate),
             *noise_doubt(session, found.estimate),
             *found.turns.doubts,
+            *chance_doubt(found.turns),
             *(one.sentence for one in departed if one.against),
         ),
         cautions=(

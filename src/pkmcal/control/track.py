@@ -21,7 +21,14 @@ from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, s
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
-from pkmcal.observe.legs import Photographs, StationEdges, first_binning, measure, search
+from pkmcal.observe.legs import (
+    OUT_OF_SIGHT_REASON,
+    Photographs,
+    StationEdges,
+    first_binning,
+    measure,
+    search,
+)
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -39,7 +46,6 @@ tell some motions of the platform a hundred times worse than others, and there r
 ONE_LEG_MISFIT = 16.0
 """Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
 LEG_EDGE_SIDES = np.array([0, 1])
-LEG_OUT_OF_SIGHT = "hidden behind another leg or outside the photograph"
 LOST_EDGE_DISTANCE = 0.7
 """Median distance (px) of edges from their prediction from which none is believed: of legs that
 turned away more than that, the ends that still lie within reach pass for whole edges."""
@@ -403,7 +409,7 @@ def _reasons(sight: Sight, at: _Look) -> tuple[str, ...]:
     out: list[str] = []
     for leg, found, agrees in zip(sight.seen.legs, at.lines.found, at.lines.agrees, strict=True):
         mine = [r.reason for r in at.look.rejected if r.leg == leg]
-        shown = [reason for reason in mine if reason != LEG_OUT_OF_SIGHT]
+        shown = [reason for reason in mine if reason != OUT_OF_SIGHT_REASON]
         why = (shown or mine or ["only one of its sides is seen"])[0]
         out.append("" if found else why if agrees else "its edges do not belong to one leg")
     return tuple(out)

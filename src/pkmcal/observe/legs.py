@@ -88,7 +88,7 @@ FEWEST_SHARE = 1 / 3
 OTHER_OUTLINE_CLEARANCE = 5.0
 """Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
-_HIDDEN = "hidden behind another leg or outside the photograph"
+OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
@@ -359,7 +359,7 @@ def _searched(
     rejected = [
         Rejection(photographs.station, int(photographs.configuration[k]), int(leg), -1, -1, why)
         for k, leg in zip(*np.nonzero(~places.clear), strict=True)
-        for why in [_HIDDEN if places.share[k, leg] < 0.1 else _NO_PLACE]
+        for why in [OUT_OF_SIGHT_REASON if places.share[k, leg] < 0.1 else _NO_PLACE]
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
@@ -559,7 +559,7 @@ def _rejections(
     out: list[Rejection] = []
     for k, e in zip(*np.nonzero(~fits.good), strict=True):
         if visible[k, e] == 0:
-            why = _HIDDEN
+            why = OUT_OF_SIGHT_REASON
         elif seen[k, e] < FEWEST_PLACES_FOR_TILT <= (seen + mirrored)[k, e]:
             why = "a highlight lies along it, and hides where the leg ends"
         elif seen[k, e] < FEWEST_PLACES_FOR_TILT:
