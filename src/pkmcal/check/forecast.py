@@ -157,7 +157,7 @@ def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
         numbered(look.session.camera_of_station[[s.photographs.station for s in stations]]),
         look.session.joint_noise,
         tuple(
-            LegsFrom(k, s.photographs.camera.binned(s.photographs.binning), T, pools)
+            LegsFrom(k, s.photographs.camera, T, pools, s.photographs.binning)
             for k, (s, T, pools) in enumerate(seen)
         ),
         shading=first.estimate.statistics.shading,

@@ -59,12 +59,15 @@ def nominal_pools(machine: Machine, sigma: float = NOMINAL_EDGE_SIGMA) -> Pools:
 
 @dataclass(frozen=True)
 class LegsFrom:
-    """The legs seen by a camera at T_camera_base (4, 4). pools : what its edges tell."""
+    """The legs seen by a camera at T_camera_base (4, 4). pools : what its edges tell. binning : how
+    many pixels across, and down, are one where these are looked for.
+    """
 
     station: int
     camera: Camera
     T_camera_base: Array
     pools: Pools
+    binning: int = 1
 
     def measure(self, at: At, rows: Integers, rng: np.random.Generator | None, /) -> EdgeSet:
         """Edges of the legs. rng : draws how good each turns out; without it each is as good as
@@ -74,7 +77,7 @@ class LegsFrom:
         edges, _ = simulate_edges(
             at.machine,
             self.T_camera_base[None],
-            self.camera,
+            self.camera.binned(self.binning),
             at.T_base_platform,
             EXACT_EDGE_NOISE,
             np.random.default_rng(FIRST_EDGES_SEED),

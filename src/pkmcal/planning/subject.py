@@ -157,7 +157,10 @@ def of_machine(
     if board is None:
         check_tubes(machine, "legs")
         pools = nominal_pools(machine, edge)
-        instruments = tuple(LegsFrom(s, _eye(camera), T, pools) for s, (camera, T) in placed)
+        instruments = tuple(
+            LegsFrom(s, camera, T, pools, first_binning(camera.image_size))
+            for s, (camera, T) in placed
+        )
         mounts, T_mount = (), None
         what = f"edges of legs to {edge:g} px"
     else:
@@ -295,10 +298,11 @@ def _rig(
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
-        eyes, pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
+        pixels, pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
         words.append(told)
-        for s, eye, pool in zip(legs, eyes, pools, strict=True):
-            instruments.append(LegsFrom(s, eye, T_camera_base[s], pool))
+        for s, binning, pool in zip(legs, pixels, pools, strict=True):
+            camera = session.stations[s].camera
+            instruments.append(LegsFrom(s, camera, T_camera_base[s], pool, binning))
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         place = _saved_target(saved, table.name)
         mounts.append(Mount(table.name, "platform"))
@@ -397,8 +401,10 @@ def _places(
 
 def _edge_noise(
     session: Session, legs: list[int], seen: _Photographed, T_camera_base: Array, edge: float
-) -> tuple[tuple[Camera, ...], tuple[Pools, ...], float, str]:
-    """What each station's edges tell in whose pixels, the shading, and where that comes from."""
+) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
+    """How many pixels are one where each station's edges are looked for, what these tell, the
+    shading, and where that comes from.
+    """
     why = "no photograph tells it yet"
     if len(seen.photographs) == len(legs):
         rows = [
@@ -414,16 +420,12 @@ def _edge_noise(
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
-            eyes = tuple(p.camera.binned(p.binning) for p in seen.photographs)
-            return eyes, first.pools, first.estimate.statistics.shading, words
-    eyes = tuple(_eye(session.stations[s].camera) for s in legs)
+            pixels = tuple(p.binning for p in seen.photographs)
+            return pixels, first.pools, first.estimate.statistics.shading, words
+    # how sharp they will be nobody has seen
+    pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
     pools = (nominal_pools(session.machine, edge),) * len(legs)
-    return eyes, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
-
-
-def _eye(camera: Camera) -> Camera:
-    """A camera as its photographs are looked at for edges; how sharp it is, nobody has seen."""
-    return camera.binned(first_binning(camera.image_size))
+    return pixels, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
