@@ -329,6 +329,7 @@ def test_a_calibration_gives_machine_camera_and_place(demo):
     there = saved.stations[0].T_base_camera
     np.testing.assert_allclose(inverse(loop.seen.T_camera_base), there, atol=1e-12)
     assert loop._sight.edge_shift == saved.document["cameras"][0]["edge_shift"]
+    assert loop._sight.binning == saved.document["stations"][0]["binning"]
     with pytest.raises(InputError, match="no such station"):
         VisualServo.from_calibration(demo.calibration, "nowhere", goal)
 

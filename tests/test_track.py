@@ -24,6 +24,7 @@ from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
 from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
 
@@ -79,7 +80,8 @@ def test_large_photographs_are_binned():
     camera = replace(PERSPECTIVE, image_size=(1920, 1440), parameters=larger)
     truth, outward = true_edges(seen_machine(MACHINE, BESIDE), AT), []
     for picture, eye, shift in ((small, PERSPECTIVE, 0.2), (image, camera, 0.6)):
-        sight = Sight(seen_machine(MACHINE, BESIDE), eye, shift)
+        seen, pixels = seen_machine(MACHINE, BESIDE), first_binning(eye.image_size)
+        sight = Sight(seen, eye, shift, pixels)
         at = track(sight, first_track_state(sight.seen), picture, READINGS)
         assert at.found.sum() >= 5
         outward.append(np.sum(at.lines.basis[..., 0] * (at.lines.normal - truth), axis=-1) / PIXEL)

@@ -50,6 +50,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.observe.legs import first_binning
 from pkmcal.wording import named
 
 __all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
@@ -99,7 +100,9 @@ class VisualServo:
     legs : (s,) seen legs from 0, all with tubes unless given. start : (4, 4) a pose near which the
     machine stands at first, its home unless given: it decides which assembly is meant.
     tolerance : m or rad of a reading, at the goal. period : s between samples, to foresee the end
-    of a motor's range. edge_shift : px, as calibrated. Raises InputError for what cannot be.
+    of a motor's range. edge_shift : px of a photograph, as calibrated. binning : how many of its
+    pixels across, and down, are one where edges are looked for; about as many as leave 1024 along
+    its longer side unless given. Raises InputError for what cannot be.
     """
 
     def __init__(
@@ -117,6 +120,7 @@ class VisualServo:
         tolerance: float = GOAL_READING_TOLERANCE,
         period: float = 0.0,
         edge_shift: float = 0.0,
+        binning: int | None = None,
     ) -> None:
         law_named(law)
         _check_positive("gain", gain)
@@ -125,7 +129,10 @@ class VisualServo:
         self.tolerance, self.period = tolerance, period
         self.seen = seen_machine(machine, np.asarray(T_camera_base, dtype=float), legs)
         self.rate_limits = _limits(machine, rate_limits)
-        self._sight = None if camera is None else Sight(self.seen, camera, edge_shift)
+        self._sight: Sight | None = None
+        if camera is not None:
+            pixels = binning or first_binning(camera.image_size)
+            self._sight = Sight(self.seen, camera, edge_shift, pixels)
         self._ranges = machine.joint_ranges
         self._parts: dict[bytes, SeenMachine] = {}
         self.goal: Goal = goal_of(self._sight, self.seen, goal)
@@ -176,6 +183,8 @@ class VisualServo:
         file = next(s.camera for s in saved.stations if s.name == station)
         shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document.get("cameras", [])}
         options.setdefault("edge_shift", shifts.get(file, 0.0))
+        pixels = {s["name"]: s.get("binning") for s in saved.document.get("stations", [])}
+        options.setdefault("binning", pixels.get(station))
         T_camera_base = inverse(source.T_base_camera[station])
         return cls(source.machine, source.cameras[station], T_camera_base, goal, **options)
 

@@ -25,7 +25,6 @@ from pkmcal.observe.legs import (
     OUT_OF_SIGHT_REASON,
     Photographs,
     StationEdges,
-    first_binning,
     measure,
     search,
 )
@@ -35,8 +34,9 @@ SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 assembly that was expected: a camera placed by hand is right to a few degrees, other assemblies
 lie tens of degrees away."""
 SHADING_EDGE_SHIFT = 0.1
-"""Pixels by which a whole edge may lie off, whatever its own sigma: shading that the edge model
-leaves out (docs/observation.md measures 0.14 and 0.22 px a place)."""
+"""Pixels, of those in which edges are looked for, by which a whole edge may lie off, whatever its
+own sigma: shading that the edge model leaves out (docs/observation.md measures 0.14 and 0.22 px a
+place)."""
 LEG_ENDS_ASIDE_SIGMA = 0.1
 """Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
 it keeps the line of a leg with one edge finite until that leg is found to be lost."""
@@ -249,22 +249,24 @@ def corrected_pose(
 class Sight:
     """What is looked at: the machine as believed, in the camera that stands before it.
 
-    edge_shift : px by which all edges lie outward of where they should, as calibrated.
+    edge_shift : px by which all edges lie outward of where they should, as calibrated. binning :
+    how many pixels across, and down, are one where they are looked for.
     """
 
     seen: SeenMachine
     camera: Camera
     edge_shift: float = 0.0
+    binning: int = 1
 
     def photograph(self, image: Integers, readings: Array) -> Photographs:
-        """A photograph as its edges are looked for: of a large one, some pixels are one."""
-        station, binning = np.zeros(1, dtype=int), first_binning(self.camera.image_size)
-        one = Photographs(0, self.camera, station, readings[None], [image], binning=binning)
+        """A photograph as its edges are looked for."""
+        station = np.zeros(1, dtype=int)
+        one = Photographs(0, self.camera, station, readings[None], [image], binning=self.binning)
         return one.binned()
 
     def misfits(self, readings: Array, T_base_platform: Array, edges: EdgeSet) -> EdgeMisfits:
-        """The :func:`edge_misfits` of edges found in one, whose pixels are the binned ones."""
-        shift = self.edge_shift / first_binning(self.camera.image_size)
+        """The :func:`edge_misfits` of edges found in one."""
+        shift = self.edge_shift / self.binning
         return edge_misfits(self.seen, readings, T_base_platform, edges, shift)
 
 
