@@ -38,6 +38,8 @@ has to tell more: of two configurations that are nearly alike, what the drawing 
 Of simulated machines exchanged ones told 0.2 to 2 times as much, right ones up to 0.03."""
 NAMING_ROUNDS = 3
 """Rounds of names for photographs, and of the pose that these tell."""
+FEW_ASKED = 4
+"""Photographs of which all hypotheses about the readings are asked."""
 HYPOTHESES_SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
 ENOUGH_PHOTOGRAPHS_ALONE, USUAL_PHOTOGRAPHS = 4, 15
@@ -171,17 +173,24 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     begin = np.array(starts).reshape(-1, 4, 4)
     hypotheses = list(_hypotheses(station))
     shown = [h.readings for h in hypotheses if h.readings is not None]
-    own, *evidence = evidence_nearby(view, np.stack([view.joints, *shown]), begin, wide, rng)
+    few, every = view.few(FEW_ASKED), view.few(len(view.configuration))
+    own, *evidence = evidence_nearby(view, np.stack([view.joints, *shown]), begin, wide, few, rng)
     for h in hypotheses[len(evidence) :]:  # other legs, with the same readings
         other = h.view()
-        evidence.append(evidence_nearby(other, other.joints[None], begin, wide, rng)[0])
-    # where the machine is as the user says, another word has to be better there at once
-    likely = [k for k, e in enumerate(evidence) if e > own or station.elsewhere]
-    likely.sort(key=lambda k: -evidence[k])
-    best = [hypotheses[k] for k in likely[:HYPOTHESES_SEARCHED]]
+        evidence.append(evidence_nearby(other, other.joints[None], begin, wide, few, rng)[0])
+    best = np.argsort(np.negative(evidence))[:HYPOTHESES_SEARCHED]
+    if not station.elsewhere:
+        # where the machine is as the user says, another word has to be better there at once, of few
+        # photographs, any of which another may fit better by chance, and of all
+        best = [k for k in best if evidence[k] > own]
+        if best:
+            asked = np.stack([view.joints, *(shown[k] for k in best)])
+            own, *evidence = evidence_nearby(view, asked, begin, wide, every, rng)
+            best = [k for k, e in zip(best, evidence, strict=True) if e > own]
+    likely = [hypotheses[k] for k in best]
     others = list(_other_photographs(station))
-    asked = len(hypotheses) + len(others)
-    return _likelier(station, [*others, *best], in_order, rng, asked)
+    tried = len(hypotheses) + len(others)
+    return _likelier(station, [*others, *likely], in_order, rng, tried)
 
 
 def _likelier(

@@ -119,7 +119,8 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    halves = FEWEST_FOR_HALVES if T_camera_base is None else FEWEST_FOR_HALVES_TOLD
+    told = T_camera_base is not None
+    halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
@@ -129,7 +130,7 @@ def find_station(
         found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
-        if _by_chance(surely) < BY_CHANCE / EARLY_DECISION_FACTOR:
+        if _by_chance(surely) < (BY_CHANCE_TOLD if told else BY_CHANCE) / EARLY_DECISION_FACTOR:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
@@ -140,7 +141,7 @@ def find_station(
     order = order[without_shadows(candidates[order], light)]
     first = np.cumsum([0, *(len(found) for found in kept)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
-    if parts and T_camera_base is None and confirmed >= BY_CHANCE:
+    if parts and not told and confirmed >= BY_CHANCE:
         confirmed = min(confirmed, _asked_again(view, candidates[order], parts, rng))
     order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
@@ -156,7 +157,7 @@ def find_station(
         evidence=float(evidence[0]),
         by_chance=confirmed,
         second=_second(evidence, each),
-        told=T_camera_base is not None,
+        told=told,
         grain=each,
     )
 
@@ -248,14 +249,18 @@ def _best(
 
 
 def evidence_nearby(
-    view: StationView, readings: Array, starts: Array, wide: bool, rng: np.random.Generator
+    view: StationView,
+    readings: Array,
+    starts: Array,
+    wide: bool,
+    few: Integers,
+    rng: np.random.Generator,
 ) -> Array:
-    """What a short search from poses (S, 4, 4) finds in a few photographs with each of several
-    readings (N, K, m) of them, (N,); from none, anywhere.
+    """What a short search from poses (S, 4, 4) finds in some photographs, ``few``, with each of
+    several readings (N, K, m) of all, (N,); from none, anywhere.
 
     wide : look about the starts first, as about a pose by hand.
     """
-    few = view.few(4)
     shown = readings if not len(starts) else readings[:, few]
     found = view.machine.forward_result(shown.reshape(-1, shown.shape[-1])).T_base_platform
     legs = view.legs_at(found.reshape(*shown.shape[:2], 4, 4), shown)
