@@ -259,7 +259,7 @@ MISTAKES: dict[str, Mistake] = {
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
     "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
     "diameters": Mistake(_radii, ("look like diameters",)),
-    "millimetres": Mistake(_millimetres, ("range",)),
+    "millimetres": Mistake(_millimetres, ("look like millimetres",)),
     "another machine": Mistake(_another, ("not recognised",)),
     "stations exchanged": Mistake(_stations, ("are mixed up",)),
 }
