@@ -121,6 +121,8 @@ def find_station(
     number = np.arange(count)
     told = T_camera_base is not None
     halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
+    # what is compared with thirty others has to be recognised the more surely
+    limit = BY_CHANCE_TOLD if told and not closely else BY_CHANCE
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
@@ -130,7 +132,7 @@ def find_station(
         found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
-        if _by_chance(surely) < (BY_CHANCE_TOLD if told else BY_CHANCE) / EARLY_DECISION_FACTOR:
+        if _by_chance(surely) < limit / EARLY_DECISION_FACTOR:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
