@@ -13,6 +13,7 @@ from pkmcal.calibration.chance import MOVED_ASIDE, chance_doubt
 from pkmcal.calibration.turns import Turns
 from pkmcal.measurements import Observation
 from pkmcal.observe.legs import OUT_OF_SIGHT_REASON, measure
+from pkmcal.observe.profiles import USUAL_BLUR
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
@@ -57,3 +58,20 @@ def test_nothing_is_asked_where_most_were_measured(monkeypatch):
 
     monkeypatch.setattr(chance, "_count", asked)
     assert chance_doubt(turns_of(taken())) == ()
+
+
+def test_repeats_count_once():
+    """Aside as where the machine is: what was measured is told after repeats were averaged."""
+    once = aside(taken(), 2.5 * MOVED_ASIDE)
+    twice = once.select(np.repeat(np.arange(len(once.images)), 2))
+    turns = turns_of(once)._replace(blur={0: USUAL_BLUR})
+    assert chance_doubt(turns._replace(photographs=[twice])) == chance_doubt(turns) != ()
+
+
+def test_chance_that_offers_more_is_told_in_words(monkeypatch):
+    """A chance of a half or more is not "once in 1 times"."""
+    few = turns_of(aside(taken(), 2.5 * MOVED_ASIDE))
+    counts = iter([9, 8, 10, 9, 9, 8, 10, 9, 9])
+    monkeypatch.setattr(chance, "_count", lambda *_: next(counts))
+    (why,) = chance_doubt(few)
+    assert "chance offers as many as a rule" in why

@@ -105,6 +105,11 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def how_often(probability: float) -> str:
+    """``once in 30 times``, or ``as a rule``."""
+    return f"once in {1 / probability:.0f} times" if probability < 0.5 else "as a rule"
+
+
 def percent(share: float) -> str:
     """A share as whole percent, never rounded up to a certainty it has not."""
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"

@@ -16,7 +16,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.turns import FEW_MEASURED, Turns
 from pkmcal.observe import legs
+from pkmcal.observe.repeats import combined
 from pkmcal.observe.stations import BY_CHANCE
+from pkmcal.wording import how_often
 
 MOVED_ASIDE = 2 * legs.LEG_SEARCH_REACH
 """Pixels by which the picture is moved: further than legs were looked for."""
@@ -48,7 +50,7 @@ def chance_doubt(turns: Turns) -> tuple[str, ...]:
     return (
         f"Of {in_sight} edges in sight only {measured} were measured where the machine has"
         f" them, and about {mean:.0f} are where nothing of it is, {MOVED_ASIDE:.0f} px aside:"
-        f" chance offers as many once in {1 / chance:.0f} times. So this may not be the machine in"
+        f" chance offers as many {how_often(chance)}. So this may not be the machine in"
         " the photographs, or hardly anything of it shows: check the drawing, the order of its"
         " legs, and the photographs' names; `pkmcal check` shows the drawing laid over them.",
     )
@@ -67,5 +69,5 @@ def _count(turns: Turns, aside: Array) -> int:
             state.T_base_platform[p.configuration],
             turns.blur.get(p.station),
         )
-        total += len(look.edges)
+        total += len(combined(look).edges)  # as those that were measured
     return total

@@ -22,7 +22,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.evidence import StationView, evidence_by_name, evidence_from, settled
 from pkmcal.observe.stations import FoundStation, evidence_nearby, find_station
-from pkmcal.wording import listed
+from pkmcal.wording import how_often, listed
 
 DIAGNOSIS_LOG_ODDS = math.log(30 / 0.05)
 """Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
@@ -132,8 +132,8 @@ def _little(station: SeenStation) -> str:
     count = len(station.view.configuration)
     if count < 2:
         return "one photograph alone, and none to confirm what it seems to show"
-    often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
     few = f"{count} photographs alone, and " if count < ENOUGH_PHOTOGRAPHS_ALONE else ""
+    often = how_often(found.by_chance)
     return f"{few}legs that readings of other configurations fit as well {often}"
 
 
