@@ -12,7 +12,7 @@ from pkmcal.calibration.recognise import platform_poses, read_photographs, recog
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import stations
-from pkmcal.observe.evidence import StationView
+from pkmcal.observe.evidence import StationView, score
 from pkmcal.observe.legs import LEG_SEARCH_REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
@@ -217,6 +217,28 @@ def test_one_photograph_says_where_but_not_that_it_is_the_machine():
         found = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
         assert misplaced(found.T_camera_base) < 5
         assert not found.good
+
+
+@pytest.mark.parametrize("seed", [2, *(often(seed) for seed in (0, 1, 3))])
+def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
+    """Though a place beside the right one is confirmed by photographs as well."""
+    rough = rough_pose(seed, 30.0, 0.3)
+    found = find_station(view_of(images()), rough, np.random.default_rng(seed))
+    assert found.good
+    assert misplaced(found.T_camera_base) < 5
+
+
+def test_edges_behind_the_camera_count_as_not_found():
+    """A camera that has no leg before it, or half of them, does not fit the better for it."""
+    view = view_of(images())
+    every = np.arange(len(images()))
+    turned = pose(rotation(np.array([0.0, np.pi, 0.0])), np.zeros(3)) @ FRONT
+    among = FRONT.copy()
+    among[2, 3] = 0.0
+    right, behind, half = score(view, np.stack([FRONT, turned, among]), every, 8)
+    assert right < 0.3
+    assert behind == 1
+    assert half > 0.8
 
 
 def test_a_drawing_that_is_2_mm_wrong_is_recognised():

@@ -28,7 +28,7 @@ DIAGNOSIS_LOG_ODDS = math.log(30 / 0.05)
 """Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
 another."""
 NEAR_SEARCH_TURN = np.radians(15.0)
-"""Turn from the pose by hand beyond which the search about it would not have come there."""
+"""Turn from the pose by hand beyond which hypotheses are looked for about that, too."""
 FOUND_ELSEWHERE_TURN = np.radians(45.0)
 """Turn from the pose by hand beyond which the machine was found where the user does not see it: a
 machine of three or six equal parts looks the same from there."""
@@ -120,7 +120,7 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         )
         + " that these photographs show this machine's legs, that each bears the name"
         " of its configuration, and that the drawing is this machine's"
-        + ("" if worst.by_hand is not None else "; a pose by hand, right to 10 cm, may help"),
+        + ("" if worst.by_hand is not None else "; a pose by hand, right to 20 cm, may help"),
     )
 
 

@@ -158,7 +158,8 @@ def distinct_silhouettes(view: StationView, candidates: Array, photographs: Inte
 def score(
     view: StationView, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
 ) -> Array:
-    """Mean distance from predicted edges to picture edges, cut off at ``reach``: (H,), 0 to 1.
+    """Mean distance from predicted edges to picture edges, cut off at ``reach``: (H,), 0 to 1,
+    which edges behind the camera count as.
 
     T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
     between their ends, which is exact for a pinhole and near enough for this search elsewhere.
@@ -185,7 +186,8 @@ def score(
     cost = np.where(inside & ok, np.minimum(found, reach) / reach, 1.0).mean(axis=0)
     weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
     total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
-    return np.sum(cost * weight, axis=(1, 2)) / total
+    before = np.mean(weight > 0, axis=(1, 2))  # or a camera among the legs would fit at once
+    return before * (np.sum(cost * weight, axis=(1, 2)) / total) + (1 - before)
 
 
 class _Mixture(NamedTuple):

@@ -35,21 +35,23 @@ from pkmcal.observe.evidence import (
 from pkmcal.observe.places import anywhere
 from pkmcal.observe.shadows import lightness, without_shadows
 
-SEARCH_ANGLE = np.radians(6.0)
-SEARCH_DISTANCE = 0.06
-"""Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
-is 10 degrees and 10 cm."""
-POSES_TRIED = 800
-FEWER_TRIES = 160
-"""Poses tried where one of thirty hypotheses is looked at."""
+SEARCH_SPREAD = np.repeat([np.radians(15.0), 0.15], 3)
+"""Spread (rad and m) of the poses tried around the user's: its norm over three axes is 26 degrees
+and 26 cm. A place that fits about a pose that is wrong by more than was searched is not known from
+the right one: before clutter its photographs confirm it."""
+POSES_TRIED, POSES_DESCENDING = 3200, 48
+"""Of poses that are 30 degrees and 30 cm off, 97 of 100 lead to the right place."""
+FEWER_SPREAD, FEWER_TRIES, FEWER_DESCENDING = SEARCH_SPREAD * 0.4, 160, 8
+"""Where one of thirty hypotheses is looked at."""
 POSES_A_CLOSER_LOOK = 8
 """One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
 ANYWHERE_POSES_DESCENDING, ANYWHERE_POSES_KEPT = 1200, 300
 """Poses from all round the machine that descend, and how many of them go on: before a descent the
 pictures hardly tell which is near, least of all of three legs that are alike."""
+SHAKEN_SPREAD = np.repeat([np.radians(2.0), 0.02], 3)
 SHAKEN_POSES_TRIED, SHAKEN_POSES_KEPT = 48, 16
-"""Poses beside the best ones that are tried before the last descent, and of how many two steps have
-shown that they may be the best."""
+"""Poses beside the best ones that are tried before the last descent, how far (rad and m) from
+these, and of how many two steps have shown that they may be the best."""
 LIKELIEST_PLACES_SETTLED = 4
 """Of the likeliest places, where all are one, those that are settled without a look beside them."""
 NEARBY_PLACES_SETTLED = 8
@@ -57,9 +59,10 @@ NEARBY_PLACES_SETTLED = 8
 FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
 each in its turn. About a known pose two are enough to be searched."""
-EARLY_DECISION_FACTOR = 10.0
-"""Times less than the probability asked for, by some of the photographs, at which the others need
-not be asked."""
+EARLY_DECISION, EARLY_DECISION_TOLD = 1e-4, 1e-6
+"""Probability by chance, of some of the photographs, at which the others need not be searched. A
+search about a pose by hand sees less, and may end beside the right place, where cluttered
+photographs confirm it to one in ten thousand."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 """Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
 where it was looked for about a pose by hand, which says much the same already."""
@@ -121,8 +124,7 @@ def find_station(
     number = np.arange(count)
     told = T_camera_base is not None
     halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
-    # what is compared with thirty others has to be recognised the more surely
-    limit = BY_CHANCE_TOLD if told and not closely else BY_CHANCE
+    enough = EARLY_DECISION_TOLD if told else EARLY_DECISION
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
@@ -132,7 +134,7 @@ def find_station(
         found = _search(view.select(searched), T_camera_base, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
-        if _by_chance(surely) < limit / EARLY_DECISION_FACTOR:
+        if _by_chance(surely) < enough:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
     every = view.few(count)
@@ -175,7 +177,9 @@ def _search(
         candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
         candidates = _best(view, candidates, few, reach=8, keep=each * ANYWHERE_POSES_KEPT)
     else:
-        candidates = _random_search(view, T_camera_base, rng)
+        candidates = _random_search(
+            view, T_camera_base, rng, SEARCH_SPREAD, POSES_TRIED, POSES_DESCENDING
+        )
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
@@ -200,8 +204,7 @@ def _best_about(
     candidates = candidates[distinct_silhouettes(view, candidates, photographs)[:4]]
     # the picture is rugged: what lies beside a good place may be better
     beside = candidates[rng.integers(0, len(candidates), SHAKEN_POSES_TRIED)]
-    spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
-    steps = rng.normal(size=(SHAKEN_POSES_TRIED, 6)) * spread
+    steps = rng.normal(size=(SHAKEN_POSES_TRIED, 6)) * SHAKEN_SPREAD
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
     candidates, evidence = settle_by_evidence(
         view, np.concatenate([candidates, turned]), photographs, 3, 2
@@ -218,10 +221,16 @@ def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
 
 
 def _random_search(
-    view: StationView, T_camera_base: Array, rng: np.random.Generator, tries: int = POSES_TRIED
+    view: StationView,
+    T_camera_base: Array,
+    rng: np.random.Generator,
+    spread: Array,
+    tries: int,
+    kept: int,
 ) -> Array:
-    """Candidates (16, 4, 4): a wide random draw, then a narrower one around its best."""
-    spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3)
+    """Candidates (kept, 4, 4): a wide random draw, by ``spread`` (6,) rad and m, then a narrower
+    one around its best.
+    """
     T_base_camera = inverse(T_camera_base)
 
     def moved(steps: Array) -> Array:
@@ -237,10 +246,10 @@ def _random_search(
 
     steps = rng.normal(size=(tries, 6)) * spread
     steps[0] = 0.0
-    best = likely(steps, 12, 60)
+    best = likely(steps, 12, 4 * kept)
     again = best[rng.integers(0, len(best), tries // 2)]
     again = again + rng.normal(size=again.shape) * (0.45 * spread)
-    return moved(likely(np.concatenate([best, again]), 10, 16))
+    return moved(likely(np.concatenate([best, again]), 10, kept))
 
 
 def _best(
@@ -291,7 +300,10 @@ def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Gener
     """
     if not len(starts):
         return _best(view, _anywhere(view, few, FEWER_TRIES), few, reach=12, keep=16)
-    return np.concatenate([_random_search(view, T, rng, FEWER_TRIES)[:8] for T in starts])
+    near = (
+        _random_search(view, T, rng, FEWER_SPREAD, FEWER_TRIES, FEWER_DESCENDING) for T in starts
+    )
+    return np.concatenate(list(near))
 
 
 def _surely(
