@@ -125,14 +125,17 @@ def test_what_nothing_shades_keeps_the_least():
     assert off(result, truth) < 1.15
 
 
-def test_a_tube_that_nobody_saw_keeps_what_is_stated():
+@pytest.mark.parametrize(("seen", "other"), [(0, 1), (1, 0)])
+def test_a_tube_that_nobody_saw_keeps_what_is_stated(seen, other):
     rng = np.random.default_rng(11)
     scene = shaded(rng, 0.1, runs=1)
     measurements = scene.measurements(rng)
-    first = replace(measurements, edges=measurements.edges.select(measurements.edges.tube == 0))
-    noise = bundle(scene.machine, first, scene.state()).edge_noise
-    assert noise.scale[0] != 1
-    assert (noise.scale[1], noise.shading[1], noise.tails[1]) == (1, OWN_SHADING, np.inf)
+    there = measurements.edges.tube == seen
+    alone = replace(measurements, edges=measurements.edges.select(there))
+    noise = bundle(scene.machine, alone, scene.state()).edge_noise
+    assert noise.scale[seen] != 1
+    assert (noise.scale[other], noise.shading[other]) == (1, OWN_SHADING)
+    assert noise.tails[other] == np.inf
 
 
 def test_a_crowd_is_the_sum_over_its_line():

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 import pkmcal
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.responses import ResponseTold
+from pkmcal.calibration.recognise import read_photographs
+from pkmcal.calibration.responses import ResponseTold, told_by_edges
 from pkmcal.calibration.saved import load
 from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError
@@ -173,6 +174,21 @@ def test_the_edges_overrule_what_is_usual_for_png_files(demo, coded):
 def test_the_edges_overrule_what_is_usual_for_jpeg_files(demo, session):
     recode(session, ".jpg")
     check_overruled(calibrate_session(session), "linear", "srgb", demo)
+
+
+def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
+    """In the dark the wrong one leaves three of a hundred, which say nothing, and that says it."""
+    few = calibrated.measurements.edges.select(np.arange(3))
+    told = told_by_edges(
+        calibrated.session,
+        read_photographs(calibrated.session),
+        calibrated.measurements,
+        calibrated.estimate,
+        lambda _: few,
+        lambda _: few,
+        lambda edges: replace(calibrated.measurements, edges=edges),
+    )
+    assert told == ()
 
 
 def test_a_stated_response_is_not_asked_about(session):

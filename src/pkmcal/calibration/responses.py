@@ -32,6 +32,8 @@ wrong response by four standard deviations, even on metal."""
 LEAST_RESPONSE_GAIN, MOST_WAY_DEVIATION = 2.7, 0.1
 """chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
 from which a response that is wrong would not show by so much."""
+LEAST_FOUND_OTHERWISE = 0.5
+"""Share of the edges that a response has to find, of those by the usual one, to be right."""
 ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
 """Odds from which the edges overrule what is usual for files of a kind; and from which what is
 usual needs no caution."""
@@ -123,15 +125,19 @@ def told_by_edges(
         ]
         if not doubted:
             return ()
-        every = {camera: measured(_otherwise(usual[camera])) for camera in doubted}
-        there, _ = _scored(measurements, estimate, every)
         edges = measurements.edges
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in doubted}
-        stay = ~np.any(list(own.values()), axis=0)
+        every = {camera: measured(_otherwise(usual[camera])) for camera in doubted}
+        # in the dark a wrong response leaves hardly an edge
+        every = {x: e for x, e in every.items() if len(e) > LEAST_FOUND_OTHERWISE * own[x].sum()}
+        if not every:
+            return ()
+        there, _ = _scored(measurements, estimate, every)
+        stay = ~np.any([own[camera] for camera in every], axis=0)
         new = concatenate([edges.select(stay), *every.values()])
         otherwise = of_edges(new.select(np.argsort(new.station, kind="stable")))
         ended = bundle(estimate.machine, otherwise, estimate.state)
-        before = {camera: edges.select(mine) for camera, mine in own.items()}
+        before = {camera: edges.select(own[camera]) for camera in every}
         back, _ = _scored(otherwise, ended, before)
     except PkmcalError:  # nothing, or too little, is found by the other
         return ()
@@ -141,7 +147,7 @@ def told_by_edges(
             camera[1],
             there[camera] - back[camera],
         )
-        for camera in doubted
+        for camera in every
     ]
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
 

@@ -62,6 +62,9 @@ that has settled: the second look moves it
 by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
 a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
 and each look moves the machine by four or more."""
+SETTLED_AT_ONCE = 1.0
+"""The same of a second look that nothing follows: after one that moves the machine by more, another
+leaves a quarter of what the way there still makes of it."""
 SETTLED_EDGE_DISTANCE = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
@@ -194,10 +197,11 @@ def take_turns(
                 blur = {}
                 continue
         usual = moved < SETTLED_EDGE_DISTANCE and not cameras.active
-        if usual or turn + 1 >= MOST_EDGE_LOOKS:
+        last = turn + 1 >= MOST_EDGE_LOOKS
+        if usual or last:
             away = (estimate.state.theta - before.state.theta)[None]
             change = float(np.sqrt(_variance(away, measurements, estimate)))
-            if change < SETTLED_MACHINE_CHANGE:
+            if change < (SETTLED_MACHINE_CHANGE if last else SETTLED_AT_ONCE):
                 finer = _binned(session, photographs, blur, more=False)
                 if not finer or turn + 1 == MOST_LOOKS_ASTRAY:
                     break

@@ -50,8 +50,8 @@ class EdgeScatter:
         """By how much more or less each edge counts than on average, (B, K, G), where the squares
         of its whitened residuals are (B, K, G).
         """
-        tails = self.tails[:, blocks.tube]
-        return (tails + NUMBERS_AN_EDGE) / (tails + square * worth(tails))
+        tails = self.tails[:, blocks.tube]  # infinite of normal ones
+        return (1 + NUMBERS_AN_EDGE / tails) / (1 + square * worth(tails) / tails)
 
     def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
         """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
