@@ -15,10 +15,11 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
-from pkmcal.calibration.turns import _scatter_of, _variance
+from pkmcal.calibration.turns import Turns, _scatter_of, _variance, looked_again
 from pkmcal.check import check
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.alone import finest_view, likeliest_near
@@ -167,11 +168,10 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
 def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
     """Machines that scatter as noise lets them have one, twice as far apart they have four."""
     calibration = calibrate_session(beside[0].parent / "tripod")
-    assert calibration.measurements.look_variance == 0  # painted, and from one place
-    measurements, estimate = calibration.measurements, calibration.estimate
-    again = bundle(
-        calibration.session.machine, replace(measurements, look_variance=1.0), estimate.state
-    )
+    machine, state = calibration.session.machine, calibration.estimate.state
+    measurements = replace(calibration.measurements, look_variance=0.0)
+    estimate = bundle(machine, measurements, state)
+    again = bundle(machine, replace(measurements, look_variance=1.0), state)
     n = len(estimate.state.theta)
     noise = (again.joint_covariance - estimate.joint_covariance)[:n, :n]
     value, vectors = np.linalg.eigh(noise)
@@ -180,6 +180,22 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
     changes = drawn - estimate.state.theta
     assert _variance(changes, measurements, estimate) == pytest.approx(1, rel=0.1)
     assert _variance(2 * changes, measurements, estimate) == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize(("times", "asked"), [(0.9, False), (1.1, True)])
+def test_painted_legs_on_a_tripod_are_not_looked_for_again(beside, monkeypatch, times, asked):
+    calibration = calibrate_session(beside[0].parent / "tripod")
+    estimate, start = calibration.estimate, calibration.estimate.state
+    shading = np.full_like(estimate.edge_noise.shading, times * POLISHED_SHADING)
+    shaded = replace(estimate, edge_noise=replace(estimate.edge_noise, shading=shading))
+    found = Turns(None, calibration.measurements, shaded, None,
+                  photographs=[SimpleNamespace(station=0)], start=start)  # fmt: skip
+    drawn = []
+    monkeypatch.setattr(turns, "_as_likely", lambda *_: drawn.append(1) or [])
+    seen = SimpleNamespace(session=calibration.session)
+    ended = looked_again(seen, found, np.random.default_rng(0), lambda *_: None)
+    assert bool(drawn) == asked
+    assert (ended is found) != asked
 
 
 @pytest.fixture(scope="module")
