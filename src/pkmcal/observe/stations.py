@@ -1,8 +1,8 @@
 """Where a station's camera stands: a coarse search for the machine in its photographs.
 
-From a rough pose many near it are tried at random; of a station without one, places all round the
-machine (:mod:`pkmcal.observe.places`). The best descend (:mod:`pkmcal.observe.evidence`) on more
-and more photographs, with distances cut off ever nearer.
+About a rough pose many are tried at random, first a few as near as the right one most often is; of
+a station without one, places all round the machine (:mod:`pkmcal.observe.places`). The best descend
+(:mod:`pkmcal.observe.evidence`) on more and more photographs, with distances cut off ever nearer.
 
 What was found is weighed. The most evidence is found in any picture, machine or not. So the place
 is searched in some of the photographs, and the others are asked: at that place, do their own
@@ -15,11 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
 from pkmcal.observe.evidence import (
     LAST_REACH,
     StationView,
@@ -35,14 +36,32 @@ from pkmcal.observe.evidence import (
 from pkmcal.observe.places import anywhere
 from pkmcal.observe.shadows import lightness, without_shadows
 
-SEARCH_SPREAD = np.repeat([np.radians(15.0), 0.15], 3)
-"""Spread (rad and m) of the poses tried around the user's: its norm over three axes is 26 degrees
-and 26 cm. A place that fits about a pose that is wrong by more than was searched is not known from
-the right one: before clutter its photographs confirm it."""
-POSES_TRIED, POSES_DESCENDING = 3200, 48
-"""Of poses that are 30 degrees and 30 cm off, 97 of 100 lead to the right place."""
-FEWER_SPREAD, FEWER_TRIES, FEWER_DESCENDING = SEARCH_SPREAD * 0.4, 160, 8
-"""Where one of thirty hypotheses is looked at."""
+
+class _About(NamedTuple):
+    """How a search goes about a pose by hand: by what spread (6,) of rad and m the poses are drawn
+    that are tried, how many these are, how many of them descend, and at what probability by
+    chance, of some of the photographs, the others need not be searched.
+    """
+
+    spread: Array
+    tried: int
+    descending: int
+    enough: float
+
+    def reaches(self, T_camera_base: Array, other: Array) -> bool:
+        """Whether another pose is no further from one, (4, 4) both, than poses drawn are."""
+        turn, shift = angle_between(T_camera_base, other), T_camera_base @ inverse(other)
+        square = (turn / self.spread[0]) ** 2 + np.sum((shift[:3, 3] / self.spread[3:]) ** 2)
+        return bool(square < len(self.spread))
+
+
+FAR = _About(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
+"""The spread's norm over three axes is 26 degrees and 26 cm; of poses that are 30 degrees and 30 cm
+off, 97 of 100 lead to the right place. A place that fits about a pose that is wrong by more than
+was searched is not known from the right one: before clutter its photographs confirm it to one in
+ten thousand."""
+NEAR = _About(FAR.spread / 3, 160, 8, 1e-3)
+"""Asked first. Where a pose is wrong by more, a search does not end so near to it by chance."""
 POSES_A_CLOSER_LOOK = 8
 """One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
 ANYWHERE_POSES_DESCENDING, ANYWHERE_POSES_KEPT = 1200, 300
@@ -54,15 +73,15 @@ SHAKEN_POSES_TRIED, SHAKEN_POSES_KEPT = 48, 16
 these, and of how many two steps have shown that they may be the best."""
 LIKELIEST_PLACES_SETTLED = 4
 """Of the likeliest places, where all are one, those that are settled without a look beside them."""
+FEW_PLACES_ANYWHERE, FEW_PLACES_KEPT = 160, 16
+"""Where one of thirty hypotheses is looked at."""
 NEARBY_PLACES_SETTLED = 8
 """Places of each of thirty hypotheses that are settled."""
 FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
 each in its turn. About a known pose two are enough to be searched."""
-EARLY_DECISION, EARLY_DECISION_TOLD = 1e-4, 1e-6
-"""Probability by chance, of some of the photographs, at which the others need not be searched. A
-search about a pose by hand sees less, and may end beside the right place, where cluttered
-photographs confirm it to one in ten thousand."""
+EARLY_DECISION = 1e-4
+"""What ``enough`` is of a search from nothing."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 """Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
 where it was looked for about a pose by hand, which says much the same already."""
@@ -120,23 +139,39 @@ def find_station(
     closely : look beside the likeliest places though they are one, as is done of searches from
     nothing, for evidence that is to be compared.
     """
+    if T_camera_base is None:
+        return _found(view, None, None, rng, closely)
+    near = _found(view, T_camera_base, NEAR, rng, closely)
+    if near.sure and NEAR.reaches(T_camera_base, near.T_camera_base):
+        return near
+    return _found(view, T_camera_base, FAR, rng, closely)
+
+
+def _found(
+    view: StationView,
+    T_camera_base: Array | None,
+    about: _About | None,
+    rng: np.random.Generator,
+    closely: bool,
+) -> FoundStation:
+    """The same by one search."""
     count = len(view.configuration)
     number = np.arange(count)
-    told = T_camera_base is not None
+    told = about is not None
     halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
-    enough = EARLY_DECISION_TOLD if told else EARLY_DECISION
+    enough = about.enough if about else EARLY_DECISION
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
     asked = [number % folds == fold for fold in range(folds if count > 1 else 0)]
     parts = [(np.flatnonzero(~part), np.flatnonzero(part)) for part in asked]  # one alone has none
     for searched, other in parts:
-        found = _search(view.select(searched), T_camera_base, rng, closely)
+        found = _search(view.select(searched), T_camera_base, about, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
         if _by_chance(surely) < enough:
             break
-    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng, closely)
+    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, about, rng, closely)
     every = view.few(count)
     candidates, evidence = settle_by_evidence(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
@@ -167,24 +202,26 @@ def find_station(
 
 
 def _search(
-    view: StationView, T_camera_base: Array | None, rng: np.random.Generator, closely: bool
+    view: StationView,
+    T_camera_base: Array | None,
+    about: _About | None,
+    rng: np.random.Generator,
+    closely: bool,
 ) -> Array:
     """Up to three places (H, 4, 4), the one with the most evidence first."""
     few, more = view.few(4), view.few(8)
-    if T_camera_base is None:
+    if T_camera_base is None or about is None:
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
         candidates = _anywhere(view, few, each * ANYWHERE_POSES_DESCENDING)
         candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
         candidates = _best(view, candidates, few, reach=8, keep=each * ANYWHERE_POSES_KEPT)
     else:
-        candidates = _random_search(
-            view, T_camera_base, rng, SEARCH_SPREAD, POSES_TRIED, POSES_DESCENDING
-        )
+        candidates = _random_search(view, T_camera_base, about, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
-    # of photographs that all took part in the descents none could disagree
-    closely = closely or T_camera_base is None or len(more) == len(few)
+    # of photographs that all took part in the descents none could disagree, but for the pose's word
+    closely = closely or about is None or (about is not NEAR and len(more) == len(few))
     if not closely and len(distinct_silhouettes(view, likelier, more)) == 1:
         others = distinct_silhouettes(view, candidates, more)[1:3]
         candidates = candidates[[*range(LIKELIEST_PLACES_SETTLED), *others]]
@@ -221,15 +258,10 @@ def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
 
 
 def _random_search(
-    view: StationView,
-    T_camera_base: Array,
-    rng: np.random.Generator,
-    spread: Array,
-    tries: int,
-    kept: int,
+    view: StationView, T_camera_base: Array, about: _About, rng: np.random.Generator
 ) -> Array:
-    """Candidates (kept, 4, 4): a wide random draw, by ``spread`` (6,) rad and m, then a narrower
-    one around its best.
+    """Candidates (``about.descending``, 4, 4): a wide random draw, then a narrower one around its
+    best.
     """
     T_base_camera = inverse(T_camera_base)
 
@@ -244,12 +276,12 @@ def _random_search(
         steps = steps[first[: max(len(steps) // POSES_A_CLOSER_LOOK, keep)]]
         return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
 
-    steps = rng.normal(size=(tries, 6)) * spread
+    steps = rng.normal(size=(about.tried, 6)) * about.spread
     steps[0] = 0.0
-    best = likely(steps, 12, 4 * kept)
-    again = best[rng.integers(0, len(best), tries // 2)]
-    again = again + rng.normal(size=again.shape) * (0.45 * spread)
-    return moved(likely(np.concatenate([best, again]), 10, kept))
+    best = likely(steps, 12, 4 * about.descending)
+    again = best[rng.integers(0, len(best), about.tried // 2)]
+    again = again + rng.normal(size=again.shape) * (0.45 * about.spread)
+    return moved(likely(np.concatenate([best, again]), 10, about.descending))
 
 
 def _best(
@@ -299,11 +331,9 @@ def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Gener
     guess.
     """
     if not len(starts):
-        return _best(view, _anywhere(view, few, FEWER_TRIES), few, reach=12, keep=16)
-    near = (
-        _random_search(view, T, rng, FEWER_SPREAD, FEWER_TRIES, FEWER_DESCENDING) for T in starts
-    )
-    return np.concatenate(list(near))
+        places = _anywhere(view, few, FEW_PLACES_ANYWHERE)
+        return _best(view, places, few, reach=12, keep=FEW_PLACES_KEPT)
+    return np.concatenate([_random_search(view, T, NEAR, rng) for T in starts])
 
 
 def _surely(
