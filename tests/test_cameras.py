@@ -352,6 +352,25 @@ def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
     assert camera.binned(1) is camera
 
 
+def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
+    """With all that its calibration told, and turned twice it is itself."""
+    _, camera = case
+    camera = replace(camera, covariance=np.diag(np.arange(1.0, len(camera.parameters) + 1)) + 0.1)
+    points, turned = seen_points(camera, 0), camera.turned_by_half()
+    upside_down = np.array(camera.image_size) - 1 - camera.project(points * [-1, -1, 1])
+    np.testing.assert_allclose(turned.project(points), upside_down, atol=1e-9, rtol=0)
+    again = turned.turned_by_half()
+    np.testing.assert_allclose(again.parameters, camera.parameters, atol=1e-12)
+    np.testing.assert_array_equal(again.covariance, camera.covariance)
+    # how the picture moves by the parameters, their deviations taken along
+    (_, own), (_, other) = (
+        c.project_jacobians(p) for c, p in ((camera, points * [-1, -1, 1]), (turned, points))
+    )
+    np.testing.assert_allclose(
+        other @ turned.covariance @ other.mT, own @ camera.covariance @ own.mT, rtol=1e-8, atol=1e-8
+    )
+
+
 @pytest.mark.parametrize(("model", "name"), [pair for pair in ALL if pair[0] in OPENCV])
 def test_opencv_agrees(model, name):
     example, camera = made(model, name)

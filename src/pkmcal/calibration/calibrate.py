@@ -43,6 +43,7 @@ from pkmcal.calibration.recognise import (
 from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
+from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bundle import as_ended
@@ -159,6 +160,11 @@ def calibrate_session(
         seen = _observe(session, seed, clock)
         try:
             turns, richer = _identify(seen, refine_camera, clock)
+            turned = upside_down(seen.session, turns)
+            if turned:
+                session = turned_round(session, turned)
+                seen = _observe(session, seed, clock)
+                turns, richer = _identify(seen, refine_camera, clock)
             # without one that was in a wrong place, another may show itself to be
             while wrong := misplaced(
                 seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
@@ -170,7 +176,7 @@ def calibrate_session(
             raise
         check_radii(seen, turns.estimate, refine_camera, seed)
         found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
-        return _judge(seen, found, method, seed, clock)
+        return _judge(seen, found, turned, method, seed, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -278,7 +284,12 @@ def _estimated(
 
 
 def _judge(
-    seen: SeenSession, found: _Identified, method: CalibrationMethod, seed: int, clock: _Clock
+    seen: SeenSession,
+    found: _Identified,
+    turned: tuple[UpsideDown, ...],
+    method: CalibrationMethod,
+    seed: int,
+    clock: _Clock,
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
@@ -331,6 +342,7 @@ def _judge(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
             *numbering_told(session),
+            *(one.sentence for one in turned),
             *(one.sentence for one in found.turns.responses if one.sure),
         ),
     )

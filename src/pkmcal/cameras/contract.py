@@ -81,13 +81,15 @@ class Camera(ABC):
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
-    own : fields of the model's file between ``center`` and ``distortion``.
+    own : fields of the model's file between ``center`` and ``distortion``. odd : names of the
+        parameters that change their sign as the picture is turned by half.
     """
 
     model: ClassVar[str]
     parameter_names: ClassVar[tuple[str, ...]]
     schema: ClassVar[type[CameraSchema]]
     own: ClassVar[tuple[str, ...]] = ()
+    odd: ClassVar[tuple[str, ...]] = ()
 
     image_size: tuple[int, int]
     parameters: Array
@@ -228,6 +230,15 @@ class Camera(ABC):
         parameters[2:4] += (1 / count - 1) / 2  # pixel centres are at integers
         size = self.image_size[0] // count, self.image_size[1] // count
         return replace(self, image_size=size, parameters=parameters, covariance=None)
+
+    def turned_by_half(self) -> Self:
+        """The camera of pictures that are turned by half, itself turned by half about its axis."""
+        sign = np.where(np.isin(self.parameter_names, self.odd), -1.0, 1.0)
+        sign[2:4] = -1.0
+        parameters = sign * self.parameters
+        parameters[2:4] += np.asarray(self.image_size) - 1.0
+        covariance = None if self.covariance is None else self.covariance * np.outer(sign, sign)
+        return replace(self, parameters=parameters, covariance=covariance)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
         """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""

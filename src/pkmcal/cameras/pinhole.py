@@ -165,6 +165,7 @@ class Pinhole(Camera):
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "k1", "k2", "p1", "p2", "k3",
     )  # fmt: skip
+    odd: ClassVar[tuple[str, ...]] = ("p1", "p2")
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""

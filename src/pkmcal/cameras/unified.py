@@ -48,6 +48,7 @@ class Unified(Camera):
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "xi", "k1", "k2", "p1", "p2",
     )  # fmt: skip
+    odd: ClassVar[tuple[str, ...]] = ("p1", "p2")
 
     @property
     def xi(self) -> float:
