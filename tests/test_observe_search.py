@@ -228,6 +228,36 @@ def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
     assert misplaced(found.T_camera_base) < 5
 
 
+@pytest.mark.parametrize(("degrees", "distance", "far"), [(5.0, 0.05, False), (14.0, 0.14, True)])
+def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degrees, distance, far):
+    """A place that is confirmed is not the station's if it is further than was looked for: so near
+    to a pose that is wrong nothing is found by chance.
+    """
+    searched, searching = [], stations._random_search
+
+    def told(view, T_camera_base, about, rng):
+        searched.append(about.tried)
+        return searching(view, T_camera_base, about, rng)
+
+    monkeypatch.setattr(stations, "_random_search", told)
+    rough = rough_pose(3, degrees, distance)
+    found = find_station(view_of(images()), rough, np.random.default_rng(3))
+    assert found.sure
+    assert misplaced(found.T_camera_base) < 5
+    assert searched[0] == stations.NEAR.tried
+    assert (stations.FAR.tried in searched) == far
+
+
+def test_a_near_pose_is_near_by_turn_and_shift_together():
+    """Its six deviations' squares are one on average; turned and shifted by a deviation along each
+    axis is the limit."""
+    step = stations.NEAR.spread * (1 - 1e-9)
+    for size, near in ((1.0, True), (1.001, False)):
+        other = inverse(inverse(FRONT) @ pose(rotation(size * step[:3]), size * step[3:]))
+        assert stations.NEAR.reaches(FRONT, other) == near
+        assert stations.NEAR.reaches(other, FRONT) == near
+
+
 def test_edges_behind_the_camera_count_as_not_found():
     """A camera that has no leg before it, or half of them, does not fit the better for it."""
     view = view_of(images())
