@@ -235,11 +235,11 @@ def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degr
     """
     searched, searching = [], stations._random_search
 
-    def told(view, T_camera_base, about, rng):
-        searched.append(about.tried)
-        return searching(view, T_camera_base, about, rng)
+    def noted(view, told, rng):
+        searched.append(told.nearness.tried)
+        return searching(view, told, rng)
 
-    monkeypatch.setattr(stations, "_random_search", told)
+    monkeypatch.setattr(stations, "_random_search", noted)
     rough = rough_pose(3, degrees, distance)
     found = find_station(view_of(images()), rough, np.random.default_rng(3))
     assert found.sure

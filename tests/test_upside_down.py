@@ -12,9 +12,13 @@ import yaml
 
 import pkmcal
 from pkmcal.calibration.gather import refinement_of
-from pkmcal.calibration.upside_down import upside_down
+from pkmcal.calibration.saved import load
+from pkmcal.calibration.source import load_source
+from pkmcal.calibration.upside_down import turned_round, upside_down
 from pkmcal.cameras import load_camera
 from pkmcal.identify.score import Departures, Freed
+from pkmcal.judge.new_data import _as_then
+from pkmcal.session.load import load_session
 from test_calibration import check_found
 
 CUT = (32, 20)
@@ -40,19 +44,23 @@ def turned(demo, tmp_path_factory):
     return folder
 
 
-def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
-    """As good as upright ones, and told how the camera's file would be theirs."""
-    found = pkmcal.calibrate(turned)
+@pytest.fixture(scope="module")
+def turned_found(turned):
+    return pkmcal.calibrate(turned)
+
+
+def test_upside_down_photographs_are_known_by_their_cameras_centre(turned, turned_found):
+    """As good as upright ones, and told what file would be theirs."""
+    found = turned_found
     check_found(found, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
     (hint,) = [text for text in found.verdict.advice if "upside down" in text]
     assert hint.startswith(
         "The photographs of station1, station2 and station3 are upside down against"
         " cameras/camera.yaml: so say their edges, at odds of more than 1000 to 1."
     )
-    # 447 less 241.18, 339 less 178.48; the lens turned by half, too
-    assert "write center: [205.82, 160.52] and distortion: [-0.11, 0.09, -0.0004, 0.0003, 0]" in (
-        hint
-    )
+    # 447 less 241.18, 339 less 178.48
+    assert "by the same camera turned by half, whose centre is at [205.82, 160.52]." in hint
+    assert "Name its file, camera-camera.yaml beside the result, in session.yaml" in hint
     assert not found.departures
     own = load_camera(turned / "cameras" / "camera.yaml").turned_by_half()
     for station in found.session.stations:
@@ -66,17 +74,82 @@ def test_upright_photographs_are_left_as_they_are(calibrated):
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)
 
 
+def lens(session, centre, covariance=None):
+    """A session whose camera's centre is so many px beside the middle, as its file would say."""
+    file, camera = session.stations[0].camera_file, session.stations[0].camera
+    parameters = camera.parameters.copy()
+    parameters[2:4] = (np.array(camera.image_size) - 1) / 2 + centre
+    camera = replace(camera, parameters=parameters, covariance=covariance)
+    return turned_round(session, {file: camera})
+
+
 @pytest.mark.parametrize(
-    ("value", "sigma", "known"),
-    [(0.0, 0.02, False), (0.9, 0.07, True), (0.9, 0.4, False), (2.0, 0.1, False)],
-    ids=["upright", "upside down", "not told", "another camera"],
-)
-def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, value, sigma, known):
-    fit = Freed(np.array([value]), np.array([sigma]), np.zeros(1))
-    monkeypatch.setattr(Departures, "fitted", lambda *_: [fit])
-    found = upside_down(calibrated.session, calibrated)
-    assert [one.file for one in found] == ["cameras/camera.yaml"] * known
-    assert [one.entries for one in found] == [("station1", "station2", "station3")] * known
+    ("values", "sigma", "known"),
+    [((0.0, 0.1, -0.1), 0.04, False), ((0.9, 1.1, 0.8), 0.12, True), ((0.9, 1.1, 0.8), 0.8, False),
+     ((2.0, 2.1, 2.0), 0.1, False), ((1.0, 1.0, 0.0), 0.1, False), ((1.0, 0.3, 1.0), 0.3, True),
+     ((1.0, 0.0, 0.0), np.array([0.1, np.inf, np.inf]), True), ((0.0, 0.0, 0.0), np.inf, False)],
+    ids=["upright", "upside down", "not told", "another camera", "one station is upright",
+         "one tells little", "one alone tells", "none tells"],
+)  # fmt: skip
+def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigma, known):
+    sigmas = np.broadcast_to(sigma, 3)
+    told = zip(values, sigmas, strict=True)
+    fits = [Freed(np.array([v]), np.array([s]), np.zeros(1)) for v, s in told]
+    monkeypatch.setattr(Departures, "fitted", lambda *_: fits)
+    session = lens(calibrated.session, (8.0, -5.0))
+    (camera,) = {id(station.camera): station.camera for station in session.stations}.values()
+    found = upside_down(session, calibrated)
+    assert [(one.file, one.entries) for one in found] == [
+        ("cameras/camera.yaml", ("station1", "station2", "station3"))
+    ] * known
+    for one in found:
+        np.testing.assert_array_equal(one.camera.parameters, camera.turned_by_half().parameters)
+
+
+@pytest.mark.parametrize(
+    ("centre", "sigma", "known"),
+    [((8.0, -5.0), None, True), ((0.5, -0.5), None, False), ((0.0, 0.0), None, False),
+     ((0.5, -0.5), 0.05, True), ((8.0, -5.0), 8.0, False)],
+    ids=["beside the middle", "half a pixel beside", "in the middle", "known to less", "not known"],
+)  # fmt: skip
+def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, sigma, known):
+    """A centre that is half a pixel from the middle may be on the other side without any turn."""
+    fit = Freed(np.array([0.9]), np.array([0.05]), np.zeros(1))
+    monkeypatch.setattr(Departures, "fitted", lambda _, freed: [fit] * len(freed))
+    n = len(calibrated.session.stations[0].camera.parameters)
+    covariance = None if sigma is None else sigma**2 * np.eye(n)
+    assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == known
+
+
+def test_the_file_that_is_told_is_the_one_that_is_written(turned_found, tmp_path):
+    """Beside the result, where what loads a calibration looks for it; and said to programs."""
+    folder = tmp_path / "calibration"
+    turned_found.save(folder)
+    own = turned_found.session.stations[0].camera
+    saved = load(folder)
+    (row,) = saved.document["cameras"]
+    assert row["upside_down"] is True
+    camera = load_camera(folder / "camera-camera.yaml")
+    np.testing.assert_allclose(camera.parameters, own.parameters)
+    source = load_source(folder, turned_found.session.folder)
+    for seen in source.cameras.values():
+        np.testing.assert_allclose(seen.parameters, own.parameters)
+
+
+def test_new_photographs_are_taken_to_be_as_those_of_the_calibration_were(
+    turned, turned_found, tmp_path
+):
+    """As long as the file is the same; one that was set right is not turned again."""
+    turned_found.save(tmp_path / "calibration")
+    saved = load(tmp_path / "calibration")
+    session = load_session(turned)
+    own, upright = turned_found.session.stations[0].camera, session.stations[0].camera
+    right = turned_round(session, {"cameras/camera.yaml": own})
+    for before, after in ((session, own), (right, own), (lens(session, (3.0, 3.0)), None)):
+        for station, was in zip(_as_then(saved, before), before.stations, strict=True):
+            wanted = was.camera if after is None else after
+            np.testing.assert_allclose(station.camera.parameters, wanted.parameters)
+    assert not np.allclose(own.parameters, upright.parameters)
 
 
 def test_cameras_that_are_estimated_are_not_asked_about(calibrated):

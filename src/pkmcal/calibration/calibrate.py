@@ -81,6 +81,7 @@ class Calibration(ShownCalibration):
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
     the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
     tells what it predicts of them. departures : what the data show that the model does not have.
+    upside_down : cameras whose photographs are, by which they were measured.
     photographs : of stations whose legs were observed, by their number; those that fitted into
     memory are decoded.
     """
@@ -98,6 +99,7 @@ class Calibration(ShownCalibration):
     boards: Boards = field(default_factory=Boards)
     holdout: LeftOut | None = None
     departures: tuple[Departed, ...] = ()
+    upside_down: tuple[UpsideDown, ...] = ()
     photographs: Mapping[int, Sequence[Integers]] = field(
         default_factory=dict[int, Sequence[Integers]]
     )
@@ -158,22 +160,18 @@ def calibrate_session(
         clock = _Clock(progress)
         session = _load(session, refine_camera, clock)
         seen = _observe(session, seed, clock)
-        try:
-            turns, richer = _identify(seen, refine_camera, clock)
-            turned = upside_down(seen.session, turns)
-            if turned:
-                session = turned_round(session, turned)
-                seen = _observe(session, seed, clock)
-                turns, richer = _identify(seen, refine_camera, clock)
-            # without one that was in a wrong place, another may show itself to be
-            while wrong := misplaced(
-                seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
-            ):
-                seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-                turns, richer = _identify(seen, refine_camera, clock)
-        except ResultError:
-            check_radii(seen, None, refine_camera, seed)
-            raise
+        turns, richer = _identify(seen, refine_camera, seed, clock)
+        turned = upside_down(seen.session, turns)
+        if turned:
+            session = turned_round(session, {one.file: one.camera for one in turned})
+            seen = _observe(session, seed, clock)
+            turns, richer = _identify(seen, refine_camera, seed, clock)
+        # without one that was in a wrong place, another may show itself to be
+        while wrong := misplaced(
+            seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
+        ):
+            seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
+            turns, richer = _identify(seen, refine_camera, seed, clock)
         check_radii(seen, turns.estimate, refine_camera, seed)
         found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
         return _judge(seen, found, turned, method, seed, clock)
@@ -235,9 +233,22 @@ def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
 
 
 def _identify(
+    seen: SeenSession, refine_camera: bool, seed: int, clock: _Clock
+) -> tuple[Turns, tuple[RicherModel, ...]]:
+    """The machine, in turns with looks at the edges, and richer models that were tried; where there
+    is none, diameters for radii may be why.
+    """
+    try:
+        return _identified(seen, refine_camera, clock)
+    except ResultError:
+        check_radii(seen, None, refine_camera, seed)
+        raise
+
+
+def _identified(
     seen: SeenSession, refine_camera: bool, clock: _Clock
 ) -> tuple[Turns, tuple[RicherModel, ...]]:
-    """The machine, in turns with looks at the edges, and richer models that were tried."""
+    """The same, or why there is none."""
     session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     if seen.photographs:
         turns = take_turns(seen, cameras, clock.told, clock.lap)
@@ -361,6 +372,7 @@ def _judge(
         boards=seen.boards,
         holdout=found.out,
         departures=departed,
+        upside_down=turned,
         photographs={one.station: one.images for one in seen.photographs},
     )
 

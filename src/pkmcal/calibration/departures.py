@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.assembly import Assembled
@@ -163,26 +163,51 @@ def _lenses(
     session: Session, observation: Observation, measured: Measurements
 ) -> Iterator[Departure]:
     """A camera that is not as its file says, by the departures that its model declares."""
-    cameras = [station.camera for station in session.stations]
-    if measured.intrinsics_factor.shape[-1] or not cameras:
+    changed = CameraChange.of(session, observation, measured)
+    if changed is None:
         return  # they are estimated already
-    number_of = np.asarray(measured.camera_of_station)
-    edges = edges_by_camera(observation, cameras)
-    poses = np.zeros((len(measured.poses), 6, edges.shape[-1]))
-    own = measured.poses.by_intrinsics
-    poses[..., : own.shape[-1]] = own
-    for c in range(int(number_of[: len(cameras)].max()) + 1):
-        station = int(np.flatnonzero(number_of == c)[0])
-        camera, file = cameras[station], session.stations[station].camera_file
-        mine = (number_of[measured.edges.station] == c)[:, None, None]
-        also = (number_of[measured.poses.station] == c) & (measured.poses.station < len(cameras))
+    files = {station.camera_file: station.camera for station in session.stations}
+    for file, camera in files.items():
+        own = np.array([station.camera_file == file for station in session.stations])
         for part in camera.departures():
-            n = len(camera.parameters)
-            effect = Effect(
-                edges=np.where(mine, edges[..., :n] @ part.columns, 0.0),
-                poses=np.where(also[:, None, None], poses[..., :n] @ part.columns, 0.0),
-            )
+            effect = changed.effect(own, part.columns)
             yield Departure(part.kind, file, _of_lens(part.says, file), effect)
+
+
+@dataclass(frozen=True)
+class CameraChange:
+    """What a change of cameras' parameters does to all that they see: edges (N, 2, n) and poses (M,
+    6, n), with the station of each, (N,) and (M,).
+    """
+
+    edges: Array
+    poses: Array
+    edge_station: Integers
+    pose_station: Integers
+
+    @classmethod
+    def of(
+        cls, session: Session, observation: Observation, measured: Measurements
+    ) -> CameraChange | None:
+        """Nothing where no camera is held: what is estimated is not asked about."""
+        cameras = [station.camera for station in session.stations]
+        if measured.intrinsics_factor.shape[-1] or not cameras:
+            return None
+        edges = edges_by_camera(observation, cameras)
+        poses = np.zeros((len(measured.poses), 6, edges.shape[-1]))
+        own = measured.poses.by_intrinsics
+        poses[..., : own.shape[-1]] = own
+        return cls(edges, poses, measured.edges.station, measured.poses.station)
+
+    def effect(self, stations: Booleans, columns: Array) -> Effect:
+        """That of some stations' camera, (S,), by k numbers: ``columns`` (n, k) of its change."""
+        n = len(columns)
+        also = np.append(stations, False)[np.minimum(self.pose_station, len(stations))]
+        edges, poses = self.edges[..., :n] @ columns, self.poses[..., :n] @ columns
+        return Effect(
+            edges=np.where(stations[self.edge_station][:, None, None], edges, 0.0),
+            poses=np.where(also[:, None, None], poses, 0.0),
+        )
 
 
 def _of_lens(

@@ -120,12 +120,15 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
     for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
         texts[refined_camera(file)] = camera_text(camera)
+    for turned in calibration.upside_down:
+        texts[refined_camera(turned.file)] = camera_text(turned.camera)
     return texts
 
 
 def refined_camera(file: str) -> str:
-    """The name of a camera's file as refined with the machine, by the one that the session names:
-    camera-front.yaml of cameras/front.yaml; other folders, and a # in it, become hyphens.
+    """The name of a camera's file as refined with the machine, or turned by half as photographs
+    were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
+    and a # in it, become hyphens.
     """
     parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
     return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
@@ -375,12 +378,14 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     # trackers, whose number means nothing, come last
     files = {c: station.camera_file for c, station in zip(numbers, stations, strict=False)}
     pixels = dict(zip(numbers, calibration.observation.binning.tolist(), strict=False))
+    turned = {one.file for one in calibration.upside_down}
     return [
         {
             "file": files[c],
             "edge_shift": estimate.state.edge_shift[c] * pixels[c],
             "sigma": estimate.edge_shift_sigma[c] * pixels[c],
             **_refined(calibration, files[c]),
+            **({"upside_down": True} if files[c] in turned else {}),
         }
         for c in sorted(files)
     ]

@@ -5,29 +5,36 @@ turned, too, and no look at them tells. But the camera's centre is then on the o
 picture's middle, which no place of the camera makes up for. So the way from a camera to the same
 one turned is a departure of one number (:mod:`pkmcal.identify.score`), whose fit is 0 where the
 file is right and 1 where the photographs are upside down. Where the edges are sure of that, these
-are measured by the camera turned by half.
+are measured by the camera turned by half. A camera that is estimated with the machine is not asked
+about.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.arrays import Array
+from pkmcal.calibration.departures import CameraChange
+from pkmcal.calibration.results import refined_camera
 from pkmcal.calibration.turns import Turns
 from pkmcal.cameras import Camera
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.score import Departures
-from pkmcal.measurements import Effect
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 ODDS_FOR_UPSIDE_DOWN = 1000.0
 """Odds from which the edges overrule the file."""
-MOST_FROM_TURNED = 0.5
-"""Share of the way by which what fits may be off its end: else neither is the photographs' camera,
-though one may be nearer."""
+ODDS_FOR_UPRIGHT = 20.0
+"""Odds from which the photographs of one of session.yaml's stations are upright, so that those of
+the same camera are not taken to be turned alike."""
+FURTHER_THAN_TURNED = 1.5
+"""Times the way, from which what fits is neither camera, though one is nearer."""
+USUAL_CENTRE_ERROR = 1.5
+"""px; of a calibrated camera's centre along the way, where the file does not say."""
 
 
 @dataclass(frozen=True)
@@ -43,53 +50,71 @@ class UpsideDown:
     @property
     def sentence(self) -> str:
         """A hint for the verdict."""
-        fields = self.camera.document()
-        wanted = [f"center: {_numbers(fields['center'])}"]
-        if np.any(fields["distortion"]):
-            wanted.append(f"distortion: {_numbers(fields['distortion'])}")
+        centre = ", ".join(f"{value:.6g}" for value in self.camera.document()["center"])
         return (
             f"The photographs of {listed(self.entries)} are upside down against {self.file}: so say"
             f" their edges, at odds of more than {ODDS_FOR_UPSIDE_DOWN:.0f} to 1. They are measured"
-            f" so; turn them by half, or write {' and '.join(wanted)} in that file, and every"
-            " command knows it."
+            f" by the same camera turned by half, whose centre is at [{centre}]. Name its file,"
+            f" {refined_camera(self.file)} beside the result, in session.yaml in the place of"
+            f" {self.file}, and every command knows it."
         )
 
 
-def _numbers(values: list[float]) -> str:
-    return f"[{', '.join(f'{value:.6g}' for value in values)}]"
-
-
 def upside_down(session: Session, turns: Turns) -> tuple[UpsideDown, ...]:
-    """The cameras against whose files the photographs are upside down; none of those that are
-    estimated with the machine.
-    """
-    if turns.cameras.active or not len(turns.measurements.edges):
+    """The cameras against whose files the photographs are upside down."""
+    changed = CameraChange.of(session, turns.observation, turns.measurements)
+    if changed is None or not len(turns.measurements.edges):
         return ()
-    measured = turns.measurements
-    cameras = {station.camera_file: station.camera for station in session.stations}
-    every = [station.camera for station in session.stations]
-    edges = edges_by_camera(turns.observation, every)
-    files = np.array([station.camera_file for station in session.stations])
-    effects = list[Effect]()
-    for file, camera in cameras.items():
-        way = camera.turned_by_half().parameters - camera.parameters
-        mine = (files[measured.edges.station] == file)[:, None, None]
-        effects.append(Effect(edges=np.where(mine, edges[..., : len(way)] @ way[:, None], 0.0)))
-    tests = Departures(*as_ended(measured, turns.estimate), effects)
+    entries = np.array([station.entry for station in session.stations])
+    cameras = {station.entry: (station.camera_file, station.camera) for station in session.stations}
+    ways = {entry: _way(camera) for entry, (_, camera) in cameras.items()}
+    effects = [changed.effect(entries == entry, way[:, None]) for entry, way in ways.items()]
+    fits = Departures(*as_ended(turns.measurements, turns.estimate), effects).fitted(
+        range(len(effects))
+    )
     out = list[UpsideDown]()
-    for number, (file, camera) in enumerate(cameras.items()):
-        (fit,) = tests.fitted([number])
-        value, sigma = float(fit.value[0]), float(fit.sigma[0])
-        sure = (2 * value - 1) / sigma**2 > 2 * np.log(ODDS_FOR_UPSIDE_DOWN)
-        if sure and abs(value - 1) < MOST_FROM_TURNED:
-            own = [station.entry for station in session.stations if station.camera_file == file]
-            out.append(UpsideDown(file, tuple(dict.fromkeys(own)), camera.turned_by_half()))
+    for file, camera in dict(cameras.values()).items():
+        own = [k for k, (mine, _) in enumerate(cameras.values()) if mine == file]
+        value = np.concatenate([fits[k].value for k in own])
+        sigma = np.concatenate([fits[k].sigma for k in own])
+        known = _file_sigma(camera)
+        alone = [_log_odds(value[[k]], sigma[[k]], known) for k in range(len(own))]
+        sure = _log_odds(value, sigma, known) > np.log(ODDS_FOR_UPSIDE_DOWN)
+        if sure and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
+            names = tuple(list(cameras)[k] for k in own)
+            out.append(UpsideDown(file, names, camera.turned_by_half()))
     return tuple(out)
 
 
-def turned_round(session: Session, found: tuple[UpsideDown, ...]) -> Session:
-    """The session with the cameras that took its photographs."""
-    cameras = {one.file: one.camera for one in found}
+def _way(camera: Camera) -> Array:
+    """Change (n,) of a camera's parameters to those of the same turned by half."""
+    return camera.turned_by_half().parameters - camera.parameters
+
+
+def _file_sigma(camera: Camera) -> float:
+    """Standard deviation of how far along the way a camera may be from what its file says."""
+    way = _way(camera)
+    if camera.covariance is not None:
+        known = float(way @ np.linalg.pinv(camera.covariance, hermitian=True) @ way)
+        return float(known**-0.5) if known > 0 else np.inf
+    length = float(np.linalg.norm(way[2:4]))
+    return USUAL_CENTRE_ERROR / length if length else np.inf
+
+
+def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
+    """For the end of the way against its begin, by what fits of some stations, (n,) with its
+    deviations; nothing where nothing is told, or it is another camera.
+    """
+    weight = sigma**-2.0
+    if not weight.any():
+        return 0.0
+    mean = float(weight @ value / weight.sum())
+    variance = float(1 / weight.sum()) + file_sigma**2
+    return (2 * mean - 1) / (2 * variance) if mean < FURTHER_THAN_TURNED else 0.0
+
+
+def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:
+    """The session with other cameras in the place of some files'."""
     stations = tuple(
         replace(station, camera=cameras.get(station.camera_file, station.camera))
         for station in session.stations

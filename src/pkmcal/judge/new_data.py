@@ -14,7 +14,9 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
+from pkmcal.calibration.results import refined_camera
 from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.cameras import load_camera
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
@@ -75,9 +77,14 @@ def measured_new_data(
 
 def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     """The stations, their photographs taken to code light as the calibration found them to, where
-    the session does not say: a few new ones tell less.
+    the session does not say, and to be upside down where those were: a few new ones tell less.
     """
     then = {row["name"]: row.get("response") for row in saved.document["stations"]}
+    turned = {
+        row["file"]: load_camera(saved.path.parent / refined_camera(row["file"]))
+        for row in saved.document["cameras"]
+        if row.get("upside_down")
+    }
     out: list[Station] = []
     for station in session.stations:
         # a photograph by hand has its own name behind its entry's
@@ -88,5 +95,11 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
         )
         found = then.get(next(names, station.name))
         known = found is not None and not station.response_told
-        out.append(replace(station, response=found, response_told=True) if known else station)
+        camera = station.camera
+        own = turned.get(station.camera_file)
+        # else the file has been set right since, or is another
+        if own is not None and np.allclose(camera.turned_by_half().parameters, own.parameters):
+            camera = own
+        told = replace(station, camera=camera)
+        out.append(replace(told, response=found, response_told=True) if known else told)
     return tuple(out)

@@ -37,10 +37,10 @@ from pkmcal.observe.places import anywhere
 from pkmcal.observe.shadows import lightness, without_shadows
 
 
-class _About(NamedTuple):
-    """How a search goes about a pose by hand: by what spread (6,) of rad and m the poses are drawn
-    that are tried, how many these are, how many of them descend, and at what probability by
-    chance, of some of the photographs, the others need not be searched.
+class _Nearness(NamedTuple):
+    """How far about a pose by hand is searched: the spread (6,) of rad and m by which the poses
+    are drawn that are tried, how many these are, and how many of them descend. enough : probability
+    by chance, of some of the photographs, from which the others need not be searched.
     """
 
     spread: Array
@@ -49,19 +49,31 @@ class _About(NamedTuple):
     enough: float
 
     def reaches(self, T_camera_base: Array, other: Array) -> bool:
-        """Whether another pose is no further from one, (4, 4) both, than poses drawn are."""
+        """Whether another pose is no further from one, (4, 4) both, than those drawn are on
+        average, turn and shift together.
+        """
         turn, shift = angle_between(T_camera_base, other), T_camera_base @ inverse(other)
         square = (turn / self.spread[0]) ** 2 + np.sum((shift[:3, 3] / self.spread[3:]) ** 2)
         return bool(square < len(self.spread))
 
 
-FAR = _About(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
+FAR = _Nearness(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
 """The spread's norm over three axes is 26 degrees and 26 cm; of poses that are 30 degrees and 30 cm
 off, 97 of 100 lead to the right place. A place that fits about a pose that is wrong by more than
 was searched is not known from the right one: before clutter its photographs confirm it to one in
 ten thousand."""
-NEAR = _About(FAR.spread / 3, 160, 8, 1e-3)
-"""Asked first. Where a pose is wrong by more, a search does not end so near to it by chance."""
+NEAR = _Nearness(FAR.spread / 3, 160, 8, 1e-3)
+"""Asked first, and where one of thirty hypotheses is looked at. Where a pose is wrong by more, a
+search does not end so near to it by chance."""
+
+
+class _Told(NamedTuple):
+    """A rough pose (4, 4), and how far about it is searched."""
+
+    T_camera_base: Array
+    nearness: _Nearness
+
+
 POSES_A_CLOSER_LOOK = 8
 """One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
 ANYWHERE_POSES_DESCENDING, ANYWHERE_POSES_KEPT = 1200, 300
@@ -81,7 +93,8 @@ FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
 each in its turn. About a known pose two are enough to be searched."""
 EARLY_DECISION = 1e-4
-"""What ``enough`` is of a search from nothing."""
+"""Probability by chance, of some of the photographs, from which the others need not be searched
+where nothing is told of the pose."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 """Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
 where it was looked for about a pose by hand, which says much the same already."""
@@ -140,38 +153,34 @@ def find_station(
     nothing, for evidence that is to be compared.
     """
     if T_camera_base is None:
-        return _found(view, None, None, rng, closely)
-    near = _found(view, T_camera_base, NEAR, rng, closely)
-    if near.sure and NEAR.reaches(T_camera_base, near.T_camera_base):
-        return near
-    return _found(view, T_camera_base, FAR, rng, closely)
+        return _found(view, None, rng, closely)
+    if len(view.configuration) > 1:  # one alone confirms nothing
+        near = _found(view, _Told(T_camera_base, NEAR), rng, closely)
+        if near.sure and NEAR.reaches(T_camera_base, near.T_camera_base):
+            return near
+    return _found(view, _Told(T_camera_base, FAR), rng, closely)
 
 
 def _found(
-    view: StationView,
-    T_camera_base: Array | None,
-    about: _About | None,
-    rng: np.random.Generator,
-    closely: bool,
+    view: StationView, told: _Told | None, rng: np.random.Generator, closely: bool
 ) -> FoundStation:
-    """The same by one search."""
+    """What one search finds: about a pose by hand, as far as is told with it, or anywhere."""
     count = len(view.configuration)
     number = np.arange(count)
-    told = about is not None
     halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
-    enough = about.enough if about else EARLY_DECISION
+    enough = told.nearness.enough if told else EARLY_DECISION
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
     asked = [number % folds == fold for fold in range(folds if count > 1 else 0)]
     parts = [(np.flatnonzero(~part), np.flatnonzero(part)) for part in asked]  # one alone has none
     for searched, other in parts:
-        found = _search(view.select(searched), T_camera_base, about, rng, closely)
+        found = _search(view.select(searched), told, rng, closely)
         kept.append(found)
         surely.append(_surely(view, found[0], searched, other, rng))
         if _by_chance(surely) < enough:
             break
-    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, about, rng, closely)
+    candidates = np.concatenate(kept) if kept else _search(view, told, rng, closely)
     every = view.few(count)
     candidates, evidence = settle_by_evidence(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
@@ -196,32 +205,29 @@ def _found(
         evidence=float(evidence[0]),
         by_chance=confirmed,
         second=_second(evidence, each),
-        told=told,
+        told=told is not None,
         grain=each,
     )
 
 
 def _search(
-    view: StationView,
-    T_camera_base: Array | None,
-    about: _About | None,
-    rng: np.random.Generator,
-    closely: bool,
+    view: StationView, told: _Told | None, rng: np.random.Generator, closely: bool
 ) -> Array:
     """Up to three places (H, 4, 4), the one with the most evidence first."""
     few, more = view.few(4), view.few(8)
-    if T_camera_base is None or about is None:
+    if told is None:
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
         candidates = _anywhere(view, few, each * ANYWHERE_POSES_DESCENDING)
         candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
         candidates = _best(view, candidates, few, reach=8, keep=each * ANYWHERE_POSES_KEPT)
     else:
-        candidates = _random_search(view, T_camera_base, about, rng)
+        candidates = _random_search(view, told, rng)
     candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
     # of photographs that all took part in the descents none could disagree, but for the pose's word
-    closely = closely or about is None or (about is not NEAR and len(more) == len(few))
+    near = told is not None and told.nearness is NEAR
+    closely = closely or told is None or (not near and len(more) == len(few))
     if not closely and len(distinct_silhouettes(view, likelier, more)) == 1:
         others = distinct_silhouettes(view, candidates, more)[1:3]
         candidates = candidates[[*range(LIKELIEST_PLACES_SETTLED), *others]]
@@ -257,13 +263,11 @@ def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
     return anywhere(view.camera, view.tubes, radius, legs, view.tables, few, keep)
 
 
-def _random_search(
-    view: StationView, T_camera_base: Array, about: _About, rng: np.random.Generator
-) -> Array:
-    """Candidates (``about.descending``, 4, 4): a wide random draw, then a narrower one around its
-    best.
+def _random_search(view: StationView, told: _Told, rng: np.random.Generator) -> Array:
+    """Candidates (``descending``, 4, 4) about a pose: a wide random draw, then a narrower one
+    around its best.
     """
-    T_base_camera = inverse(T_camera_base)
+    T_base_camera, (spread, tried, descending, _) = inverse(told.T_camera_base), told.nearness
 
     def moved(steps: Array) -> Array:
         return inverse(T_base_camera @ pose(rotation(steps[:, :3]), steps[:, 3:]))
@@ -276,12 +280,12 @@ def _random_search(
         steps = steps[first[: max(len(steps) // POSES_A_CLOSER_LOOK, keep)]]
         return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
 
-    steps = rng.normal(size=(about.tried, 6)) * about.spread
+    steps = rng.normal(size=(tried, 6)) * spread
     steps[0] = 0.0
-    best = likely(steps, 12, 4 * about.descending)
-    again = best[rng.integers(0, len(best), about.tried // 2)]
-    again = again + rng.normal(size=again.shape) * (0.45 * about.spread)
-    return moved(likely(np.concatenate([best, again]), 10, about.descending))
+    best = likely(steps, 12, 4 * descending)
+    again = best[rng.integers(0, len(best), tried // 2)]
+    again = again + rng.normal(size=again.shape) * (0.45 * spread)
+    return moved(likely(np.concatenate([best, again]), 10, descending))
 
 
 def _best(
@@ -333,7 +337,7 @@ def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Gener
     if not len(starts):
         places = _anywhere(view, few, FEW_PLACES_ANYWHERE)
         return _best(view, places, few, reach=12, keep=FEW_PLACES_KEPT)
-    return np.concatenate([_random_search(view, T, NEAR, rng) for T in starts])
+    return np.concatenate([_random_search(view, _Told(T, NEAR), rng) for T in starts])
 
 
 def _surely(
