@@ -110,7 +110,7 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
 
     document : of :func:`calibration_document`.
     """
-    from pkmcal.cameras.files import camera_text
+    from pkmcal.cameras.files import camera_text, refined_camera
 
     texts: dict[str, str | bytes] = {
         CALIBRATED_MECHANISM_FILE: calibrated_mechanism_text(calibration),
@@ -123,15 +123,6 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
     for turned in calibration.upside_down:
         texts[refined_camera(turned.file)] = camera_text(turned.camera)
     return texts
-
-
-def refined_camera(file: str) -> str:
-    """The name of a camera's file as refined with the machine, or turned by half as photographs
-    were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
-    and a # in it, become hyphens.
-    """
-    parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
-    return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
 
 
 def calibrated_mechanism_text(calibration: Calibration) -> str:

@@ -15,11 +15,10 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.results import (
     CALIBRATED_MECHANISM_FILE,
     CALIBRATION_DOCUMENT_FILE,
-    refined_camera,
 )
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
-from pkmcal.cameras.files import camera_path, load_camera
+from pkmcal.cameras.files import camera_path, load_camera, refined_camera
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism

@@ -18,9 +18,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.departures import CameraChange
-from pkmcal.calibration.results import refined_camera
 from pkmcal.calibration.turns import Turns
 from pkmcal.cameras import Camera
+from pkmcal.cameras.files import refined_camera
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.score import Departures
 from pkmcal.session.load import Session

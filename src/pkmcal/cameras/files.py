@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,15 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     if "camera_matrix" in document.data:
         return _from_ros(document)
     return camera_from_document(document)
+
+
+def refined_camera(file: str) -> str:
+    """The name of a camera's file as refined with the machine, or turned by half as photographs
+    were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
+    and a # in it, become hyphens.
+    """
+    parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
+    return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
 
 
 def camera_path(path: Path | str) -> tuple[Path, str | None]:

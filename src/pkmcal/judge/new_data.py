@@ -14,9 +14,8 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
-from pkmcal.calibration.results import refined_camera
 from pkmcal.calibration.saved import SavedCalibration
-from pkmcal.cameras import load_camera
+from pkmcal.cameras.files import load_camera, refined_camera
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose

@@ -14,6 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera, load_camera
+from pkmcal.cameras.files import refined_camera
 from pkmcal.cameras.response import Response
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
@@ -126,8 +127,6 @@ class Viewed:
 
         Raises InputError where the calibration is another session's, or has not this station.
         """
-        from pkmcal.calibration.results import refined_camera
-
         saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
