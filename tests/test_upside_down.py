@@ -60,7 +60,7 @@ def test_upside_down_photographs_are_known_by_their_cameras_centre(turned, turne
     )
     # 447 less 241.18, 339 less 178.48
     assert "by the same camera turned by half, whose centre is at [205.82, 160.52]." in hint
-    assert "Name its file, camera-camera.yaml beside the result, in session.yaml" in hint
+    assert "Copy camera-camera.yaml from the result's folder to the session's and name it" in hint
     assert not found.departures
     own = load_camera(turned / "cameras" / "camera.yaml").turned_by_half()
     for station in found.session.stations:

@@ -54,9 +54,9 @@ class UpsideDown:
         return (
             f"The photographs of {listed(self.entries)} are upside down against {self.file}: so say"
             f" their edges, at odds of more than {ODDS_FOR_UPSIDE_DOWN:.0f} to 1. They are measured"
-            f" by the same camera turned by half, whose centre is at [{centre}]. Name its file,"
-            f" {refined_camera(self.file)} beside the result, in session.yaml in the place of"
-            f" {self.file}, and every command knows it."
+            f" by the same camera turned by half, whose centre is at [{centre}]. Copy"
+            f" {refined_camera(self.file)} from the result's folder to the session's and name it in"
+            f" session.yaml in the place of {self.file}, and every command knows it."
         )
 
 
