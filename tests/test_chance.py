@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pkmcal.calibration import chance
-from pkmcal.calibration.chance import MOVED_ASIDE, chance_doubt
+from pkmcal.calibration import calibrate, chance
+from pkmcal.calibration.chance import MOVED_ASIDE, by_chance, chance_doubt
 from pkmcal.calibration.turns import Turns
-from pkmcal.measurements import Observation
+from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import OUT_OF_SIGHT_REASON, measure
 from pkmcal.observe.profiles import USUAL_BLUR
 from test_observe_drawing import FRONT, machine, poses
@@ -75,3 +76,60 @@ def test_chance_that_offers_more_is_told_in_words(monkeypatch):
     monkeypatch.setattr(chance, "_count", lambda *_: next(counts))
     (why,) = chance_doubt(few)
     assert "chance offers as many as a rule" in why
+
+
+def two_stations(second, **told):
+    """The turns of two stations, of which the first is right, and their session."""
+    one, other = turns_of(taken()), turns_of(second)
+    at, seen = other.observation.edges, other.observation
+    seen = Observation(
+        concatenate([one.observation.edges, replace(at, station=at.station + 1)]),
+        one.observation.rejected + tuple(replace(r, station=1) for r in seen.rejected),
+        one.observation.points, one.observation.point_edge, np.stack([FRONT, FRONT]), None,
+        np.ones(2),
+    )  # fmt: skip
+    state = SimpleNamespace(T_camera_base=np.stack([FRONT, FRONT]), T_base_platform=poses())
+    estimate = SimpleNamespace(
+        machine=machine(), state=state, edge_weights=np.ones(len(seen.edges))
+    )
+    both = [*one.photographs, replace(second, station=1)]
+    measured = SimpleNamespace(poses=SimpleNamespace(station=np.array(told.pop("boards", []))))
+    turns = Turns(seen, measured, estimate, None, photographs=both, blur={0: None, 1: None})
+    station = SimpleNamespace(**{"handheld": False, "T_camera_base": None, **told})
+    return SimpleNamespace(stations=(station, station)), turns
+
+
+def test_a_station_that_may_stand_elsewhere_is_told_with_why():
+    session, turns = two_stations(aside(taken(), 2.5 * MOVED_ASIDE))
+    ((number, why),) = by_chance(session, turns).items()
+    assert number == 1
+    (measured,) = {int(np.sum(turns.observation.edges.station == 1))}
+    assert why.startswith(f"only {measured} of ")
+    assert why.endswith("it may stand elsewhere; a pose by hand would tell")
+    session, turns = two_stations(aside(taken(), 2.5 * MOVED_ASIDE), T_camera_base=FRONT)
+    assert by_chance(session, turns)[1].endswith("it may stand elsewhere")
+
+
+def test_a_station_is_kept_that_shows_the_machine_or_whose_place_is_told_otherwise():
+    wrong = aside(taken(), 2.5 * MOVED_ASIDE)
+    assert by_chance(*two_stations(taken())) == {}
+    assert by_chance(*two_stations(wrong, boards=[1])) == {}
+    assert by_chance(*two_stations(wrong, handheld=True)) == {}
+
+
+def test_the_only_station_is_not_left_out_but_doubted():
+    session, turns = two_stations(taken())
+    alone = turns_of(aside(taken(), 2.5 * MOVED_ASIDE))
+    alone = alone._replace(measurements=turns.measurements)
+    assert by_chance(session, alone) == {}
+    assert chance_doubt(alone)
+
+
+def test_the_machine_is_told_by_the_other_stations(demo, monkeypatch):
+    """A station that may stand elsewhere is left out with its reason, and the rest identified."""
+    found = iter([{1: "it may stand elsewhere"}])
+    monkeypatch.setattr(calibrate, "by_chance", lambda *_: next(found, {}))
+    calibration = calibrate.calibrate_session(demo.session)
+    assert [station.name for station in calibration.session.stations] == ["station1", "station3"]
+    assert "station2: left out, for it may stand elsewhere." in calibration.session.warnings
+    assert compare_with_truth(calibration, demo.session).calibrated.centre < 1e-3

@@ -370,8 +370,8 @@ def misplaced(
 def without_misplaced(
     seen: SeenSession, wrong: Mapping[int, str], edges: EdgeSet, estimate: Estimate
 ) -> SeenSession:
-    """What is seen without these photographs, each told why, and what is known by an estimate of
-    all. edges : from which it was made.
+    """What is seen without these stations, each told why, and what is known by an estimate of all.
+    edges : from which it was made.
     """
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in seen.photographs}
@@ -391,16 +391,19 @@ def why_lost(found: Alone) -> str:
 
 
 def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
-    """What is seen without the photographs that are lost, each told, the other stations numbered
-    anew; an error where none is left.
+    """What is seen without the stations that are lost, each told, the others numbered anew; an
+    error where no photograph by hand is left.
     """
     session, known = seen.session, seen.known
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
 
     def label(k: int) -> str:
-        return label_of(session.folder, session.stations[k].photographs[0].path)
+        station = session.stations[k]
+        if not station.handheld:
+            return station.name
+        return label_of(session.folder, station.photographs[0].path)
 
-    if len(lost) == len(by_hand):
+    if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
             "the machine is recognised in none of the photographs by hand",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
@@ -420,7 +423,7 @@ def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
         names = [session.configurations[k] for k in sorted(rows)]
         raise InputError(
             "the photographs that are recognised show one configuration only",
-            where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
+            where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
             found=f"{listed(names)}; {warnings[0]}" if warnings else listed(names),
             expected="two at least",
             next_step="Take photographs in which all legs are large and before a plain background",

@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
-from pkmcal.calibration.chance import chance_doubt
+from pkmcal.calibration.chance import by_chance, chance_doubt
 from pkmcal.calibration.departures import Departed, unmodelled_departures
 from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
@@ -167,7 +167,7 @@ def calibrate_session(
             seen = _observe(session, seed, clock)
             turns, richer = _identify(seen, refine_camera, seed, clock)
         # without one that was in a wrong place, another may show itself to be
-        while wrong := misplaced(
+        while wrong := by_chance(seen.session, turns) or misplaced(
             seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
         ):
             seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)

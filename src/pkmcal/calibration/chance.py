@@ -9,7 +9,9 @@ no leg is where it should be, and what is found is chance's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from pkmcal.calibration.turns import FEW_MEASURED, Turns
 from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.stations import BY_CHANCE
+from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
 MOVED_ASIDE = 2 * legs.LEG_SEARCH_REACH
@@ -26,40 +29,89 @@ DIRECTIONS_MOVED = 8
 """Directions in which it is, evenly: the chance that is told is that of one more draw."""
 
 
+class _Offered(NamedTuple):
+    """Edges of some stations: in sight, measured, about how many chance offers aside, and the
+    probability that it offers as many as were measured.
+    """
+
+    in_sight: int
+    measured: int
+    aside: float
+    chance: float
+
+
 def chance_doubt(turns: Turns) -> tuple[str, ...]:
     """Why the result is not to be used, if chance may have offered the edges by which it is told;
     asked only where less than a third of the edges in sight were measured.
     """
-    seen = turns.observation
-    measured = int(np.sum(~seen.edges.coarse))
-    missed = sum(r.side >= 0 and r.reason != legs.OUT_OF_SIGHT_REASON for r in seen.rejected)
-    given_up = int(np.sum(turns.estimate.edge_weights < 0.5))  # which are among both
-    in_sight = len(seen.edges) + missed - given_up
-    if not turns.photographs or measured >= FEW_MEASURED * in_sight:
-        return ()
-    angle = 2 * np.pi * np.arange(DIRECTIONS_MOVED) / DIRECTIONS_MOVED
-    aside = MOVED_ASIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    counts = np.array([_count(turns, away) for away in aside])
-    mean, spread = float(counts.mean()), float(counts.std(ddof=1))
-    apart = (_count(turns, np.zeros(2)) - mean) / max(spread * np.sqrt(1 + 1 / len(counts)), 1.0)
-    from scipy.special import stdtr
-
-    chance = float(stdtr(len(counts) - 1, -apart))
-    if chance < BY_CHANCE:
+    offered = _offered(turns, [p.station for p in turns.photographs])
+    if offered is None:
         return ()
     return (
-        f"Of {in_sight} edges in sight only {measured} were measured where the machine has"
-        f" them, and about {mean:.0f} are where nothing of it is, {MOVED_ASIDE:.0f} px aside:"
-        f" chance offers as many {how_often(chance)}. So this may not be the machine in"
+        f"Of {offered.in_sight} edges in sight only {offered.measured} were measured where the"
+        f" machine has them, and about {offered.aside:.0f} are where nothing of it is,"
+        f" {MOVED_ASIDE:.0f} px aside:"
+        f" chance offers as many {how_often(offered.chance)}. So this may not be the machine in"
         " the photographs, or hardly anything of it shows: check the drawing, the order of its"
         " legs, and the photographs' names; `pkmcal check` shows the drawing laid over them.",
     )
 
 
-def _count(turns: Turns, aside: Array) -> int:
-    """Edges measured with the pictures moved ``aside`` (2,), in the pixels that edges are in."""
+def by_chance(session: Session, turns: Turns) -> dict[int, str]:
+    """Why stations on a tripod may stand elsewhere than they were found, by their numbers, where
+    others tell the machine: chance offers as many edges as were measured there. One search of a
+    thousand ends elsewhere, surely as it seems; and where the machine hardly shows, little is lost.
+    A board on the base tells a place whatever edges do.
+    """
+    boards = set(turns.measurements.poses.station.tolist())
+    wrong: dict[int, str] = {}
+    for k in (p.station for p in turns.photographs):
+        station = session.stations[k]
+        if station.handheld or k in boards:
+            continue
+        if (offered := _offered(turns, [k])) is not None:
+            told = "" if station.T_camera_base is not None else "; a pose by hand would tell"
+            wrong[k] = (
+                f"only {offered.measured} of {offered.in_sight} edges in sight were measured where"
+                f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"
+                f" may stand elsewhere{told}"
+            )
+    return wrong if len(wrong) < len(turns.photographs) else {}
+
+
+def _offered(turns: Turns, stations: Sequence[int]) -> _Offered | None:
+    """What chance may have offered of some stations' edges; nothing where it can not have."""
+    from scipy.special import stdtr
+
+    seen = turns.observation
+    mine = np.isin(seen.edges.station, stations)
+    measured = int(np.sum(mine & ~seen.edges.coarse))
+    missed = sum(
+        r.side >= 0 and r.reason != legs.OUT_OF_SIGHT_REASON and r.station in stations
+        for r in seen.rejected
+    )
+    given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
+    in_sight = int(np.sum(mine)) + missed - given_up
+    if not turns.photographs or measured >= FEW_MEASURED * in_sight:
+        return None
+    angle = 2 * np.pi * np.arange(DIRECTIONS_MOVED) / DIRECTIONS_MOVED
+    aside = MOVED_ASIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    counts = np.array([_count(turns, stations, away) for away in aside])
+    mean, spread = float(counts.mean()), float(counts.std(ddof=1))
+    least = max(spread * np.sqrt(1 + 1 / len(counts)), 1.0)
+    apart = (_count(turns, stations, np.zeros(2)) - mean) / least
+    chance = float(stdtr(len(counts) - 1, -apart))
+    return _Offered(in_sight, measured, mean, chance) if chance >= BY_CHANCE else None
+
+
+def _count(turns: Turns, stations: Sequence[int], aside: Array) -> int:
+    """Edges measured from some stations with the pictures moved ``aside`` (2,), in the pixels that
+    edges are in.
+    """
     state, total = turns.estimate.state, 0
     for p in turns.photographs:
+        if p.station not in stations:
+            continue
         parameters = p.camera.parameters.copy()
         parameters[2:4] += p.binning * aside  # the centre, always third and fourth
         look = legs.measure(
