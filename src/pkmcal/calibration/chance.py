@@ -97,9 +97,11 @@ def _offered(turns: Turns, stations: Sequence[int]) -> _Offered | None:
     angle = 2 * np.pi * np.arange(DIRECTIONS_MOVED) / DIRECTIONS_MOVED
     aside = MOVED_ASIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     counts = np.array([_count(turns, stations, away) for away in aside])
-    mean, spread = float(counts.mean()), float(counts.std(ddof=1))
-    least = max(spread * np.sqrt(1 + 1 / len(counts)), 1.0)
-    apart = (_count(turns, stations, np.zeros(2)) - mean) / least
+    mean = float(counts.mean())
+    # eight counts may lie nearer to each other by chance than counts do
+    spread = max(float(counts.std(ddof=1)), np.sqrt(mean), 1.0)
+    own = _count(turns, stations, np.zeros(2))
+    apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
     chance = float(stdtr(len(counts) - 1, -apart))
     return _Offered(in_sight, measured, mean, chance) if chance >= BY_CHANCE else None
 
