@@ -150,7 +150,7 @@ def find_station(
     of few; what the others say of it decides, each in its turn. Then every photograph takes part.
 
     closely : look beside the likeliest places though they are one, as is done of searches from
-    nothing, for evidence that is to be compared.
+    nothing, and be as sure as a wide search has to be, for evidence that is to be compared.
     """
     if T_camera_base is None:
         return _found(view, None, rng, closely)
@@ -168,7 +168,7 @@ def _found(
     count = len(view.configuration)
     number = np.arange(count)
     halves = FEWEST_FOR_HALVES_TOLD if told else FEWEST_FOR_HALVES
-    enough = told.nearness.enough if told else EARLY_DECISION
+    enough = (FAR if closely else told.nearness).enough if told else EARLY_DECISION
     folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
     kept: list[Array] = []
     surely: list[Array] = []
