@@ -184,8 +184,7 @@ def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(cali
         read_photographs(calibrated.session),
         calibrated.measurements,
         calibrated.estimate,
-        lambda _: few,
-        lambda _: few,
+        lambda *_: (few, {}),
         lambda edges: replace(calibrated.measurements, edges=edges),
     )
     assert told == ()

@@ -15,20 +15,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, evenly
+from pkmcal.arrays import Array, Booleans, evenly
 from pkmcal.cameras.response import OTHER_RESPONSE, Response
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
-from pkmcal.observe.legs import Photographs
+from pkmcal.observe.legs import BlurByStation, Photographs
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 CONFIGURATIONS_ASKED_OF_RESPONSE = 12
 """Configurations of a camera whose photographs are asked at first: their two hundred edges show a
-wrong response by four standard deviations, even on metal."""
+wrong response by four standard deviations, even on metal; half as many did not show it in one of
+three small photographs through a mirror."""
 LEAST_RESPONSE_GAIN, MOST_WAY_DEVIATION = 2.7, 0.1
 """chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
 from which a response that is wrong would not show by so much."""
@@ -99,16 +100,15 @@ def told_by_edges(
     photographs: Sequence[Photographs],
     measurements: Measurements,
     estimate: Estimate,
-    roughly: Callable[[list[Photographs]], EdgeSet],
-    measured: Callable[[list[Photographs]], EdgeSet],
+    measured: Callable[[list[Photographs], BlurByStation], tuple[EdgeSet, BlurByStation]],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> tuple[ResponseTold, ...]:
     """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
     say that it is otherwise than usual, or do not tell.
 
-    measurements, estimate : by the usual responses. roughly, measured : the edges of photographs,
-    looked for where those of ``measurements`` were, with their blur or with one of their own.
-    of_edges : measurements with these edges instead.
+    measurements, estimate : by the usual responses. measured : the edges of photographs, looked for
+    where those of ``measurements`` were, and the blur by which they were measured, which is told
+    where it is known. of_edges : measurements with these edges instead.
     """
     usual: dict[_Camera, list[Photographs]] = {}
     for p in photographs:
@@ -116,8 +116,9 @@ def told_by_edges(
         if not station.response_told:
             usual.setdefault((station.camera_file, p.response), []).append(p)
     try:
-        few = {camera: roughly(_otherwise(_spread(mine))) for camera, mine in usual.items()}
-        gains, ways = _scored(measurements, estimate, few)
+        asked = {camera: _asked(mine) for camera, mine in usual.items()}
+        few = {x: measured(_otherwise(usual[x], some), {}) for x, some in asked.items()}
+        gains, ways = _scored(measurements, estimate, {x: edges for x, (edges, _) in few.items()})
         doubted = [
             camera
             for camera in usual
@@ -127,7 +128,11 @@ def told_by_edges(
             return ()
         edges = measurements.edges
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in doubted}
-        every = {camera: measured(_otherwise(usual[camera])) for camera in doubted}
+        every: dict[_Camera, EdgeSet] = {}
+        for camera in doubted:
+            first, blur = few[camera]
+            rest = _otherwise(usual[camera], [~some for some in asked[camera]])
+            every[camera] = concatenate([first, measured(rest, blur)[0]]) if rest else first
         # in the dark a wrong response leaves hardly an edge
         every = {x: e for x, e in every.items() if len(e) > LEAST_FOUND_OTHERWISE * own[x].sum()}
         if not every:
@@ -152,21 +157,26 @@ def told_by_edges(
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
 
 
-def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
-    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in photographs]
+def _otherwise(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
+    """Some of each station's photographs, if any, by the other response."""
+    return [
+        replace(p.select(np.flatnonzero(some)), response=OTHER_RESPONSE[p.response])
+        for p, some in zip(photographs, which, strict=True)
+        if some.any()
+    ]
 
 
-def _spread(photographs: Sequence[Photographs]) -> list[Photographs]:
-    """The photographs of some configurations, evenly over a camera's stations."""
+def _asked(photographs: Sequence[Photographs]) -> list[Booleans]:
+    """Which of each station's photographs are those of some configurations, evenly over a camera's
+    stations.
+    """
     shown = [np.unique(p.configuration) for p in photographs]
     first = np.cumsum([0, *map(len, shown)])
     some = evenly(int(first[-1]), CONFIGURATIONS_ASKED_OF_RESPONSE)
-    out: list[Photographs] = []
-    for p, here, since, end in zip(photographs, shown, first[:-1], first[1:], strict=True):
-        asked = here[some[(some >= since) & (some < end)] - since]
-        if len(asked):
-            out.append(p.select(np.flatnonzero(np.isin(p.configuration, asked))))
-    return out
+    return [
+        np.isin(p.configuration, here[some[(some >= since) & (some < end)] - since])
+        for p, here, since, end in zip(photographs, shown, first[:-1], first[1:], strict=True)
+    ]
 
 
 def _scored(

@@ -7,7 +7,7 @@ tables of poses need no prediction: they are measured once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -110,7 +110,7 @@ class Turns(NamedTuple):
     cameras: CameraRefinement
     responses: tuple[ResponseTold, ...] = ()
     photographs: Sequence[legs.Photographs] = ()
-    blur: Mapping[int, float | None] = MappingProxyType({})
+    blur: legs.BlurByStation = MappingProxyType({})
     scatter: float = 1.0
     start: State | None = None
     change: float = 0.0
@@ -169,23 +169,21 @@ def take_turns(
 
             def measured(
                 some: list[legs.Photographs],
-                blur: dict[int, float | None],
+                blur: legs.BlurByStation,
                 before: Estimate = before,
                 refine: bool = cameras.active,
-            ) -> EdgeSet:
+            ) -> tuple[EdgeSet, legs.BlurByStation]:
                 lap("identify")
-                look = partial(_measure, estimate=before, blur=blur, refine=refine)
-                edges = concatenate([one.edges for one in _each(some, look)])
+                found = _each(some, partial(_measure, estimate=before, blur=blur, refine=refine))
                 lap("observe")
-                return edges
+                return concatenate([one.edges for one in found]), _blur_of(found, some)
 
             responses = told_by_edges(
                 session,
                 photographs,
                 measurements,
                 estimate,
-                partial(measured, blur=blur),  # nearly the same by the other response
-                partial(measured, blur={}),
+                measured,
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
             lap("identify")
@@ -297,7 +295,7 @@ def _looked(
     session: Session,
     photographs: Sequence[legs.Photographs],
     estimate: Estimate,
-    blur: Mapping[int, float | None],
+    blur: legs.BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.PhotographsLookedAt | None = None,
@@ -312,7 +310,7 @@ def _looked_through(
     session: Session,
     photographs: Sequence[legs.Photographs],
     estimate: Estimate,
-    blur: Mapping[int, float | None],
+    blur: legs.BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.PhotographsLookedAt,
@@ -359,7 +357,7 @@ def _width_of_edges(
 def _binned(
     session: Session,
     photographs: Sequence[legs.Photographs],
-    blur: Mapping[int, float | None],
+    blur: legs.BlurByStation,
     *,
     more: bool,
 ) -> list[legs.Photographs]:
@@ -521,7 +519,7 @@ def _whole_legs(
 def _measure(
     photographs: legs.Photographs,
     estimate: Estimate,
-    blur: Mapping[int, float | None],
+    blur: legs.BlurByStation,
     refine: bool,
     done: legs.PhotographsLookedAt | None = None,
 ) -> legs.StationEdges:

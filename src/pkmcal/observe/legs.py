@@ -14,7 +14,8 @@ forgotten with it, and a few hundred numbers of its edges remain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
@@ -24,7 +25,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
-from pkmcal.cameras.response import Response, light_in, light_of_levels
+from pkmcal.cameras.response import Response, light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
@@ -81,8 +82,9 @@ EDGE_SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
 PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
 """Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-PROFILES_A_POINT = 5
-"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
+MOST_PROFILES_A_POINT = 5
+"""Profiles taken about each of these, of edges of 200 pixels: one a pixel, which faint edges need.
+Of shorter ones fewer, for more would be of the same pixels."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
 OTHER_OUTLINE_CLEARANCE = 5.0
@@ -92,6 +94,8 @@ OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
+BlurByStation = Mapping[int, float | None]
+"""Px, None where it is still to be estimated."""
 PhotographsLookedAt = Callable[[int], None]
 """Called with how many photographs more were looked at."""
 
@@ -483,12 +487,14 @@ def _segment_profiles(
 
     Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
     """
-    count = PROFILES_A_POINT * _by_segment(clear).sum(axis=-1)
-    full = count >= FEWEST_SHARE * (PROFILES_A_POINT * PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
-    seen = np.repeat(_by_segment(clear)[full], PROFILES_A_POINT, axis=-1)
+    clear_points = _by_segment(clear).sum(axis=-1)
+    full = clear_points >= FEWEST_SHARE * (PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
+    each = _profiles_a_point(points)
+    count = each * clear_points
+    seen = np.repeat(_by_segment(clear)[full], each, axis=-1)
     seen = seen[:, None].astype(np.float32)
-    outward = np.repeat(_by_segment(points.outward)[full], PROFILES_A_POINT, axis=-2)
-    pixel = photographs.camera.project(_between(points, full))
+    outward = np.repeat(_by_segment(points.outward)[full], each, axis=-2)
+    pixel = photographs.camera.project(_between(points, full, each))
     offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
     clipped = np.empty((len(seen), 1, explained), np.float32)
@@ -500,8 +506,8 @@ def _segment_profiles(
         across = _outward_of(pixel[mine].reshape(-1, 2), outward[mine].reshape(-1, 2), offsets)
         # a row a segment: what lies close in the photograph is interpolated together
         rows = (v.reshape(-1, seen.shape[-1] * len(offsets)) for v in across)
-        light = light_in(image, response)
-        grey = levels_at(light, *rows, cubic=True).reshape(-1, seen.shape[-1], len(offsets))
+        grey = levels_at(image, *rows, cubic=True, response=response)
+        grey = grey.reshape(-1, seen.shape[-1], len(offsets))
         np.matmul(seen[mine], grey, out=total[mine])
         np.matmul(seen[mine], grey[..., -explained:] >= clipped_from, out=clipped[mine])
     mean = total[:, 0] / count[full][:, None]
@@ -515,15 +521,26 @@ def _by_segment(values: Array | Booleans) -> Any:
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
-def _between(points: EdgePoints, full: Booleans) -> Array:
-    """Places (N, n, 3) of all n profiles in each of the N segments that are ``full``.
+def _profiles_a_point(points: EdgePoints) -> int:
+    """How many profiles are taken about each point: one a pixel of half of the edges."""
+    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
+    apart = np.hypot(chord[..., 0], chord[..., 1]) / (PREDICTED_EDGE_POINTS - 1)
+    seen = apart[points.valid.all(axis=-1)]
+    if not seen.size:
+        return 1
+    return min(max(math.ceil(np.median(seen)), 1), MOST_PROFILES_A_POINT)
+
+
+def _between(points: EdgePoints, full: Booleans, each: int) -> Array:
+    """Places (N, n, 3) of all n profiles, ``each`` a point, in each of the N segments that are
+    ``full``.
 
     Points of an edge lie evenly on a line in space, so those between are interpolated there; the
     profiles' directions hardly turn from one to the next.
     """
     k, e, segment = np.nonzero(full)
     start, step = points.point[..., 0, :], points.point[..., 1, :] - points.point[..., 0, :]
-    fraction = (np.arange(PREDICTED_EDGE_POINTS * PROFILES_A_POINT) + 0.5) / PROFILES_A_POINT - 0.5
+    fraction = (np.arange(PREDICTED_EDGE_POINTS * each) + 0.5) / each - 0.5
     mine = fraction.reshape(EDGE_SEGMENTS, -1)[segment]
     return of_components(*(start[k, e, c, None] + mine * step[k, e, c, None] for c in range(3)))
 

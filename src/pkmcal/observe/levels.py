@@ -1,4 +1,4 @@
-"""Grey levels of a photograph at places between its pixels.
+"""Grey levels of a photograph, or the light that they code, at places between its pixels.
 
 Only the part of the photograph that the places lie in is worked on: a machine fills a quarter of
 it, and what is worked out of a whole one does not stay in the processor's cache.
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.cameras.response import Response, light_in
 
 INTERPOLATION_MARGIN = 2
 """Pixels about a place whose levels an interpolation takes."""
@@ -18,29 +19,35 @@ BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
 
-def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: float = 0.0) -> Array:
-    """Grey levels (m, n) of a photograph (height, width) at columns and rows (m, n), interpolated.
+def levels_at(
+    image: Any,
+    x: Array,
+    y: Array,
+    *,
+    cubic: bool = False,
+    blur: float = 0.0,
+    response: Response = "linear",
+) -> Array:
+    """Light (m, n) in a photograph (height, width) at columns and rows (m, n), interpolated.
 
     m, n : fewer than 2**15, as cv2.remap wants it. blur : standard deviation (px) of a Gaussian
-    that goes over the photograph first. Places outside have the levels of its border, places that
-    are no numbers any level.
+    that goes over the levels first. response : how these code light; linear leaves them as they
+    are. Places outside have the light of its border, places that are no numbers any.
     """
     import cv2
 
     if not x.size:
         return np.zeros(x.shape, np.float32)
-    x, y = (_numbers(v.astype(np.float32, copy=False)) for v in (x, y))
     half = round(BLUR_KERNEL_END * blur)
     height, width = image.shape
-    columns, rows = (
-        _span(v, INTERPOLATION_MARGIN + half, size) for v, size in ((x, width), (y, height))
-    )
-    part = image[rows, columns]
+    x, columns = _spanned(x, INTERPOLATION_MARGIN + half, width)
+    y, rows = _spanned(y, INTERPOLATION_MARGIN + half, height)
+    part = light_in(image[rows, columns], response)
     if blur:
         kernel = cv2.getGaussianKernel(2 * half + 1, blur, cv2.CV_32F)
         levels: Any = cv2.sepFilter2D(part, cv2.CV_32F, kernel, kernel)
     else:  # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
-        levels = part.astype(np.float32)
+        levels = part.astype(np.float32, copy=False)
     how = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     across: Any = x - np.float32(columns.start)
     down: Any = y - np.float32(rows.start)
@@ -48,15 +55,15 @@ def levels_at(image: Any, x: Array, y: Array, *, cubic: bool = False, blur: floa
     return found
 
 
-def _numbers(places: Array) -> Array:
-    """Places with 0 for what is no number."""
-    if np.isfinite((places.min(), places.max())).all():  # of any that is none, one is none
-        return places
-    return np.where(np.isfinite(places), places, 0.0)
-
-
-def _span(places: Array, around: int, size: int) -> slice:
-    """The pixels, of so many in a row, in which places lie, and so many to both sides."""
-    first = min(max(int(places.min()) - around, 0), size - 1)
-    last = min(max(int(places.max()) + 1 + around, first), size - 1)
-    return slice(first, last + 1)
+def _spanned(places: Array, around: int, size: int) -> tuple[Array, slice]:
+    """Places (m, n) in single precision, 0 where they are no numbers, and the pixels, of so many in
+    a row, in which they lie, with so many to both sides.
+    """
+    places = places.astype(np.float32, copy=False)
+    low, high = places.min(), places.max()
+    if not (np.isfinite(low) and np.isfinite(high)):  # of any that is no number, one is none
+        places = np.where(np.isfinite(places), places, np.float32(0))
+        low, high = places.min(), places.max()
+    first = min(max(int(low) - around, 0), size - 1)
+    last = min(max(int(high) + 1 + around, first), size - 1)
+    return places, slice(first, last + 1)
