@@ -87,8 +87,9 @@ LIKELIEST_PLACES_SETTLED = 4
 """Of the likeliest places, where all are one, those that are settled without a look beside them."""
 FEW_PLACES_ANYWHERE, FEW_PLACES_KEPT = 160, 16
 """Where one of thirty hypotheses is looked at."""
-NEARBY_PLACES_SETTLED = 8
-"""Places of each of thirty hypotheses that are settled."""
+NEARBY_PLACES_SETTLED, HYPOTHESES_SETTLED = 8, 8
+"""Places of each of thirty hypotheses that are settled, and of how many beside the first: three are
+searched in full."""
 FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
 each in its turn. About a known pose two are enough to be searched."""
@@ -304,7 +305,8 @@ def evidence_nearby(
     rng: np.random.Generator,
 ) -> Array:
     """What a short search from poses (S, 4, 4) finds in some photographs, ``few``, with each of
-    several readings (N, K, m) of all, (N,); from none, anywhere.
+    several readings (N, K, m) of all, (N,); from none, anywhere. Of many, those that are far from
+    the best, and not the first, find nothing (minus infinity).
 
     wide : look about the starts first, as about a pose by hand.
     """
@@ -321,13 +323,15 @@ def evidence_nearby(
     count = each.shape[1]
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
     ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 10, 8, 6, 5))
-    if count > NEARBY_PLACES_SETTLED:
-        told = score(view, ends, few, 5).reshape(-1, count)
-        order = np.argsort(told, axis=1)[:, :NEARBY_PLACES_SETTLED]
-        kept = (order + count * np.arange(len(legs))[:, None]).ravel()
-        ends, view = ends[kept], view.guess(kept)
-    evidence = settle_by_evidence(view, ends, few, 5, 3)[1]
-    return evidence.reshape(len(legs), -1).max(axis=1)
+    told = score(view, ends, few, 5).reshape(-1, count)
+    asked = np.argsort(told.min(axis=1)[1:])[:HYPOTHESES_SETTLED] + 1
+    asked = np.concatenate([[0], asked])
+    order = np.argsort(told[asked], axis=1)[:, :NEARBY_PLACES_SETTLED]
+    kept = (order + count * asked[:, None]).ravel()
+    settled = settle_by_evidence(view.guess(kept), ends[kept], few, 5, 3)[1]
+    evidence = np.full(len(legs), -np.inf)
+    evidence[asked] = settled.reshape(len(asked), -1).max(axis=1)
+    return evidence
 
 
 def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Generator) -> Array:
