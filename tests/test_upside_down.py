@@ -109,15 +109,18 @@ def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigm
 @pytest.mark.parametrize(
     ("centre", "sigma", "known"),
     [((8.0, -5.0), None, True), ((0.5, -0.5), None, False), ((0.0, 0.0), None, False),
-     ((0.5, -0.5), 0.05, True), ((8.0, -5.0), 8.0, False)],
-    ids=["beside the middle", "half a pixel beside", "in the middle", "known to less", "not known"],
+     ((0.5, -0.5), 0.05, True), ((0.5, -0.5), 0.0, True), ((8.0, -5.0), 8.0, False)],
+    ids=["beside the middle", "half a pixel beside", "in the middle", "known to less", "exactly",
+         "not known"],
 )  # fmt: skip
 def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, sigma, known):
     """A centre that is half a pixel from the middle may be on the other side without any turn."""
     fit = Freed(np.array([0.9]), np.array([0.05]), np.zeros(1))
     monkeypatch.setattr(Departures, "fitted", lambda _, freed: [fit] * len(freed))
     n = len(calibrated.session.stations[0].camera.parameters)
-    covariance = None if sigma is None else sigma**2 * np.eye(n)
+    covariance = None
+    if sigma is not None:
+        covariance = np.diag([1.0, 1.0, sigma**2, sigma**2] + [1e-6] * (n - 4))
     assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == known
 
 

@@ -239,13 +239,13 @@ def _identify(
     is none, diameters for radii may be why.
     """
     try:
-        return _identified(seen, refine_camera, clock)
+        return _in_turns(seen, refine_camera, clock)
     except ResultError:
         check_radii(seen, None, refine_camera, seed)
         raise
 
 
-def _identified(
+def _in_turns(
     seen: SeenSession, refine_camera: bool, clock: _Clock
 ) -> tuple[Turns, tuple[RicherModel, ...]]:
     """The same, or why there is none."""

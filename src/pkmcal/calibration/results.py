@@ -110,7 +110,7 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
 
     document : of :func:`calibration_document`.
     """
-    from pkmcal.cameras.files import camera_text, refined_camera
+    from pkmcal.cameras.files import camera_text, written_camera
 
     texts: dict[str, str | bytes] = {
         CALIBRATED_MECHANISM_FILE: calibrated_mechanism_text(calibration),
@@ -119,9 +119,9 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
-        texts[refined_camera(file)] = camera_text(camera)
+        texts[written_camera(file)] = camera_text(camera)
     for turned in calibration.upside_down:
-        texts[refined_camera(turned.file)] = camera_text(turned.camera)
+        texts[written_camera(turned.file)] = camera_text(turned.camera)
     return texts
 
 

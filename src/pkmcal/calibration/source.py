@@ -18,7 +18,7 @@ from pkmcal.calibration.results import (
 )
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
-from pkmcal.cameras.files import camera_path, load_camera, refined_camera
+from pkmcal.cameras.files import camera_path, load_camera, written_camera
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
@@ -199,7 +199,7 @@ def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
     """
     if Path(file).suffix == ".csv":
         return None
-    refined = folder / refined_camera(file)
+    refined = folder / written_camera(file)
     if refined.is_file():
         return refined
     given = None if session is None else session / file

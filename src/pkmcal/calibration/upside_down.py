@@ -20,7 +20,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.departures import CameraChange
 from pkmcal.calibration.turns import Turns
 from pkmcal.cameras import Camera
-from pkmcal.cameras.files import refined_camera
+from pkmcal.cameras.files import written_camera
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.score import Departures
 from pkmcal.session.load import Session
@@ -35,6 +35,8 @@ FURTHER_THAN_TURNED = 1.5
 """Times the way, from which what fits is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
 """px; of a calibrated camera's centre along the way, where the file does not say."""
+EXACTLY_KNOWN = 1e-14
+"""Share of a file's largest variance from which one counts as none."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class UpsideDown:
             f"The photographs of {listed(self.entries)} are upside down against {self.file}: so say"
             f" their edges, at odds of more than {ODDS_FOR_UPSIDE_DOWN:.0f} to 1. They are measured"
             f" by the same camera turned by half, whose centre is at [{centre}]. Copy"
-            f" {refined_camera(self.file)} from the result's folder to the session's and name it in"
+            f" {written_camera(self.file)} from the result's folder to the session's and name it in"
             f" session.yaml in the place of {self.file}, and every command knows it."
         )
 
@@ -94,11 +96,16 @@ def _way(camera: Camera) -> Array:
 def _file_sigma(camera: Camera) -> float:
     """Standard deviation of how far along the way a camera may be from what its file says."""
     way = _way(camera)
-    if camera.covariance is not None:
-        known = float(way @ np.linalg.pinv(camera.covariance, hermitian=True) @ way)
-        return float(known**-0.5) if known > 0 else np.inf
-    length = float(np.linalg.norm(way[2:4]))
-    return USUAL_CENTRE_ERROR / length if length else np.inf
+    if camera.covariance is None:
+        length = float(np.linalg.norm(way[2:4]))
+        return USUAL_CENTRE_ERROR / length if length else np.inf
+    if not way.any():
+        return np.inf
+    variance, axes = np.linalg.eigh(camera.covariance)
+    along, exact = axes.T @ way, variance <= EXACTLY_KNOWN * variance[-1]
+    if np.abs(along[exact]).max(initial=0.0) > np.sqrt(EXACTLY_KNOWN) * np.linalg.norm(way):
+        return 0.0
+    return float(np.sum(along[~exact] ** 2 / variance[~exact]) ** -0.5)
 
 
 def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:

@@ -48,7 +48,7 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     return camera_from_document(document)
 
 
-def refined_camera(file: str) -> str:
+def written_camera(file: str) -> str:
     """The name of a camera's file as refined with the machine, or turned by half as photographs
     were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
     and a # in it, become hyphens.

@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
 from pkmcal.calibration.saved import SavedCalibration
-from pkmcal.cameras.files import load_camera, refined_camera
+from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
@@ -80,7 +80,7 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     """
     then = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
-        row["file"]: load_camera(saved.path.parent / refined_camera(row["file"]))
+        row["file"]: load_camera(saved.path.parent / written_camera(row["file"]))
         for row in saved.document["cameras"]
         if row.get("upside_down")
     }

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera, load_camera
-from pkmcal.cameras.files import refined_camera
+from pkmcal.cameras.files import written_camera
 from pkmcal.cameras.response import Response
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
@@ -130,7 +130,7 @@ class Viewed:
         saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
-        refined = saved.path.parent / refined_camera(station.camera_file)
+        refined = saved.path.parent / written_camera(station.camera_file)
         camera = load_camera(refined) if refined.is_file() else station.camera
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
