@@ -15,13 +15,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pkmcal
+from pkmcal.calibration import responses
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.recognise import read_photographs
-from pkmcal.calibration.responses import ResponseTold, told_by_edges
+from pkmcal.calibration.responses import (
+    LEAST_RESPONSE_GAIN,
+    ResponseTold,
+    _scored,
+    told_by_edges,
+)
 from pkmcal.calibration.saved import load
 from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError
+from pkmcal.identify.estimate import Estimate
 from pkmcal.judge.new_data import _as_then
+from pkmcal.measurements import Measurements
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
 from test_calibration import check_found
@@ -176,6 +184,28 @@ def test_the_edges_overrule_what_is_usual_for_jpeg_files(demo, session):
     check_overruled(calibrate_session(session), "linear", "srgb", demo)
 
 
+def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(coded, monkeypatch):
+    """Of the same machine, they would: it has taken up most of what a wrong response does to all of
+    them, and by a part alone no other would fit.
+    """
+    calls: list[tuple[Measurements, Estimate, dict]] = []
+
+    def recorded(measurements, estimate, other):
+        calls.append((measurements, estimate, other))
+        return _scored(measurements, estimate, other)
+
+    monkeypatch.setattr(responses, "_scored", recorded)
+    calibrate_session(coded.folder)
+    measurements, by_few, few = calls[0]
+    kept = by_few.edge_weights > 0
+    assert 0.2 < kept.mean() < 0.8
+    (gain,) = _scored(measurements, by_few, few)[0].values()
+    every = replace(by_few, edge_weights=np.ones(len(kept)))
+    (held_back,) = _scored(measurements, every, few)[0].values()
+    assert gain > 5 * LEAST_RESPONSE_GAIN
+    assert gain > 1.5 * held_back
+
+
 def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
     """In the dark the wrong one leaves three of a hundred, which say nothing, and that says it."""
     few = calibrated.measurements.edges.select(np.arange(3))
@@ -184,7 +214,8 @@ def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(cali
         read_photographs(calibrated.session),
         calibrated.measurements,
         calibrated.estimate,
-        lambda *_: (few, {}),
+        lambda _: few,
+        lambda _: few,
         lambda edges: replace(calibrated.measurements, edges=edges),
     )
     assert told == ()

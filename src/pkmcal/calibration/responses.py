@@ -3,9 +3,9 @@
 A file's kind says what is usual, not what is so. Blurred edges lean to their dark side where levels
 are coded otherwise than believed, each by its own contrast, and no machine does that: so the way
 from where edges lie by one response to where they lie by the other is a departure of one number
-(:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs tell
-whether there is anything to gain; if so all are measured by the other response too, and right is
-the one from which there is less to gain by going to the other.
+(:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs, taken by
+themselves, tell whether there is anything to gain; if so all are measured by the other response
+too, and right is the one from which there is less to gain by going to the other.
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
-from pkmcal.observe.legs import BlurByStation, Photographs
+from pkmcal.observe.legs import Photographs
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
-CONFIGURATIONS_ASKED_OF_RESPONSE = 12
-"""Configurations of a camera whose photographs are asked at first: their two hundred edges show a
-wrong response by four standard deviations, even on metal; half as many did not show it in one of
-three small photographs through a mirror."""
+CONFIGURATIONS_ASKED_OF_RESPONSE = 6
+"""Configurations of a camera whose photographs are asked at first: of painted legs their hundred
+and fifty edges show a wrong response by six standard deviations."""
 LEAST_RESPONSE_GAIN, MOST_WAY_DEVIATION = 2.7, 0.1
 """chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
-from which a response that is wrong would not show by so much."""
+from which some do not tell, as those of metal."""
 LEAST_FOUND_OTHERWISE = 0.5
 """Share of the edges that a response has to find, of those by the usual one, to be right."""
 ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
@@ -100,15 +99,16 @@ def told_by_edges(
     photographs: Sequence[Photographs],
     measurements: Measurements,
     estimate: Estimate,
-    measured: Callable[[list[Photographs], BlurByStation], tuple[EdgeSet, BlurByStation]],
+    roughly: Callable[[list[Photographs]], EdgeSet],
+    measured: Callable[[list[Photographs]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> tuple[ResponseTold, ...]:
     """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
     say that it is otherwise than usual, or do not tell.
 
-    measurements, estimate : by the usual responses. measured : the edges of photographs, looked for
-    where those of ``measurements`` were, and the blur by which they were measured, which is told
-    where it is known. of_edges : measurements with these edges instead.
+    measurements, estimate : by the usual responses. roughly, measured : the edges of photographs,
+    looked for where those of ``measurements`` were, with their blur or with one of their own.
+    of_edges : measurements with these edges instead.
     """
     usual: dict[_Camera, list[Photographs]] = {}
     for p in photographs:
@@ -117,8 +117,10 @@ def told_by_edges(
             usual.setdefault((station.camera_file, p.response), []).append(p)
     try:
         asked = {camera: _asked(mine) for camera, mine in usual.items()}
-        few = {x: measured(_otherwise(usual[x], some), {}) for x, some in asked.items()}
-        gains, ways = _scored(measurements, estimate, {x: edges for x, (edges, _) in few.items()})
+        few = {x: roughly(_otherwise(_select(usual[x], some))) for x, some in asked.items()}
+        # edges of the same machine that stay where they are would hold these back
+        weight = np.where(_shown(measurements.edges, usual, asked), estimate.edge_weights, 0.0)
+        gains, ways = _scored(measurements, replace(estimate, edge_weights=weight), few)
         doubted = [
             camera
             for camera in usual
@@ -128,11 +130,7 @@ def told_by_edges(
             return ()
         edges = measurements.edges
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in doubted}
-        every: dict[_Camera, EdgeSet] = {}
-        for camera in doubted:
-            first, blur = few[camera]
-            rest = _otherwise(usual[camera], [~some for some in asked[camera]])
-            every[camera] = concatenate([first, measured(rest, blur)[0]]) if rest else first
+        every = {camera: measured(_otherwise(usual[camera])) for camera in doubted}
         # in the dark a wrong response leaves hardly an edge
         every = {x: e for x, e in every.items() if len(e) > LEAST_FOUND_OTHERWISE * own[x].sum()}
         if not every:
@@ -157,13 +155,14 @@ def told_by_edges(
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
 
 
-def _otherwise(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
-    """Some of each station's photographs, if any, by the other response."""
-    return [
-        replace(p.select(np.flatnonzero(some)), response=OTHER_RESPONSE[p.response])
-        for p, some in zip(photographs, which, strict=True)
-        if some.any()
-    ]
+def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
+    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in photographs]
+
+
+def _select(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
+    """Some of each station's photographs, if any."""
+    pairs = zip(photographs, which, strict=True)
+    return [p.select(np.flatnonzero(some)) for p, some in pairs if some.any()]
 
 
 def _asked(photographs: Sequence[Photographs]) -> list[Booleans]:
@@ -177,6 +176,20 @@ def _asked(photographs: Sequence[Photographs]) -> list[Booleans]:
         np.isin(p.configuration, here[some[(some >= since) & (some < end)] - since])
         for p, here, since, end in zip(photographs, shown, first[:-1], first[1:], strict=True)
     ]
+
+
+def _shown(
+    edges: EdgeSet,
+    usual: Mapping[_Camera, Sequence[Photographs]],
+    asked: Mapping[_Camera, Sequence[Booleans]],
+) -> Booleans:
+    """Which edges (N,) are in the photographs that are asked, or of cameras that are not asked."""
+    out = np.ones(len(edges), dtype=bool)
+    for camera, mine in usual.items():
+        for p, some in zip(mine, asked[camera], strict=True):
+            shown = np.isin(edges.configuration, p.configuration[some])
+            out &= (edges.station != p.station) | shown
+    return out
 
 
 def _scored(

@@ -172,18 +172,20 @@ def take_turns(
                 blur: legs.BlurByStation,
                 before: Estimate = before,
                 refine: bool = cameras.active,
-            ) -> tuple[EdgeSet, legs.BlurByStation]:
+            ) -> EdgeSet:
                 lap("identify")
-                found = _each(some, partial(_measure, estimate=before, blur=blur, refine=refine))
+                look = partial(_measure, estimate=before, blur=blur, refine=refine)
+                edges = concatenate([one.edges for one in _each(some, look)])
                 lap("observe")
-                return concatenate([one.edges for one in found]), _blur_of(found, some)
+                return edges
 
             responses = told_by_edges(
                 session,
                 photographs,
                 measurements,
                 estimate,
-                measured,
+                partial(measured, blur=blur),  # nearly the same by the other response
+                partial(measured, blur={}),
                 lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
             )
             lap("identify")
