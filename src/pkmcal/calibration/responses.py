@@ -4,8 +4,8 @@ A file's kind says what is usual, not what is so. Blurred edges lean to their da
 are coded otherwise than believed, each by its own contrast, and no machine does that: so the way
 from where edges lie by one response to where they lie by the other is a departure of one number
 (:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs, taken by
-themselves, tell whether there is anything to gain; if so all are measured by the other response
-too, and right is the one from which there is less to gain by going to the other.
+themselves, tell whether there is anything to gain, but of polished legs; if so all are measured by
+the other response too, and right is the one from which there is less to gain by going to the other.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures
+from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
 from pkmcal.observe.legs import Photographs
 from pkmcal.session.load import Session
@@ -31,7 +32,7 @@ CONFIGURATIONS_ASKED_OF_RESPONSE = 6
 and fifty edges show a wrong response by six standard deviations."""
 LEAST_RESPONSE_GAIN, MOST_WAY_DEVIATION = 2.7, 0.1
 """chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
-from which some do not tell, as those of metal."""
+from which some do not tell."""
 LEAST_FOUND_OTHERWISE = 0.5
 """Share of the edges that a response has to find, of those by the usual one, to be right."""
 ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
@@ -116,16 +117,7 @@ def told_by_edges(
         if not station.response_told:
             usual.setdefault((station.camera_file, p.response), []).append(p)
     try:
-        asked = {camera: _asked(mine) for camera, mine in usual.items()}
-        few = {x: roughly(_otherwise(_select(usual[x], some))) for x, some in asked.items()}
-        # edges of the same machine that stay where they are would hold these back
-        weight = np.where(_shown(measurements.edges, usual, asked), estimate.edge_weights, 0.0)
-        gains, ways = _scored(measurements, replace(estimate, edge_weights=weight), few)
-        doubted = [
-            camera
-            for camera in usual
-            if gains[camera] > LEAST_RESPONSE_GAIN or not ways[camera] < MOST_WAY_DEVIATION
-        ]
+        doubted = _doubted(measurements, estimate, usual, roughly)
         if not doubted:
             return ()
         edges = measurements.edges
@@ -153,6 +145,29 @@ def told_by_edges(
         for camera in every
     ]
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+
+
+def _doubted(
+    measurements: Measurements,
+    estimate: Estimate,
+    usual: Mapping[_Camera, Sequence[Photographs]],
+    roughly: Callable[[list[Photographs]], EdgeSet],
+) -> list[_Camera]:
+    """Cameras all of whose photographs are to be asked: some have something to gain, or do not
+    tell, as those of polished legs.
+    """
+    if estimate.edge_noise.shading.max() > POLISHED_SHADING:
+        return list(usual)
+    asked = {camera: _asked(mine) for camera, mine in usual.items()}
+    few = {x: roughly(_otherwise(_select(usual[x], some))) for x, some in asked.items()}
+    # edges of the same machine that stay where they are would hold these back
+    weight = np.where(_shown(measurements.edges, usual, asked), estimate.edge_weights, 0.0)
+    gains, ways = _scored(measurements, replace(estimate, edge_weights=weight), few)
+    return [
+        camera
+        for camera in usual
+        if gains[camera] > LEAST_RESPONSE_GAIN or not ways[camera] < MOST_WAY_DEVIATION
+    ]
 
 
 def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
