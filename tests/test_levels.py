@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from pkmcal.cameras.response import light_in
 from pkmcal.observe.levels import levels_at
 
 PHOTOGRAPH = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
@@ -30,6 +31,14 @@ def test_levels_are_those_of_the_whole_photograph(x, y, blur):
     np.testing.assert_allclose(
         found, map_coordinates(whole, [y, x], order=1), atol=8 if not blur else 3
     )
+
+
+def test_light_is_that_of_the_whole_photographs_levels():
+    x, y = places((20, 30), (15, 19))
+    found = levels_at(PHOTOGRAPH, x, y, cubic=True, response="srgb")
+    whole = levels_at(light_in(PHOTOGRAPH, "srgb"), x, y, cubic=True)
+    np.testing.assert_array_equal(found, whole)
+    assert not np.allclose(found, levels_at(PHOTOGRAPH, x, y, cubic=True), atol=5)
 
 
 def test_outside_stands_the_border_and_what_is_no_number_does_not_harm():

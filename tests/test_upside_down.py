@@ -120,7 +120,7 @@ def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, si
     n = len(calibrated.session.stations[0].camera.parameters)
     covariance = None
     if sigma is not None:
-        covariance = np.diag([1.0, 1.0, sigma**2, sigma**2] + [1e-6] * (n - 4))
+        covariance = np.diag([1.0, 1.0, sigma**2, sigma**2] + [0.0] * (n - 4))
     assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == known
 
 

@@ -35,8 +35,8 @@ FURTHER_THAN_TURNED = 1.5
 """Times the way, from which what fits is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
 """px; of a calibrated camera's centre along the way, where the file does not say."""
-EXACTLY_KNOWN = 1e-14
-"""Share of a file's largest variance from which one counts as none."""
+LEAST_CENTRE_ERROR = 1e-6
+"""px; of a centre that a file holds to be exact."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,17 @@ def _way(camera: Camera) -> Array:
 
 
 def _file_sigma(camera: Camera) -> float:
-    """Standard deviation of how far along the way a camera may be from what its file says."""
-    way = _way(camera)
-    if camera.covariance is None:
-        length = float(np.linalg.norm(way[2:4]))
-        return USUAL_CENTRE_ERROR / length if length else np.inf
-    if not way.any():
+    """Standard deviation of how far along the way a camera may be from what its file says, by its
+    centre.
+    """
+    centre = _way(camera)[2:4]
+    length = float(np.linalg.norm(centre))
+    if not length:
         return np.inf
-    variance, axes = np.linalg.eigh(camera.covariance)
-    along, exact = axes.T @ way, variance <= EXACTLY_KNOWN * variance[-1]
-    if np.abs(along[exact]).max(initial=0.0) > np.sqrt(EXACTLY_KNOWN) * np.linalg.norm(way):
-        return 0.0
-    return float(np.sum(along[~exact] ** 2 / variance[~exact]) ** -0.5)
+    if camera.covariance is None:
+        return USUAL_CENTRE_ERROR / length
+    known = camera.covariance[2:4, 2:4] + LEAST_CENTRE_ERROR**2 * np.eye(2)
+    return float(centre @ np.linalg.solve(known, centre)) ** -0.5
 
 
 def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:

@@ -353,7 +353,7 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
         some = names[first : first + NAMES_AT_ONCE]
         guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
         places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
-        look = look_under(replace(view, guessed=guessed), places, every, 4)
+        look = look_under(replace(view, guessed=guessed), places, every, 8)
         fits.append(by_photograph(look.evidence(mixture), len(every)))
     return np.concatenate(fits).T
 

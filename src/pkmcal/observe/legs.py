@@ -83,8 +83,8 @@ EDGE_SEGMENTS = 8
 PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
 """Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
 MOST_PROFILES_A_POINT = 5
-"""Profiles taken about each of these, of edges of 200 pixels: one a pixel, which faint edges need.
-Of shorter ones fewer, for more would be of the same pixels."""
+"""Profiles taken about each of these where edges are 200 pixels long: one a pixel, which faint ones
+need. Of shorter ones fewer, for more would be of the same pixels."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
 OTHER_OUTLINE_CLEARANCE = 5.0
@@ -522,7 +522,9 @@ def _by_segment(values: Array | Booleans) -> Any:
 
 
 def _profiles_a_point(points: EdgePoints) -> int:
-    """How many profiles are taken about each point: one a pixel of half of the edges."""
+    """How many profiles are taken about each point: at least one a pixel on half of the edges that
+    are looked at together.
+    """
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
     apart = np.hypot(chord[..., 0], chord[..., 1]) / (PREDICTED_EDGE_POINTS - 1)
     seen = apart[points.valid.all(axis=-1)]

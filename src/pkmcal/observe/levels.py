@@ -31,8 +31,8 @@ def levels_at(
     """Light (m, n) in a photograph (height, width) at columns and rows (m, n), interpolated.
 
     m, n : fewer than 2**15, as cv2.remap wants it. blur : standard deviation (px) of a Gaussian
-    that goes over the levels first. response : how these code light; linear leaves them as they
-    are. Places outside have the light of its border, places that are no numbers any.
+    that goes over the light first. response : how the levels code it; linear leaves them as they
+    are. Places outside have the light of its border, places that are no numbers any light.
     """
     import cv2
 
