@@ -14,7 +14,6 @@ forgotten with it, and a few hundred numbers of its edges remain.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
@@ -82,9 +81,8 @@ EDGE_SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
 PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
 """Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-MOST_PROFILES_A_POINT = 5
-"""Profiles taken about each of these where edges are 200 pixels long: one a pixel, which faint ones
-need. Of shorter ones fewer, for more would be of the same pixels."""
+PROFILES_A_POINT = 5
+"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
 OTHER_OUTLINE_CLEARANCE = 5.0
@@ -489,7 +487,7 @@ def _segment_profiles(
     """
     clear_points = _by_segment(clear).sum(axis=-1)
     full = clear_points >= FEWEST_SHARE * (PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
-    each = _profiles_a_point(points)
+    each = PROFILES_A_POINT
     count = each * clear_points
     seen = np.repeat(_by_segment(clear)[full], each, axis=-1)
     seen = seen[:, None].astype(np.float32)
@@ -519,18 +517,6 @@ def _by_segment(values: Array | Booleans) -> Any:
     one, ...).
     """
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
-
-
-def _profiles_a_point(points: EdgePoints) -> int:
-    """How many profiles are taken about each point: at least one a pixel on half of the edges that
-    are looked at together.
-    """
-    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
-    apart = np.hypot(chord[..., 0], chord[..., 1]) / (PREDICTED_EDGE_POINTS - 1)
-    seen = apart[points.valid.all(axis=-1)]
-    if not seen.size:
-        return 1
-    return min(max(math.ceil(np.median(seen)), 1), MOST_PROFILES_A_POINT)
 
 
 def _between(points: EdgePoints, full: Booleans, each: int) -> Array:
