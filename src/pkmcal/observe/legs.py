@@ -485,14 +485,12 @@ def _segment_profiles(
 
     Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
     """
-    clear_points = _by_segment(clear).sum(axis=-1)
-    full = clear_points >= FEWEST_SHARE * (PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
-    each = PROFILES_A_POINT
-    count = each * clear_points
-    seen = np.repeat(_by_segment(clear)[full], each, axis=-1)
+    count = PROFILES_A_POINT * _by_segment(clear).sum(axis=-1)
+    full = count >= FEWEST_SHARE * (PROFILES_A_POINT * PREDICTED_EDGE_POINTS / EDGE_SEGMENTS)
+    seen = np.repeat(_by_segment(clear)[full], PROFILES_A_POINT, axis=-1)
     seen = seen[:, None].astype(np.float32)
-    outward = np.repeat(_by_segment(points.outward)[full], each, axis=-2)
-    pixel = photographs.camera.project(_between(points, full, each))
+    outward = np.repeat(_by_segment(points.outward)[full], PROFILES_A_POINT, axis=-2)
+    pixel = photographs.camera.project(_between(points, full))
     offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
     total = np.empty((len(seen), 1, len(offsets)), np.float32)
     clipped = np.empty((len(seen), 1, explained), np.float32)
@@ -519,16 +517,15 @@ def _by_segment(values: Array | Booleans) -> Any:
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
-def _between(points: EdgePoints, full: Booleans, each: int) -> Array:
-    """Places (N, n, 3) of all n profiles, ``each`` a point, in each of the N segments that are
-    ``full``.
+def _between(points: EdgePoints, full: Booleans) -> Array:
+    """Places (N, n, 3) of all n profiles in each of the N segments that are ``full``.
 
     Points of an edge lie evenly on a line in space, so those between are interpolated there; the
     profiles' directions hardly turn from one to the next.
     """
     k, e, segment = np.nonzero(full)
     start, step = points.point[..., 0, :], points.point[..., 1, :] - points.point[..., 0, :]
-    fraction = (np.arange(PREDICTED_EDGE_POINTS * each) + 0.5) / each - 0.5
+    fraction = (np.arange(PREDICTED_EDGE_POINTS * PROFILES_A_POINT) + 0.5) / PROFILES_A_POINT - 0.5
     mine = fraction.reshape(EDGE_SEGMENTS, -1)[segment]
     return of_components(*(start[k, e, c, None] + mine * step[k, e, c, None] for c in range(3)))
 
