@@ -15,6 +15,9 @@ from pkmcal.cameras.response import Response, light_in
 
 INTERPOLATION_MARGIN = 2
 """Pixels about a place whose levels an interpolation takes."""
+PLACES_A_ROW = 512
+"""Places that cv2.remap is given in a row: of few long rows it takes far more time, of short ones
+half as much again; and more than 2**15 of either it does not take."""
 BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
@@ -28,11 +31,11 @@ def levels_at(
     blur: float = 0.0,
     response: Response = "linear",
 ) -> Array:
-    """Light (m, n) in a photograph (height, width) at columns and rows (m, n), interpolated.
+    """Light (...) in a photograph (height, width) at columns and rows (...), interpolated.
 
-    m, n : fewer than 2**15, as cv2.remap wants it. blur : standard deviation (px) of a Gaussian
-    that goes over the light first. response : how the levels code it; linear leaves them as they
-    are. Places outside have the light of its border, places that are no numbers any light.
+    blur : standard deviation (px) of a Gaussian that goes over the light first. response : how the
+    levels code it; linear leaves them as they are. Places outside have the light of its border,
+    places that are no numbers any light.
     """
     import cv2
 
@@ -49,14 +52,28 @@ def levels_at(
     else:  # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
         levels = part.astype(np.float32, copy=False)
     how = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
-    across: Any = x - np.float32(columns.start)
-    down: Any = y - np.float32(rows.start)
-    found: Any = cv2.remap(levels, across, down, how, borderMode=cv2.BORDER_REPLICATE)
-    return found
+    return looked_up(levels, x - np.float32(columns.start), y - np.float32(rows.start), how)
+
+
+def looked_up(picture: Any, x: Array, y: Array, how: int) -> Array:
+    """What a picture (height, width), of fewer than 2**15 rows and columns, has at columns and rows
+    (...), of the nearest pixel or between pixels as cv2 interpolates; that of its border outside.
+    """
+    import cv2
+
+    if not x.size:
+        return np.zeros(x.shape, dtype=np.float32)
+    rows = -(-x.size // PLACES_A_ROW)
+    flat = np.empty((2, rows * PLACES_A_ROW), dtype=np.float32)
+    flat[0, : x.size], flat[1, : x.size] = x.ravel(), y.ravel()
+    flat[:, x.size :] = 0.0
+    across, down = flat.reshape(2, rows, -1)
+    found: Any = cv2.remap(picture, across, down, how, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape(-1)[: x.size].reshape(x.shape)
 
 
 def _spanned(places: Array, around: int, size: int) -> tuple[Array, slice]:
-    """Places (m, n) in single precision, 0 where they are no numbers, and the pixels, of so many in
+    """Places (...) in single precision, 0 where they are no numbers, and the pixels, of so many in
     a row, in which they lie, with so many to both sides.
     """
     places = places.astype(np.float32, copy=False)

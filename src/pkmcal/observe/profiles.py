@@ -13,7 +13,8 @@ residual over a grid of positions is a matrix product, and its minimum is the ed
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -47,6 +48,7 @@ BRIGHTNESS_UNKNOWNS = 5
 """Linear unknowns of the model: three inside the limb, two outside."""
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 """Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
+_BETWEEN_HALF_WIDTHS = np.sqrt(HALF_WIDTHS[1:] * HALF_WIDTHS[:-1])
 BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
 """Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
 USUAL_BLUR = 0.7
@@ -126,7 +128,8 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=2048)
 def _projections(blur: float, half_width: float, cut: int) -> Array:
-    """Orthonormal bases of the model's profiles at each trial position, (5, samples, shifts).
+    """Orthonormal bases of the model's profiles at each trial position, (samples, 5 shifts): the
+    first of all positions, then the second, single precision.
 
     cut : samples at the inner end that are not used; their rows are zero.
     The weak beliefs about the shading are rows below the samples, whose data are zero; only the
@@ -140,7 +143,7 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     beliefs[:, 0, 1] = PROFILE_MODEL_ERROR / SHADING_SLOPE
     beliefs[:, 1, 2] = PROFILE_MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
     bases = np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
-    return np.ascontiguousarray(bases.T)
+    return bases.transpose(1, 2, 0).reshape(at.shape[1], -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,7 @@ class Profiles:
         """The profiles at a mask or at positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    @cached_property
     def contrast(self) -> Array:
         """Largest grey-level difference in each profile, (N,)."""
         return _contrast(self.grey)
@@ -186,7 +190,7 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
     depth = np.maximum(MODELLED_LIMB_SHARE * half_width, LEAST_INSIDE)
-    beyond = np.sum(profile_offsets() < -depth[:, None] - 1e-9, axis=-1)
+    beyond = np.searchsorted(profile_offsets(), -depth - 1e-9)
     return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
 
@@ -233,28 +237,31 @@ def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Boole
     if bright.size:
         whole = profiles.select(bright)
         left = residual_curves(whole, blur).min(axis=-1) * PROFILE_STEP
-        expected = _noise(whole.contrast(), whole.count) ** 2 + PROFILE_MODEL_ERROR**2
+        expected = _noise(whole.contrast, whole.count) ** 2 + PROFILE_MODEL_ERROR**2
         odd[bright] = left > expected * _freedom(whole)
     return replace(profiles, cut=np.maximum(profiles.cut, profiles.strip)), odd
 
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
     """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
-    scaled = profiles.grey - profiles.grey[:, -1:]
-    scaled = scaled / profiles.contrast()[:, None]
-    scaled[np.arange(scaled.shape[1]) < profiles.cut[:, None]] = 0.0
-    out = np.empty((len(scaled), len(EDGE_SHIFTS)), dtype=scaled.dtype)
-    width = np.abs(np.log(profiles.half_width)[:, None] - np.log(HALF_WIDTHS)).argmin(axis=1)
-    kind = width * scaled.shape[1] + np.minimum(profiles.cut, scaled.shape[1] - 1)
-    for number in np.unique(kind):  # a few dozen combinations of width and cut
-        mine = np.flatnonzero(kind == number)
-        w, cut = divmod(int(number), scaled.shape[1])
+    scaled = (profiles.grey - profiles.grey[:, -1:]).astype(np.float32, copy=False)
+    scaled /= profiles.contrast[:, None].astype(np.float32, copy=False)
+    samples, shifts = scaled.shape[1], len(EDGE_SHIFTS)
+    scaled[np.arange(samples) < profiles.cut[:, None]] = 0.0
+    width = np.searchsorted(_BETWEEN_HALF_WIDTHS, profiles.half_width)
+    kind = width * samples + np.minimum(profiles.cut, samples - 1)
+    order = np.argsort(kind, kind="stable")
+    scaled, kind = scaled[order], kind[order]
+    explained = np.empty((len(scaled), shifts), dtype=scaled.dtype)
+    ends = [*np.flatnonzero(np.diff(kind, prepend=-1)), len(kind)]
+    for first, end in pairwise(ends):  # a few dozen combinations of width and cut
+        w, cut = divmod(int(kind[first]), samples)
         bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
-        part = scaled[mine]
-        along = part @ bases
-        explained = np.einsum("bns,bns->ns", along, along)
-        out[mine] = np.sum(part**2, axis=1, keepdims=True) - explained
-    return np.maximum(out, 0.0)
+        along = (scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
+        np.einsum("nbs,nbs->ns", along, along, out=explained[first:end])
+    out = np.empty_like(explained)
+    out[order] = np.einsum("ni,ni->n", scaled, scaled)[:, None] - explained
+    return np.maximum(out, 0.0, out=out)
 
 
 def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
@@ -264,7 +271,7 @@ def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
     curves : of :func:`residual_curves`.
     """
     samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
-    floor = samples * (_noise(profiles.contrast(), profiles.count) ** 2 + PROFILE_MODEL_ERROR**2)
+    floor = samples * (_noise(profiles.contrast, profiles.count) ** 2 + PROFILE_MODEL_ERROR**2)
     out = -_freedom(profiles)[:, None] / 2 * np.log(curves + floor[:, None])
     out -= out.max(axis=-1, keepdims=True)
     return np.where(_shows_its_edge(profiles)[:, None], out, 0.0)
@@ -288,7 +295,7 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
     )
     bend = np.maximum(left - 2 * here + right, 1e-12)
     position = EDGE_SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
-    noise = _noise(profiles.contrast(), profiles.count)
+    noise = _noise(profiles.contrast, profiles.count)
     variance = here * PROFILE_STEP / _freedom(profiles) + noise**2
     # cost(x) = residual / (variance / PROFILE_STEP): its second derivative is 2 / sigma^2
     sigma = np.sqrt(2 * (variance / PROFILE_STEP) / (bend / step**2))
@@ -331,7 +338,7 @@ def estimate_blur(profiles: Profiles) -> float:
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
-    floor = (GREY_NOISE / profiles.contrast()) ** 2
+    floor = (GREY_NOISE / profiles.contrast) ** 2
     costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # until they are tried
     k = int(np.argmin(np.abs(BLURS_TRIED - USUAL_BLUR)))
     while True:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Booleans, Integers
+from pkmcal.observe.levels import looked_up
 
 EDGE_DIRECTIONS = 8
 """Edge directions told apart; each table takes the neighbouring directions in as well."""
@@ -184,19 +185,8 @@ class DistanceTables:
 
     def _looked_up(self, x: Array, y: Array, how: int) -> Array:
         """The picture of all tables at columns and rows (...)."""
-        import cv2
-
         tables = self.tables.picture
-        picture: Any = tables.reshape(tables.shape[0] * tables.shape[1], -1)
-        # cv2.remap takes at most MOST_ACROSS rows and columns
-        across = min(x.size, MOST_ACROSS)
-        flat = np.zeros((2, -(-x.size // max(across, 1)) * across), dtype=np.float32)
-        flat[0, : x.size], flat[1, : x.size] = x.ravel(), y.ravel()
-        if not x.size:
-            return np.zeros(x.shape, dtype=np.float32)
-        columns, lines = flat.reshape(2, -1, across)
-        found: Any = cv2.remap(picture, columns, lines, how)
-        return found.reshape(-1)[: x.size].reshape(x.shape)
+        return looked_up(tables.reshape(tables.shape[0] * tables.shape[1], -1), x, y, how)
 
     def by_chance(self, direction: Integers, found: Array) -> Array:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
