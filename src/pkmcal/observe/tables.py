@@ -255,19 +255,22 @@ def distance_tables(
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
 
-    small: list[Integers] = []
-    scale = 1.0
-    for image in images:  # each is decoded once, and only its reduction kept
-        scale = max(image.shape[1] / width, 1.0)
+    scale = max(images[0].shape[1] / width, 1.0)
+
+    def reduced(image: Any) -> Integers:
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
-        small.append(_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
-    height, across = small[0].shape
-    against = np.zeros((len(small), height, across), dtype=np.int8)
-    differs = None
-    if len(small) >= ENOUGH_TO_COMPARE:
-        against = _against_median(np.stack(small))
-        differs = against != 0
-    edges = tuple(map(_edges_of, small, [None] * len(small) if differs is None else differs))
+        return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+    with ThreadPoolExecutor(THREADS) as pool:  # each is decoded once, and only its reduction kept
+        small = list(pool.map(reduced, images))
+        height, across = small[0].shape
+        against = np.zeros((len(small), height, across), dtype=np.int8)
+        differs = None
+        if len(small) >= ENOUGH_TO_COMPARE:
+            against = _against_median(np.stack(small))
+            differs = against != 0
+        each = [None] * len(small) if differs is None else differs
+        edges = tuple(pool.map(_edges_of, small, each))
     moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
     place = [e.pixel.astype(int) @ (1, across) for e in edges]
     number = [direction_of(e.normal, directions) for e in edges]
