@@ -21,6 +21,7 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import (
+    EdgePoints,
     LegsInCamera,
     TubeList,
     edge_points,
@@ -198,39 +199,26 @@ class _Mixture(NamedTuple):
     share: Array
     sigma: Array
 
-    def likelier(self, look: _Look) -> Array:
+    def likelier(self, at: Distances) -> Array:
         """Density (H, E, n) of the distances found on the machine's edges, times the share that is
         on these, by the density that chance gives.
         """
         share, sigma = (v.astype(np.float32)[:, None, None] for v in self)
-        near = np.exp(look.found**2 * (-0.5 / sigma**2))
-        return near * ((1 - share) * np.sqrt(2 / np.pi) / sigma) * look.rare
+        near = np.exp(at.found**2 * (-0.5 / sigma**2))
+        return near * ((1 - share) * np.sqrt(2 / np.pi) / sigma) * at.rare
 
 
-class _Look(NamedTuple):
-    """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
-    DISTANCE_OUTSIDE_IMAGE outside the image; its slope, by metres that the edge moves outward; one
-    by the density of such distances by chance; reduced pixels of silhouette for which each place
-    stands, none outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the
-    camera frame does to an edge, in metres outward: at its first place, and how much more its turn
-    at the last.
+class Distances(NamedTuple):
+    """Distances found in the picture under predicted edges, of all photographs in a row, (H, E, n).
+
+    found : reduced pixels, DISTANCE_OUTSIDE_IMAGE outside the image. rare : one by the density of
+    such distances by chance. length : reduced pixels of silhouette for which each place stands,
+    none outside the image.
     """
 
     found: Array
-    slope: Array
     rare: Array
     length: Array
-    begins: Array
-    grows: Array
-
-    def weight(self, reach: float) -> Array:
-        """Geman-McClure: what is further than the reach is another edge."""
-        return (1 + (self.found * (1 / reach)) ** 2) ** -2
-
-    def cost(self, reach: float) -> Array:
-        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
-        part = (self.found * (1 / reach)) ** 2
-        return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
     def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
         """The likeliest mixture, from another on (expectation and maximisation)."""
@@ -253,14 +241,35 @@ class _Look(NamedTuple):
         share = mixture.share.astype(np.float32)[:, None, None]
         return self.length * np.log(mixture.likelier(self) + share)
 
+
+class _Look(NamedTuple):
+    """What a place may descend by. slope : (H, E, n) of the distances found, by metres that the
+    edge moves outward. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
+    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
+    """
+
+    under: Distances
+    slope: Array
+    begins: Array
+    grows: Array
+
+    def weight(self, reach: float) -> Array:
+        """Geman-McClure: what is further than the reach is another edge."""
+        return (1 + (self.under.found * (1 / reach)) ** 2) ** -2
+
+    def cost(self, reach: float) -> Array:
+        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
+        part = (self.under.found * (1 / reach)) ** 2
+        return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
+
     def where(self, better: Booleans, other: _Look) -> _Look:
         """Take some of the hypotheses from here, the rest from the other look."""
         if better.all():
             return self
-        out = [mine.copy() for mine in self]
-        for mine, its in zip(out, other, strict=True):
+        out = [mine.copy() for mine in (*self.under, *self[1:])]
+        for mine, its in zip(out, (*other.under, *other[1:]), strict=True):
             mine[~better] = its[~better]
-        return _Look(*out)
+        return _Look(Distances(*out[:3]), *out[3:])
 
 
 def _summed(values: Array) -> Array:
@@ -309,10 +318,10 @@ def settle_by_evidence(
     mixture = first_mixture(len(candidates))
     last = float("inf")
     for _ in range(steps):
-        mixture = look.mixture(mixture, widest=widest)
-        trial = _step(candidates, look, look.length * look.own(mixture), damping)
+        mixture = look.under.mixture(mixture, widest=widest)
+        trial = _step(candidates, look, look.under.length * look.under.own(mixture), damping)
         seen = look_under(view, trial, photographs, samples)
-        gain = _summed(seen.evidence(mixture)) - _summed(look.evidence(mixture))
+        gain = _summed(seen.under.evidence(mixture)) - _summed(look.under.evidence(mixture))
         better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
@@ -321,8 +330,8 @@ def settle_by_evidence(
         if max(last, most) < LEAST_EVIDENCE_GAIN:
             break  # one step may have been too long
         last = most
-    mixture = look.mixture(first_mixture(len(candidates)), 10, widest)
-    return candidates, _summed(look.evidence(mixture))
+    mixture = look.under.mixture(first_mixture(len(candidates)), 10, widest)
+    return candidates, _summed(look.under.evidence(mixture))
 
 
 def first_mixture(count: int) -> _Mixture:
@@ -332,9 +341,9 @@ def first_mixture(count: int) -> _Mixture:
 
 def evidence_of(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
     """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
-    look = look_under(view, candidates, photographs, samples)
-    mixture = look.mixture(first_mixture(len(candidates)), rounds=10)
-    return by_photograph(look.evidence(mixture), len(photographs))
+    under = distances_under(view, candidates, photographs, samples)
+    mixture = under.mixture(first_mixture(len(candidates)), rounds=10)
+    return by_photograph(under.evidence(mixture), len(photographs))
 
 
 def by_photograph(evidence: Array, count: int) -> Array:
@@ -347,14 +356,15 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
     readings; edges scatter as they do under the names that the view has.
     """
     every = view.few(len(view.configuration))
-    mixture = look_under(view, T_camera_base[None], every, 8).mixture(first_mixture(1), rounds=10)
+    own = distances_under(view, T_camera_base[None], every, 8)
+    mixture = own.mixture(first_mixture(1), rounds=10)
     fits: list[Array] = []
     for first in range(0, len(names), NAMES_AT_ONCE):
         some = names[first : first + NAMES_AT_ONCE]
         guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
         places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
-        look = look_under(replace(view, guessed=guessed), places, every, 8)
-        fits.append(by_photograph(look.evidence(mixture), len(every)))
+        under = distances_under(replace(view, guessed=guessed), places, every, 8)
+        fits.append(by_photograph(under.evidence(mixture), len(every)))
     return np.concatenate(fits).T
 
 
@@ -379,7 +389,7 @@ def grain(view: StationView, T_camera_base: Array) -> float:
     each half counts as one measurement.
     """
     every = view.few(len(view.configuration))
-    length = look_under(view, T_camera_base[None], every, 2).length[0]
+    length = distances_under(view, T_camera_base[None], every, 2).length[0]
     seen = length[length > 0]
     # two samples stand for an edge's length each; where no edge is in the picture none counts
     return float(seen.mean()) / 2 if seen.size else 1.0
@@ -393,34 +403,63 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
     return [slice(*pair) for pair in pairwise(ends)]
 
 
-def look_under(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
+def distances_under(
+    view: StationView, candidates: Array, photographs: Integers, samples: int
+) -> Distances:
     """Distances under the edges predicted from poses (H, 4, 4)."""
     parts = _parts(view, len(candidates), len(photographs) * samples)
     if len(parts) > 1:
+        each = [distances_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
+        return Distances(*map(np.concatenate, zip(*each, strict=True)))
+    points, direction, number = _edges_under(view, candidates, photographs, samples)
+    found, inside = view.tables.look(direction, points.pixel, number, between=True)
+    return _distances(view, points, direction, found, inside & points.valid)
+
+
+def look_under(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
+    """The same, and what places may descend by."""
+    parts = _parts(view, len(candidates), len(photographs) * samples)
+    if len(parts) > 1:
         looks = [look_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
-        return _Look(*map(np.concatenate, zip(*looks, strict=True)))
-    number = np.arange(len(view.configuration))[photographs][:, None, None]
-    legs = view.legs(photographs).moved(candidates)
-    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-    direction = view.tables.direction(points.outward)
+        under, *rest = zip(*looks, strict=True)
+        every = Distances(*map(np.concatenate, zip(*under, strict=True)))
+        return _Look(every, *map(np.concatenate, rest))
+    points, direction, number = _edges_under(view, candidates, photographs, samples)
     found, slope, inside = view.tables.look_along(direction, points.pixel, points.outward, number)
     inside = inside & points.valid
-    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
-    length = np.hypot(chord[..., 0], chord[..., 1]) / np.float32(view.tables.scale * (samples - 1))
-    rare = 1 / view.tables.by_chance(direction, found)
     # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
     first, last = points.point[..., 0, :], points.point[..., -1, :]
     seen = np.any(inside, axis=-1, keepdims=True)[..., 0]
-    begins = _stacked((cross(first, points.normal), points.normal), seen)
-    grows = _stacked((cross(last - first, points.normal),), seen)
-    shape = (len(candidates), -1, samples)
     return _Look(
+        _distances(view, points, direction, found, inside),
+        (slope * np.where(inside, points.gain, 0.0)).reshape(len(candidates), -1, samples),
+        _stacked((cross(first, points.normal), points.normal), seen),
+        _stacked((cross(last - first, points.normal),), seen),
+    )
+
+
+def _edges_under(
+    view: StationView, candidates: Array, photographs: Integers, samples: int
+) -> tuple[EdgePoints, Integers, Integers]:
+    """Predicted edges (H, K, E, n), their directions, and the photographs' numbers (K, 1, 1)."""
+    number = np.arange(len(view.configuration))[photographs][:, None, None]
+    legs = view.legs(photographs).moved(candidates)
+    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
+    return points, view.tables.direction(points.outward), number
+
+
+def _distances(
+    view: StationView, points: EdgePoints, direction: Integers, found: Array, inside: Booleans
+) -> Distances:
+    """What was found at all (H, K, E, n), in one row of photographs."""
+    shape = (len(found), -1, found.shape[-1])
+    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
+    length = np.hypot(chord[..., 0], chord[..., 1])
+    length /= np.float32(view.tables.scale * (shape[-1] - 1))
+    return Distances(
         np.where(inside, found, DISTANCE_OUTSIDE_IMAGE).reshape(shape),
-        (slope * np.where(inside, points.gain, 0.0)).reshape(shape),
-        rare.reshape(shape),
+        (1 / view.tables.by_chance(direction, found)).reshape(shape),
         np.where(inside, length[..., None], 0.0).reshape(shape),
-        begins,
-        grows,
     )
 
 
@@ -444,7 +483,7 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * look.slope
     one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
-    here, there = np.moveaxis((weighted * look.found) @ powers[:, :2], -1, 0)
+    here, there = np.moveaxis((weighted * look.under.found) @ powers[:, :2], -1, 0)
     begins, grows = look.begins, look.grows
     normal = (begins * one) @ begins.mT
     mixed = (grows * both) @ begins.mT

@@ -15,9 +15,10 @@ from pkmcal.cameras.response import Response, light_in
 
 INTERPOLATION_MARGIN = 2
 """Pixels about a place whose levels an interpolation takes."""
-PLACES_A_ROW = 512
-"""Places that cv2.remap is given in a row: of few long rows it takes far more time, of short ones
-half as much again; and more than 2**15 of either it does not take."""
+PLACES_A_ROW, PLACES_IN_ONE_ROW = 512, 2**14
+"""Places that cv2.remap is given in a row, of shorter ones it takes half as much time again, and up
+to how many all are one: rows are shared out among threads, which costs more than so few take. More
+than 2**15 rows, or places in one, it does not take."""
 BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
@@ -63,8 +64,8 @@ def looked_up(picture: Any, x: Array, y: Array, how: int) -> Array:
 
     if not x.size:
         return np.zeros(x.shape, dtype=np.float32)
-    rows = -(-x.size // PLACES_A_ROW)
-    flat = np.empty((2, rows * PLACES_A_ROW), dtype=np.float32)
+    rows = -(-x.size // PLACES_A_ROW) if x.size > PLACES_IN_ONE_ROW else 1
+    flat = np.empty((2, rows * PLACES_A_ROW if rows > 1 else x.size), dtype=np.float32)
     flat[0, : x.size], flat[1, : x.size] = x.ravel(), y.ravel()
     flat[:, x.size :] = 0.0
     across, down = flat.reshape(2, rows, -1)

@@ -91,10 +91,11 @@ class DirectionTables:
     def _work_out(self, direction: int) -> None:
         rows, taken_in = len(self.picture), alike(direction, len(self.ready))
         counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
+        sparse = 2 if len(self.place) < ENOUGH_TO_COMPARE else 4  # of many, few places tell as much
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
-            counted += _counted(table)
+            counted += _counted(table[::sparse, ::sparse])
         self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
         self.ready[direction] = True  # at last, as others may look beside
 
@@ -130,16 +131,18 @@ class DistanceTables:
         return direction_of(normal, len(self.tables.ready))
 
     def look(
-        self, direction: Integers, pixel: Array, photograph: Integers
+        self, direction: Integers, pixel: Array, photograph: Integers, between: bool = False
     ) -> tuple[Array, Booleans]:
         """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
 
-        direction, photograph : (...) table numbers. Nearest table entry.
+        direction, photograph : (...) table numbers. between : bilinear between table entries, else
+        the nearest.
         """
         import cv2
 
         x, y, inside = self._place(direction, pixel, photograph)
-        return self._looked_up(x, y, cv2.INTER_NEAREST), inside
+        how = cv2.INTER_LINEAR if between else cv2.INTER_NEAREST
+        return self._looked_up(x, y, how), inside
 
     def look_along(
         self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
@@ -308,13 +311,9 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
 
 
 def _counted(table: Array) -> Integers:
-    """How often each distance occurs in a table (h, w), (bins,); at every other place of every
-    other row.
-    """
+    """How often each distance occurs in a table (h, w), (bins,)."""
     bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
-    number = np.minimum(table[::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(
-        np.intp
-    )
+    number = np.minimum(table * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(np.intp)
     return np.bincount(number.ravel(), minlength=bins)
 
 
