@@ -258,14 +258,14 @@ def distance_tables(
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
 
-    scale = max(images[0].shape[1] / width, 1.0)
-
-    def reduced(image: Any) -> Integers:
+    def reduced(number: int) -> tuple[Integers, float]:
+        image = images[number]  # each is decoded once, and only its reduction kept
+        scale = max(image.shape[1] / width, 1.0)
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
-        return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
 
-    with ThreadPoolExecutor(THREADS) as pool:  # each is decoded once, and only its reduction kept
-        small = list(pool.map(reduced, images))
+    with ThreadPoolExecutor(THREADS) as pool:
+        small, (scale, *_) = zip(*pool.map(reduced, range(len(images))), strict=True)
         height, across = small[0].shape
         against = np.zeros((len(small), height, across), dtype=np.int8)
         differs = None
