@@ -168,11 +168,13 @@ def coded(demo, tmp_path_factory):
 SAID = {"srgb": "sRGB (as telephones write it)", "linear": "linear (as sensors count light)"}
 
 
-def check_overruled(calibration, found, usual, demo):
-    """And the machine is found as well as where it is as usual."""
+def check_overruled(calibration, found, usual, demo, worse=1.0):
+    """And the machine is found as well as where it is as usual, but for what the file's kind does:
+    errors that are so many times as large.
+    """
     (hint,) = [text for text in calibration.verdict.advice if "levels of the photographs" in text]
     assert f"are {SAID[found]}, not {SAID[usual]}, as is usual for such files" in hint
-    check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
+    check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480 * worse)
     assert {station.response for station in calibration.session.stations} == {found}
 
 
@@ -182,7 +184,8 @@ def test_the_edges_overrule_what_is_usual_for_png_files(demo, coded):
 
 def test_the_edges_overrule_what_is_usual_for_jpeg_files(demo, session):
     recode(session, ".jpg")
-    check_overruled(calibrate_session(session), "linear", "srgb", demo)
+    # over eight such sessions JPEG's own noise makes errors a fifth larger
+    check_overruled(calibrate_session(session), "linear", "srgb", demo, worse=1.2)
 
 
 def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(coded, monkeypatch):
