@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pkmcal.cameras.response import light_in
-from pkmcal.observe.levels import levels_at
+from pkmcal.observe.levels import PLACES_IN_ONE_ROW, levels_at
 
 PHOTOGRAPH = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
 
@@ -51,3 +51,11 @@ def test_outside_stands_the_border_and_what_is_no_number_does_not_harm():
 
 def test_of_no_places_there_are_no_levels():
     assert levels_at(PHOTOGRAPH, np.zeros((0, 31)), np.zeros((0, 31)), blur=1.0).shape == (0, 31)
+
+
+@pytest.mark.parametrize("shape", [(7,), (PLACES_IN_ONE_ROW + 3,), (3, 5, PLACES_IN_ONE_ROW // 3)])
+def test_any_number_of_places_may_be_looked_up(shape):
+    """In one row, or in rows that they do not fill."""
+    rng = np.random.default_rng(2)
+    x, y = (rng.integers(0, size, shape) for size in PHOTOGRAPH.shape[::-1])
+    np.testing.assert_array_equal(levels_at(PHOTOGRAPH, x, y), PHOTOGRAPH[y, x])

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pkmcal.observe.legs import Photographs, measure
+from pkmcal.observe import legs as looks
+from pkmcal.observe.legs import (
+    PREDICTED_EDGE_POINTS,
+    Photographs,
+    _segment_profiles,
+    measure,
+)
+from pkmcal.observe.levels import levels_at
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import (
     EDGE_SIGMA_FLOOR,
@@ -13,6 +22,7 @@ from pkmcal.observe.profiles import (
     MEASUREMENTS_AN_EDGE,
     edge_set,
     fit_edges,
+    sampled_offsets,
 )
 from test_observe_drawing import (
     FRONT,
@@ -71,6 +81,44 @@ def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
     # the blur of lens, pixel and interpolation
     assert 0.62 < found.blur < 0.78
     assert np.all(np.abs(turn[:, 1]) < 5 * np.sqrt(edges.covariance[:, 1, 1]))
+
+
+def test_profiles_are_one_a_pixel_of_what_is_clear():
+    """Each segment's mean is that of profiles taken one by one; an end of an edge that has no image
+    makes the rest no poorer.
+    """
+    seen, mechanism, camera = taken(), redrawn(0, 0.0005), camera_of()
+    at = mechanism, FRONT, poses()
+    tubes, points, clear = looks.predicted(seen, *at, PREDICTED_EDGE_POINTS)
+    clear[:, :, 7] = False
+    width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 2::5]
+    full, across = _segment_profiles(seen, points, clear, width)
+    pitch = np.linalg.norm(np.diff(points.pixel, axis=2), axis=-1)
+    kinds: set[int] = set()
+    for n in np.random.default_rng(0).choice(full.sum(), 40, replace=False):
+        k, e, segment = (where[n] for where in np.nonzero(full))
+        first = 5 * segment
+        each = int(np.clip(np.ceil(pitch[k, e, first : first + 4].max()), 2, 5))
+        mine = [p for p in range(first, first + 5) if clear[k, e, p]]
+        step = points.point[k, e, 1] - points.point[k, e, 0]
+        turns = (np.arange(each) + 0.5) / each - 0.5
+        place = [points.point[k, e, p] + turn * step for p in mine for turn in turns]
+        outward = np.repeat(points.outward[k, e, mine], each, axis=0)
+        pixel = camera.project(np.array(place))[:, None]
+        pixel = pixel + sampled_offsets()[:, None] * outward[:, None]
+        grey = levels_at(seen.images[k], pixel[..., 0], pixel[..., 1], cubic=True).mean(axis=0)
+        assert across.count[n] == len(place)
+        # OpenCV 4 rounds places to a 32nd of a pixel
+        np.testing.assert_allclose(across.grey[n], grey[-len(across.grey[n]) :], atol=1.0)
+        kinds.add(each)
+    assert len(kinds) > 1
+
+    pixel = points.pixel.copy()
+    pixel[:, :, 0] = np.nan
+    clear[:, :, 0] = False
+    nearer = _segment_profiles(seen, replace(points, pixel=pixel), clear, width)[1]
+    _, _, segment = np.nonzero(full)
+    np.testing.assert_array_equal(nearer.count[segment > 0], across.count[segment > 0])
 
 
 def test_every_edge_is_measured_or_has_a_reason():

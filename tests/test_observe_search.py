@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import stations
+from pkmcal.observe import evidence, stations
 from pkmcal.observe.evidence import StationView, score
 from pkmcal.observe.legs import LEG_SEARCH_REACH, Photographs, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
@@ -330,6 +330,17 @@ def test_photographs_of_other_configurations_are_not_recognised():
 
 
 # Distance tables
+
+
+@pytest.mark.parametrize("at_once", [evidence.SILHOUETTE_PLACES_AT_ONCE, 500])
+def test_places_that_are_only_weighed_find_what_those_find_that_descend(monkeypatch, at_once):
+    monkeypatch.setattr(evidence, "SILHOUETTE_PLACES_AT_ONCE", at_once)
+    view = view_of(images())
+    at = np.stack([rough_pose(seed) for seed in range(5)])
+    every = np.arange(len(view.configuration))
+    weighed = evidence.distances_under(view, at, every, 6)
+    for one, other in zip(weighed, evidence.look_under(view, at, every, 6).distances, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_directions_are_of_lines_not_of_arrows():

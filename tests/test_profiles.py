@@ -351,6 +351,15 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
     np.testing.assert_allclose(at.position, truth, atol=0.014)
 
 
+def test_profiles_of_many_widths_and_cuts_are_worked_out_as_each_by_itself():
+    profiles = make(22, 60, half_width=(2, 90)).profiles
+    cut = np.random.default_rng(22).integers(0, len(profile_offsets()) - 2, len(profiles.cut))
+    mixed = replace(profiles, cut=cut)
+    together = residual_curves(mixed, 0.7)
+    alone = [residual_curves(mixed.select(np.array([k])), 0.7)[0] for k in range(len(cut))]
+    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-14)
+
+
 def test_where_there_is_no_edge_none_is_found():
     rng = np.random.default_rng(8)
     for noise in (0.2, 1.0, 5.0):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from threading import get_ident
 
 import numpy as np
 import pytest
 
-from pkmcal.calibration import recognise
+from pkmcal.calibration import recognise, turns
 from pkmcal.calibration.recognise import mistake_in, platform_poses, read_photographs
 from pkmcal.observe import legs
 from pkmcal.observe.legs import measure, search
@@ -113,6 +114,22 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
     for k, own in enumerate((7, 2)):
         alike = [t.look(np.array(3), place, np.array(n))[0] for t, n in ((some, k), (tables, own))]
         assert alike[0] == alike[1]
+
+
+@pytest.mark.parametrize("enough", [0.0, np.inf])
+def test_stations_are_looked_at_beside_one_another_or_in_turn(monkeypatch, enough):
+    """With the same result: a look a station, in their order."""
+    monkeypatch.setattr(turns, "PIXELS_FOR_THREADS", enough)
+    photographs = [replace(many()[0], station=number) for number in range(3)]
+    threads: set[int] = set()
+
+    def look(one):
+        threads.add(get_ident())
+        return legs.joined_looks([], 0.5 + one.station, 0.0)
+
+    assert [seen.blur for seen in turns._each(photographs, look)] == [0.5, 1.5, 2.5]
+    assert (get_ident() in threads) == (enough > 0)
+    assert turns._each([], look) == []
 
 
 # ------------------------------------------------------------------ a session

@@ -248,28 +248,36 @@ class _Look(NamedTuple):
     does to an edge, in metres outward: at its first place, and how much more its turn at the last.
     """
 
-    under: Distances
+    distances: Distances
     slope: Array
     begins: Array
     grows: Array
 
     def weight(self, reach: float) -> Array:
         """Geman-McClure: what is further than the reach is another edge."""
-        return (1 + (self.under.found * (1 / reach)) ** 2) ** -2
+        return (1 + (self.distances.found * (1 / reach)) ** 2) ** -2
 
     def cost(self, reach: float) -> Array:
         """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
-        part = (self.under.found * (1 / reach)) ** 2
+        part = (self.distances.found * (1 / reach)) ** 2
         return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
     def where(self, better: Booleans, other: _Look) -> _Look:
         """Take some of the hypotheses from here, the rest from the other look."""
         if better.all():
             return self
-        out = [mine.copy() for mine in (*self.under, *self[1:])]
-        for mine, its in zip(out, (*other.under, *other[1:]), strict=True):
-            mine[~better] = its[~better]
-        return _Look(Distances(*out[:3]), *out[3:])
+
+        def either(mine: Array, its: Array) -> Array:
+            out = mine.copy()
+            out[~better] = its[~better]
+            return out
+
+        return _Look(
+            Distances(*map(either, self.distances, other.distances)),
+            either(self.slope, other.slope),
+            either(self.begins, other.begins),
+            either(self.grows, other.grows),
+        )
 
 
 def _summed(values: Array) -> Array:
@@ -318,10 +326,12 @@ def settle_by_evidence(
     mixture = first_mixture(len(candidates))
     last = float("inf")
     for _ in range(steps):
-        mixture = look.under.mixture(mixture, widest=widest)
-        trial = _step(candidates, look, look.under.length * look.under.own(mixture), damping)
+        mixture = look.distances.mixture(mixture, widest=widest)
+        trial = _step(
+            candidates, look, look.distances.length * look.distances.own(mixture), damping
+        )
         seen = look_under(view, trial, photographs, samples)
-        gain = _summed(seen.under.evidence(mixture)) - _summed(look.under.evidence(mixture))
+        gain = _summed(seen.distances.evidence(mixture)) - _summed(look.distances.evidence(mixture))
         better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
@@ -330,8 +340,8 @@ def settle_by_evidence(
         if max(last, most) < LEAST_EVIDENCE_GAIN:
             break  # one step may have been too long
         last = most
-    mixture = look.under.mixture(first_mixture(len(candidates)), 10, widest)
-    return candidates, _summed(look.under.evidence(mixture))
+    mixture = look.distances.mixture(first_mixture(len(candidates)), 10, widest)
+    return candidates, _summed(look.distances.evidence(mixture))
 
 
 def first_mixture(count: int) -> _Mixture:
@@ -341,9 +351,9 @@ def first_mixture(count: int) -> _Mixture:
 
 def evidence_of(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
     """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
-    under = distances_under(view, candidates, photographs, samples)
-    mixture = under.mixture(first_mixture(len(candidates)), rounds=10)
-    return by_photograph(under.evidence(mixture), len(photographs))
+    found = distances_under(view, candidates, photographs, samples)
+    mixture = found.mixture(first_mixture(len(candidates)), rounds=10)
+    return by_photograph(found.evidence(mixture), len(photographs))
 
 
 def by_photograph(evidence: Array, count: int) -> Array:
@@ -363,8 +373,8 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
         some = names[first : first + NAMES_AT_ONCE]
         guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
         places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
-        under = distances_under(replace(view, guessed=guessed), places, every, 8)
-        fits.append(by_photograph(under.evidence(mixture), len(every)))
+        found = distances_under(replace(view, guessed=guessed), places, every, 8)
+        fits.append(by_photograph(found.evidence(mixture), len(every)))
     return np.concatenate(fits).T
 
 
@@ -421,8 +431,8 @@ def look_under(view: StationView, candidates: Array, photographs: Integers, samp
     parts = _parts(view, len(candidates), len(photographs) * samples)
     if len(parts) > 1:
         looks = [look_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
-        under, *rest = zip(*looks, strict=True)
-        every = Distances(*map(np.concatenate, zip(*under, strict=True)))
+        distances, *rest = zip(*looks, strict=True)
+        every = Distances(*map(np.concatenate, zip(*distances, strict=True)))
         return _Look(every, *map(np.concatenate, rest))
     points, direction, number = _edges_under(view, candidates, photographs, samples)
     found, slope, inside = view.tables.look_along(direction, points.pixel, points.outward, number)
@@ -451,7 +461,9 @@ def _edges_under(
 def _distances(
     view: StationView, points: EdgePoints, direction: Integers, found: Array, inside: Booleans
 ) -> Distances:
-    """What was found at all (H, K, E, n), in one row of photographs."""
+    """Distances that were ``found`` at predicted points (H, K, E, n), and where these are
+    ``inside``, of all photographs in a row.
+    """
     shape = (len(found), -1, found.shape[-1])
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
     length = np.hypot(chord[..., 0], chord[..., 1])
@@ -483,7 +495,7 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * look.slope
     one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
-    here, there = np.moveaxis((weighted * look.under.found) @ powers[:, :2], -1, 0)
+    here, there = np.moveaxis((weighted * look.distances.found) @ powers[:, :2], -1, 0)
     begins, grows = look.begins, look.grows
     normal = (begins * one) @ begins.mT
     mixed = (grows * both) @ begins.mT

@@ -48,7 +48,7 @@ of them wide, and all lengths below are meant: photographs are binned to about a
 BLUR_ROUNDING = 1e-6
 """Pixels by which the last of the blurs that are tried may be missed."""
 PHOTOGRAPHS_A_WINDOW = 32
-"""Photographs that are looked at together: their profiles take some 80 MB."""
+"""Photographs that are looked at together: their profiles take some 20 MB."""
 WINDOW_BYTES = 96 * 2**20
 """Bytes that these take as grey levels at most; one may take more."""
 LEG_SEARCH_REACH = 10.0
@@ -82,8 +82,9 @@ EDGE_SEGMENTS = 8
 PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
 """Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
 FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT = 2, 5
-"""Profiles taken about each of these: one a pixel, which leaves no pixel out. Faint edges need all
-of them; more look at the same pixels."""
+"""Profiles taken about each of these: one a pixel on edges of 80 to 200 pixels. Faint edges need
+all of them, and more would look at the same pixels; shorter edges are looked at twice a pixel, and
+of longer ones 200 tell what shading leaves to be told."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
 OTHER_OUTLINE_CLEARANCE = 5.0
@@ -487,10 +488,10 @@ def _segment_profiles(
     """
     seen = _by_segment(clear)
     full = seen.sum(axis=-1) >= FEWEST_SHARE * seen.shape[-1]
-    chord = np.nan_to_num(points.pixel[..., -1, :] - points.pixel[..., 0, :])
-    pitch = np.hypot(chord[..., 0], chord[..., 1]) / (PREDICTED_EDGE_POINTS - 1)
+    step = np.diff(_by_segment(points.pixel)[full], axis=1)
+    pitch = np.fmax.reduce(np.hypot(step[..., 0], step[..., 1]), axis=1)  # from point to point
+    pitch = np.nan_to_num(pitch, nan=MOST_PROFILES_A_POINT)  # next to none that has an image
     each = np.clip(np.ceil(pitch), FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT).astype(int)
-    each = np.broadcast_to(each[..., None], full.shape)[full]
     count = each * seen[full].sum(axis=-1)
     which, at = _between(seen[full], each)
     pixel = photographs.camera.project(_on_edges(points, full, which, at))
@@ -500,18 +501,16 @@ def _segment_profiles(
     clipped = np.zeros((len(count), explained), dtype=bool)
     response = photographs.response
     clipped_from = light_of_levels(response)[profiles.SATURATED_GREY_LEVEL]
-    first = np.cumsum([0, *count])
-    for image, part in zip(
-        photographs.images, pairwise(np.cumsum([0, *full.sum(axis=(1, 2))])), strict=True
-    ):
-        mine, taken = slice(*part), slice(*first[list(part)])
+    first = np.concatenate([[0], np.cumsum(count)])  # profile of each segment
+    parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
+    for image, (start, end) in zip(photographs.images, parts, strict=True):
+        taken, begin = slice(first[start], first[end]), first[start:end] - first[start]
         across = _outward_of(pixel[taken], outward[taken], offsets)
         grey = levels_at(image, *across, cubic=True, response=response)
-        begin = first[mine] - first[part[0]]
-        np.add.reduceat(grey, begin, axis=0, out=total[mine])
+        np.add.reduceat(grey, begin, axis=0, out=total[start:end])
         if grey.max(initial=0.0) >= clipped_from:
             bright = grey[:, -explained:] >= clipped_from
-            np.logical_or.reduceat(bright, begin, axis=0, out=clipped[mine])
+            np.logical_or.reduceat(bright, begin, axis=0, out=clipped[start:end])
     mean = total / count[:, None].astype(np.float32)
     return full, profiles.Profiles.of(mean, clipped, count, half_width[full])
 
@@ -525,18 +524,20 @@ def _by_segment(values: Array | Booleans) -> Any:
 
 def _between(seen: Booleans, each: Integers) -> tuple[Integers, Array]:
     """M profiles about the points of N segments that are ``seen`` (N, points of one), ``each`` (N,)
-    about a point: its number among all of these points, and their place from it, -1/2 to 1/2 of
-    the way to the next.
+    about a point.
+
+    Returns the point of each profile (M,), counted through all segments, and the profile's place
+    (M,) from it, -1/2 to 1/2 of the way to the next.
     """
-    times = seen * each[:, None]
-    which = np.repeat(np.arange(times.size), times.ravel())
-    turn = np.arange(len(which)) - np.repeat(np.cumsum(times) - times.ravel(), times.ravel())
+    times = (seen * each[:, None]).ravel()
+    which = np.repeat(np.arange(times.size), times)
+    turn = np.arange(len(which)) - np.repeat(np.cumsum(times) - times, times)
     return which, ((turn + 0.5) / each[which // seen.shape[1]] - 0.5).astype(np.float32)
 
 
 def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) -> Array:
-    """Places (M, 3), single precision, of profiles, of :func:`_between` in segments that are
-    ``full``.
+    """Places (M, 3) of profiles, single precision. which, at : (M,) as :func:`_between` gives them
+    of the segments that are ``full``.
 
     Points of an edge lie evenly on a line in space, so those between are interpolated there; the
     profiles' directions hardly turn from one to the next.

@@ -1,7 +1,8 @@
-"""Grey levels of a photograph, or the light that they code, at places between its pixels.
+"""Grey levels of a photograph, or the light that they code, at places between its pixels; and what
+any picture has at places.
 
-Only the part of the photograph that the places lie in is worked on: a machine fills a quarter of
-it, and what is worked out of a whole one does not stay in the processor's cache.
+Of a photograph only the part that the places lie in is worked on: a machine fills a quarter of it,
+and what is worked out of a whole one does not stay in the processor's cache.
 """
 
 from __future__ import annotations
@@ -15,10 +16,14 @@ from pkmcal.cameras.response import Response, light_in
 
 INTERPOLATION_MARGIN = 2
 """Pixels about a place whose levels an interpolation takes."""
-PLACES_A_ROW, PLACES_IN_ONE_ROW = 512, 2**14
-"""Places that cv2.remap is given in a row, of shorter ones it takes half as much time again, and up
-to how many all are one: rows are shared out among threads, which costs more than so few take. More
-than 2**15 rows, or places in one, it does not take."""
+MOST_ROWS_LOOKED_UP = 32_000
+"""Rows, or columns, of a picture that cv2.remap takes, and of the places in it: a little fewer than
+2**15."""
+PLACES_A_ROW = 512
+"""Places that it is given in a row: of shorter rows it takes half as much time again."""
+PLACES_IN_ONE_ROW = 2**14
+"""Places up to which all are one row: rows are shared out among threads, and to wake these costs
+more than so few places take."""
 BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
@@ -57,8 +62,11 @@ def levels_at(
 
 
 def looked_up(picture: Any, x: Array, y: Array, how: int) -> Array:
-    """What a picture (height, width), of fewer than 2**15 rows and columns, has at columns and rows
-    (...), of the nearest pixel or between pixels as cv2 interpolates; that of its border outside.
+    """What a picture (height, width) has at columns and rows (...), of the nearest pixel or between
+    pixels as cv2 interpolates; that of its border outside.
+
+    Neither side of the picture is longer than MOST_ROWS_LOOKED_UP; places are no more than so many
+    rows of PLACES_A_ROW, 16 million.
     """
     import cv2
 

@@ -49,6 +49,7 @@ BRIGHTNESS_UNKNOWNS = 5
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 """Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
 _BETWEEN_HALF_WIDTHS = np.sqrt(HALF_WIDTHS[1:] * HALF_WIDTHS[:-1])
+"""Half widths (px) from which the next one is nearer, by ratio."""
 BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
 """Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
 USUAL_BLUR = 0.7
@@ -128,8 +129,8 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=2048)
 def _projections(blur: float, half_width: float, cut: int) -> Array:
-    """Orthonormal bases of the model's profiles at each trial position, (samples, 5 shifts): the
-    first of all positions, then the second, single precision.
+    """Orthonormal bases of the model's profiles at each trial position, (samples, 5 x shifts):
+    the first basis of all positions, then the second.
 
     cut : samples at the inner end that are not used; their rows are zero.
     The weak beliefs about the shading are rows below the samples, whose data are zero; only the
@@ -143,7 +144,7 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     beliefs[:, 0, 1] = PROFILE_MODEL_ERROR / SHADING_SLOPE
     beliefs[:, 1, 2] = PROFILE_MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
     bases = np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
-    return bases.transpose(1, 2, 0).reshape(at.shape[1], -1).astype(np.float32)
+    return bases.transpose(1, 2, 0).reshape(at.shape[1], -1)
 
 
 @dataclass(frozen=True)
@@ -244,8 +245,9 @@ def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Boole
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
     """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
-    scaled = (profiles.grey - profiles.grey[:, -1:]).astype(np.float32, copy=False)
-    scaled /= profiles.contrast[:, None].astype(np.float32, copy=False)
+    # what a good fit leaves is a millionth of the profile: too little for single precision
+    scaled = (profiles.grey - profiles.grey[:, -1:]).astype(float)
+    scaled /= profiles.contrast[:, None]
     samples, shifts = scaled.shape[1], len(EDGE_SHIFTS)
     scaled[np.arange(samples) < profiles.cut[:, None]] = 0.0
     width = np.searchsorted(_BETWEEN_HALF_WIDTHS, profiles.half_width)

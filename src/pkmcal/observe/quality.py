@@ -81,11 +81,8 @@ def _quality(
 
     def look(outward: Array) -> Array:
         pixel = points.pixel[..., None, :] + outward[..., None] * points.outward[..., None, :]
-        flat = pixel.reshape(*pixel.shape[:2], -1, 2)  # a row an edge
-        pairs = zip(photographs.images, flat, strict=True)
-        return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs]).reshape(
-            pixel.shape[:-1]
-        )
+        pairs = zip(photographs.images, pixel, strict=True)
+        return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs])
 
     inside = look(edge - DEPTHS_INSIDE_EDGE * half_width)
     offsets = np.arange(

@@ -38,8 +38,8 @@ def silhouette_edges(
     """
     tubes = view.tubes
     look = look_under(view, T_camera_base[None], np.zeros(1, dtype=int), SILHOUETTE_SAMPLES)
-    under = look.under
-    mixture = under.mixture(first_mixture(1), 10, WIDEST_SCATTER)
+    distances = look.distances
+    mixture = distances.mixture(first_mixture(1), 10, WIDEST_SCATTER)
     legs = legs_in_camera(view.machine, T_camera_base, view.poses, view.joints)
     points = edge_points(view.machine, view.camera, legs, tubes, SILHOUETTE_SAMPLES)
     clear = unobstructed(view.machine, view.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
@@ -47,9 +47,9 @@ def silhouette_edges(
     # how a distance grows as the edge moves outward by a pixel of the tables
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.nan_to_num(np.clip(look.slope * scale / points.gain, -1, 1))
-    position = -scale * under.found * np.sign(slope)
-    weight = under.own(mixture) * slope**2
-    found = clear & (under.length > 0) & (weight > LEAST_OWN)
+    position = -scale * distances.found * np.sign(slope)
+    weight = distances.own(mixture) * slope**2
+    found = clear & (distances.length > 0) & (weight > LEAST_OWN)
     position = np.where(found, position, 0.0)
     sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(found, weight, 1.0))
     fits = fit_edges(points, position, sigma, found)

@@ -197,7 +197,7 @@ def _found(
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
     # tell the place better
     best = candidates[:1]
-    nearer = descend(view, best, every, 8, (5, 3, 2, 1.5))
+    nearer = descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
     ends = np.concatenate([nearer, best])
     scores, each = score(view, ends, every, LAST_REACH), grain(view, candidates[0])
     return FoundStation(
@@ -364,8 +364,8 @@ def _surely(
     every = np.arange(len(view.configuration))
     guessed = view.legs(every)[None].joined(view.rivals(rng))
     places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
-    under = distances_under(replace(view, guessed=guessed), places, other, 8)
-    own, *rivals = by_photograph(under.evidence(mixture), len(other))
+    asked = distances_under(replace(view, guessed=guessed), places, other, 8)
+    own, *rivals = by_photograph(asked.evidence(mixture), len(other))
     count, fits = len(rivals), np.stack(rivals)
     scatter = np.maximum(fits.std(axis=0, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
     away = (own - fits.mean(axis=0)) / scatter

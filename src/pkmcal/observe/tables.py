@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Booleans, Integers
-from pkmcal.observe.levels import looked_up
+from pkmcal.observe.levels import MOST_ROWS_LOOKED_UP, looked_up
 
 EDGE_DIRECTIONS = 8
 """Edge directions told apart; each table takes the neighbouring directions in as well."""
@@ -37,8 +37,10 @@ NO_EDGE_DISTANCE = 1e3
 """Reduced pixels where a photograph has no edge of a direction."""
 CHANCE_DISTANCE_BIN = 0.5
 """Reduced pixels of a bin of the distances that chance gives."""
-MOST_ACROSS = 32_000
-"""Rows and columns of a picture that OpenCV looks things up in, fewer than 2**15."""
+ENOUGH_PLACES_FOR_CHANCE = 10_000
+"""Places of a direction's tables that tell what chance gives: where every fourth of every fourth
+row are more than so many, as from four photographs on, no more are counted. A bin of the nearest
+distances then holds a hundred."""
 
 
 class PictureEdges(NamedTuple):
@@ -72,7 +74,7 @@ class DirectionTables:
     ) -> DirectionTables:
         """Those of edge points, none ready. shape : EDGE_DIRECTIONS, h, w."""
         directions, height, width = shape
-        rows = min(len(place), MOST_ACROSS // height)
+        rows = min(len(place), MOST_ROWS_LOOKED_UP // height)
         columns = -(-len(place) // rows)
         picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
         chance = np.zeros(
@@ -91,7 +93,7 @@ class DirectionTables:
     def _work_out(self, direction: int) -> None:
         rows, taken_in = len(self.picture), alike(direction, len(self.ready))
         counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
-        sparse = 2 if len(self.place) < ENOUGH_TO_COMPARE else 4  # of many, few places tell as much
+        sparse = 4 if self.picture[..., 0, :].size > 16 * ENOUGH_PLACES_FOR_CHANCE else 2
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
@@ -255,7 +257,9 @@ def distance_tables(
     width: int = WORKING_WIDTH,
     directions: int = EDGE_DIRECTIONS,
 ) -> DistanceTables:
-    """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
+    """Tables of one station's photographs, K arrays (height, width) uint8 of one size, which are
+    looked at on threads.
+    """
     import cv2
 
     def reduced(number: int) -> tuple[Integers, float]:
@@ -265,7 +269,8 @@ def distance_tables(
         return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
 
     with ThreadPoolExecutor(THREADS) as pool:
-        small, (scale, *_) = zip(*pool.map(reduced, range(len(images))), strict=True)
+        pairs = list(pool.map(reduced, range(len(images))))
+        small, scale = [image for image, _ in pairs], pairs[0][1]
         height, across = small[0].shape
         against = np.zeros((len(small), height, across), dtype=np.int8)
         differs = None
