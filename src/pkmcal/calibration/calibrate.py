@@ -172,7 +172,7 @@ def calibrate_session(
         ):
             seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
             turns, richer = _identify(seen, refine_camera, seed, clock)
-        check_radii(seen, turns.estimate, refine_camera, seed)
+        check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
         found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
         return _judge(seen, found, turned, method, seed, clock)
 
@@ -241,7 +241,7 @@ def _identify(
     try:
         return _in_turns(seen, refine_camera, clock)
     except ResultError:
-        check_radii(seen, None, refine_camera, seed)
+        check_radii(seen, None, False, refine_camera, seed)
         raise
 
 

@@ -4,7 +4,8 @@ Thick tubes of half the width are found in the photographs all the same: their e
 seen inside of the right ones, and the camera at another distance. A search in the picture does not
 tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
 joint estimate: with the drawing's radii few edges are found, which disagree with the machine, now
-and then by no more than is accepted of a result; with half of them there are more, and they agree.
+and then by no more than is accepted of a result, or are no more than chance offers; with half of
+them there are more, and they agree.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ from pkmcal.observe.diagnose import diameters
 
 
 def check_radii(
-    seen: SeenSession, estimate: Estimate | None, refine_camera: bool, seed: int
+    seen: SeenSession, estimate: Estimate | None, by_chance: bool, refine_camera: bool, seed: int
 ) -> None:
     """Raise `InputError` where edges disagree with the machine more than with one whose mistake is
     put right, and more of them agree with a machine of half the radii.
 
-    estimate : with the drawing's radii, None where there is none. refine_camera : whether it
-    estimated the cameras. seed : of the search for the stations.
+    estimate : with the drawing's radii, None where there is none. by_chance : whether chance may
+    have offered its edges, which then agree with anything. refine_camera : whether it estimated the
+    cameras. seed : of the search for the stations.
     """
     agree = CURED_MISFIT_SHARE * TOO_NOISY
-    bad = estimate is None or estimate.statistics.noise_scale > agree
+    bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
     if not bad or not seen.photographs:
         return
     thinner = replace(seen.session, machine=_of_half_the_radii(seen.session.machine))
