@@ -37,10 +37,6 @@ NO_EDGE_DISTANCE = 1e3
 """Reduced pixels where a photograph has no edge of a direction."""
 CHANCE_DISTANCE_BIN = 0.5
 """Reduced pixels of a bin of the distances that chance gives."""
-ENOUGH_PLACES_FOR_CHANCE = 10_000
-"""Places of a direction's tables that tell what chance gives: where every fourth of every fourth
-row are more than so many, as from four photographs on, no more are counted. A bin of the nearest
-distances then holds a hundred."""
 
 
 class PictureEdges(NamedTuple):
@@ -93,11 +89,10 @@ class DirectionTables:
     def _work_out(self, direction: int) -> None:
         rows, taken_in = len(self.picture), alike(direction, len(self.ready))
         counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
-        sparse = 4 if self.picture[..., 0, :].size > 16 * ENOUGH_PLACES_FOR_CHANCE else 2
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
-            counted += _counted(table[::sparse, ::sparse])
+            counted += _counted(table)
         self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
         self.ready[direction] = True  # at last, as others may look beside
 
@@ -316,9 +311,13 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
 
 
 def _counted(table: Array) -> Integers:
-    """How often each distance occurs in a table (h, w), (bins,)."""
+    """How often each distance occurs in a table (h, w), (bins,); at every other place of every
+    other row: from fewer, what chance gives would differ between explanations of one picture.
+    """
     bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
-    number = np.minimum(table * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(np.intp)
+    number = np.minimum(table[::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(
+        np.intp
+    )
     return np.bincount(number.ravel(), minlength=bins)
 
 
