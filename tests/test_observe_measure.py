@@ -9,7 +9,10 @@ import pytest
 
 from pkmcal.observe import legs as looks
 from pkmcal.observe.legs import (
-    PREDICTED_EDGE_POINTS,
+    EDGE_SEGMENTS,
+    FEWEST_PROFILES_A_POINT,
+    MOST_PROFILES_A_POINT,
+    POINTS_A_SEGMENT,
     Photographs,
     _segment_profiles,
     measure,
@@ -89,17 +92,19 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     """
     seen, mechanism, camera = taken(), redrawn(0, 0.0005), camera_of()
     at = mechanism, FRONT, poses()
-    tubes, points, clear = looks.predicted(seen, *at, PREDICTED_EDGE_POINTS)
+    tubes, points, clear = looks.predicted(seen, *at, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     clear[:, :, 7] = False
-    width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 2::5]
+    width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 1::POINTS_A_SEGMENT]
     full, across = _segment_profiles(seen, points, clear, width)
     pitch = np.linalg.norm(np.diff(points.pixel, axis=2), axis=-1)
     kinds: set[int] = set()
     for n in np.random.default_rng(0).choice(full.sum(), 40, replace=False):
         k, e, segment = (where[n] for where in np.nonzero(full))
-        first = 5 * segment
-        each = int(np.clip(np.ceil(pitch[k, e, first : first + 4].max()), 2, 5))
-        mine = [p for p in range(first, first + 5) if clear[k, e, p]]
+        first = POINTS_A_SEGMENT * segment
+        end = first + POINTS_A_SEGMENT
+        furthest = np.ceil(pitch[k, e, first : end - 1].max())
+        each = int(np.clip(furthest, FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT))
+        mine = [p for p in range(first, end) if clear[k, e, p]]
         step = points.point[k, e, 1] - points.point[k, e, 0]
         turns = (np.arange(each) + 0.5) / each - 0.5
         place = [points.point[k, e, p] + turn * step for p in mine for turn in turns]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,13 +213,9 @@ def recognise(
     if starts is not None:
         told = zip(known, starts[: len(known)], strict=True)
         known = [T if T is not None or np.isnan(start).any() else start for T, start in told]
-    with ThreadPoolExecutor(THREADS) as pool:
-        few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
-        ready = [pool.submit(view, p) for p in few]
-        # a station is searched while the next one's tables are worked out
-        coming = (one.result() for one in ready)
-        found = _searched(coming, [known[s] for s in at], [None] * len(at), rngs)
-        views = tuple(one.result() for one in ready)
+    # one station after the other: what works its tables out uses all threads
+    views = tuple(view(p.select(numbers)) for p, numbers in zip(photographs, seen, strict=True))
+    found = _searched(views, [known[s] for s in at], [None] * len(at), rngs)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
     good: list[Array | None] = [None] * len(known)
@@ -234,7 +230,7 @@ Search = FoundStation | None
 
 
 def _searched(
-    views: Iterable[StationView],
+    views: tuple[StationView, ...],
     starts: list[Array | None],
     before: Sequence[Search],
     rngs: list[np.random.Generator],

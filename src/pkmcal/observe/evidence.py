@@ -145,6 +145,8 @@ class StationView:
 
 def distinct_silhouettes(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
     """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
+    if len(candidates) < 2:
+        return list(range(len(candidates)))
     legs = view.legs(photographs).moved(candidates)
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
     kept: list[int] = []
@@ -510,5 +512,4 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     step = -np.linalg.solve(normal, right)[..., 0]
     step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
     # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
-    turned = pose(rotation(step[:, :3]), np.zeros((len(step), 3))) @ candidates
-    return perturb(turned, np.concatenate([np.zeros((len(step), 3)), step[:, 3:]], axis=-1))
+    return pose(rotation(step[:, :3]), step[:, 3:]) @ candidates

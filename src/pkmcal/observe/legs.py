@@ -79,19 +79,22 @@ LEG_TILTS = np.arange(-1.0, 1.25, 0.25)
 """Shifts of a leg's ends against its middle that are tried once it is known to a pixel, px."""
 EDGE_SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
-PREDICTED_EDGE_POINTS = 5 * EDGE_SEGMENTS
-"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT = 2, 5
-"""Profiles taken about each of these: one a pixel on edges of 80 to 200 pixels. Faint edges need
-all of them, and more would look at the same pixels; shorter edges are looked at twice a pixel, and
-of longer ones 200 tell what shading leaves to be told."""
+POINTS_A_SEGMENT = 3
+"""Points along each that are predicted in full: an odd count, so one is its middle."""
+FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT = 3, 8
+"""Profiles taken about each of these: one a pixel on edges of 72 to 192 pixels. Faint edges need
+all of them, and more would look at the same pixels; shorter edges are looked at oftener, and of
+longer ones so many tell what shading leaves to be told."""
 FEWEST_SHARE = 1 / 3
-"""Share of a segment's samples that must be clear for its mean profile to count."""
+"""Share of a segment's points that must be clear for its mean profile to count."""
 OTHER_OUTLINE_CLEARANCE = 5.0
 """Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
 OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
+_LAMP = "a highlight lies along it, and hides where the leg ends"
+_TOO_LITTLE = "too little of it is seen as a clear edge"
+_NOT_ONE_EDGE = "its places do not lie on one edge"
 
 
 BlurByStation = Mapping[int, float | None]
@@ -219,15 +222,17 @@ def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
     """Place of every point between the ends of its leg's visible part, -1..1; (K, E, n)."""
-    place = np.zeros(along.shape)
-    for leg in np.unique(tubes.leg):
-        mine = tubes.leg == leg
-        seen = np.where(clear[:, mine], along[:, mine], np.nan)
-        low = np.fmin.reduce(seen, axis=(1, 2), keepdims=True)
-        high = np.fmax.reduce(seen, axis=(1, 2), keepdims=True)
-        half = np.fmax((high - low) / 2, 1e-3)
-        place[:, mine] = np.nan_to_num((along[:, mine] - (high + low) / 2) / half)
-    return np.clip(place, -1, 1)
+    legs, first_edge = np.unique(tubes.leg, return_index=True)  # tubes come leg by leg
+    ends: list[Array] = []
+    for reduce, beyond in ((np.minimum, np.inf), (np.maximum, -np.inf)):
+        of_edge = reduce.reduce(np.where(clear, along, beyond), axis=2)
+        ends.append(reduce.reduceat(of_edge, first_edge, axis=1))
+    seen = ends[0] <= ends[1]
+    low, high = (np.where(seen, end, 0.0) for end in ends)
+    middle, half = (high + low) / 2, np.where(seen, np.maximum((high - low) / 2, 1e-3), np.inf)
+    which = np.searchsorted(legs, tubes.leg)
+    middle, half = (v[:, which, None] for v in (middle, half))
+    return np.clip(np.nan_to_num((along - middle) / half), -1, 1)
 
 
 def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlaces:
@@ -433,9 +438,9 @@ class _Seen:
 
 def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
     tubes, points, clear = predicted(
-        photographs, machine, T_camera_base, poses, PREDICTED_EDGE_POINTS
+        photographs, machine, T_camera_base, poses, EDGE_SEGMENTS * POINTS_A_SEGMENT
     )
-    middles = np.arange(EDGE_SEGMENTS) * 5 + 2  # of the segments, among the points
+    middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
@@ -516,9 +521,7 @@ def _segment_profiles(
 
 
 def _by_segment(values: Array | Booleans) -> Any:
-    """Values (K, E, PREDICTED_EDGE_POINTS, ...) of edges' points, (K, E, EDGE_SEGMENTS, points of
-    one, ...).
-    """
+    """Values (K, E, n, ...) of all edges' points, (K, E, EDGE_SEGMENTS, POINTS_A_SEGMENT, ...)."""
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
@@ -577,25 +580,15 @@ def _rejections(
     fits: EdgeFits,
 ) -> tuple[Rejection, ...]:
     """Edges without a measurement, each with its reason."""
-    visible, seen, mirrored = (where.sum(axis=-1) for where in (full, found, lamps))
-    out: list[Rejection] = []
-    for k, e in zip(*np.nonzero(~fits.good), strict=True):
-        if visible[k, e] == 0:
-            why = OUT_OF_SIGHT_REASON
-        elif seen[k, e] < FEWEST_PLACES_FOR_TILT <= (seen + mirrored)[k, e]:
-            why = "a highlight lies along it, and hides where the leg ends"
-        elif seen[k, e] < FEWEST_PLACES_FOR_TILT:
-            why = "too little of it is seen as a clear edge"
-        else:
-            why = "its places do not lie on one edge"
-        out.append(
-            Rejection(
-                photographs.station,
-                int(photographs.configuration[k]),
-                int(tubes.leg[e]),
-                int(tubes.tube[e]),
-                int(tubes.side[e]),
-                why,
-            )
-        )
-    return tuple(out)
+    k, e = np.nonzero(~fits.good)
+    visible, seen, mirrored = (where[k, e].sum(axis=-1) for where in (full, found, lamps))
+    few = seen < FEWEST_PLACES_FOR_TILT
+    lamp = few & (seen + mirrored >= FEWEST_PLACES_FOR_TILT)
+    why = np.select(
+        [visible == 0, lamp, few], [OUT_OF_SIGHT_REASON, _LAMP, _TOO_LITTLE], _NOT_ONE_EDGE
+    )
+    names = photographs.configuration[k], tubes.leg[e], tubes.tube[e], tubes.side[e], why
+    return tuple(
+        Rejection(photographs.station, *name)
+        for name in zip(*(v.tolist() for v in names), strict=True)
+    )

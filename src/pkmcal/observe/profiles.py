@@ -15,10 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet
@@ -56,7 +57,8 @@ USUAL_BLUR = 0.7
 """Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
 BLURS_BESIDE = 2
 """Blurs to both sides of the best that are tried: the next tell its place between them, and how
-little each profile can leave; with further ones it moves by less than profiles tell it to."""
+little each profile can leave; with further ones it moves by less than profiles tell it to, and of a
+hundred poor profiles the next ones alone may mistake a dent for it."""
 ENOUGH_FOR_BLUR = 500
 """Profiles that tell the blur to a hundredth of a pixel; more only take time."""
 FEWEST_FOR_BLUR = 100
@@ -147,6 +149,20 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     return bases.transpose(1, 2, 0).reshape(at.shape[1], -1)
 
 
+class _Kinds(NamedTuple):
+    """Profiles by kind: a few dozen combinations of half width and cut.
+
+    scaled : (N, samples) in contrasts, less the outermost, in the order of the kinds. square : (N,)
+    sums of their squares. order : (N,) the profile that each is. parts : the first and the end of
+    each kind, and its half width (px) and cut.
+    """
+
+    scaled: Array
+    square: Array
+    order: Integers
+    parts: list[tuple[tuple[int, int], float, int]]
+
+
 @dataclass(frozen=True)
 class Profiles:
     """Averaged profiles across edges, N of them.
@@ -180,6 +196,25 @@ class Profiles:
     def contrast(self) -> Array:
         """Largest grey-level difference in each profile, (N,)."""
         return _contrast(self.grey)
+
+    @cached_property
+    def by_kind(self) -> _Kinds:
+        """The profiles as one projection a kind takes them."""
+        # what a good fit leaves is a millionth of the profile: too little for single precision
+        scaled = (self.grey - self.grey[:, -1:]).astype(float)
+        scaled /= self.contrast[:, None]
+        samples = scaled.shape[1]
+        scaled[np.arange(samples) < self.cut[:, None]] = 0.0
+        width = np.searchsorted(_BETWEEN_HALF_WIDTHS, self.half_width)
+        kind = width * samples + np.minimum(self.cut, samples - 1)
+        order = np.argsort(kind, kind="stable")
+        kind = kind[order]
+        first = np.flatnonzero(np.diff(kind, prepend=-1))
+        widths, cuts = divmod(kind[first], samples)
+        ends = [*first.tolist(), len(kind)]
+        parts = zip(pairwise(ends), HALF_WIDTHS[widths].tolist(), cuts.tolist(), strict=True)
+        scaled = scaled[order]
+        return _Kinds(scaled, np.einsum("ni,ni->n", scaled, scaled), order, list(parts))
 
 
 def cut_of(saturated: Booleans, half_width: Array) -> Integers:
@@ -245,24 +280,14 @@ def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Boole
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
     """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
-    # what a good fit leaves is a millionth of the profile: too little for single precision
-    scaled = (profiles.grey - profiles.grey[:, -1:]).astype(float)
-    scaled /= profiles.contrast[:, None]
-    samples, shifts = scaled.shape[1], len(EDGE_SHIFTS)
-    scaled[np.arange(samples) < profiles.cut[:, None]] = 0.0
-    width = np.searchsorted(_BETWEEN_HALF_WIDTHS, profiles.half_width)
-    kind = width * samples + np.minimum(profiles.cut, samples - 1)
-    order = np.argsort(kind, kind="stable")
-    scaled, kind = scaled[order], kind[order]
-    explained = np.empty((len(scaled), shifts), dtype=scaled.dtype)
-    ends = [*np.flatnonzero(np.diff(kind, prepend=-1)), len(kind)]
-    for first, end in pairwise(ends):  # a few dozen combinations of width and cut
-        w, cut = divmod(int(kind[first]), samples)
-        bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
-        along = (scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
+    kinds, shifts = profiles.by_kind, len(EDGE_SHIFTS)
+    explained = np.empty((len(kinds.scaled), shifts))
+    for (first, end), half_width, cut in kinds.parts:
+        bases = _projections(round(float(blur), 3), half_width, cut)
+        along = (kinds.scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
         np.einsum("nbs,nbs->ns", along, along, out=explained[first:end])
     out = np.empty_like(explained)
-    out[order] = np.einsum("ni,ni->n", scaled, scaled)[:, None] - explained
+    out[kinds.order] = kinds.square[:, None] - explained
     return np.maximum(out, 0.0, out=out)
 
 
@@ -339,7 +364,7 @@ def estimate_blur(profiles: Profiles) -> float:
     few = min(FEWEST_FOR_BLUR, len(profiles.cut))
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
-        profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
+        profiles = profiles.select(whole[evenly(whole.size, ENOUGH_FOR_BLUR)])
     floor = (GREY_NOISE / profiles.contrast) ** 2
     costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # until they are tried
     k = int(np.argmin(np.abs(BLURS_TRIED - USUAL_BLUR)))
@@ -391,22 +416,31 @@ def fit_edges(
     rows = np.where(found[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
     value = np.where(found, position, 0.0)
     base = np.where(found, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
-    turn, normal = _weighted(rows, value, base)
-    off2 = _squared_misfit(rows, value, turn, base)
-    weight = base
+    # all edges side by side, place after place: what is added up then lies in one piece
+    one, two, at, sure = (
+        np.ascontiguousarray(v.reshape(-1, v.shape[-1]).T)
+        for v in (rows[..., 0], rows[..., 1], value, base)
+    )
+    squares = np.stack([one * one, one * two, two * two, one * at, two * at])
+    weight = sure
+    inverse, turn = _solved(squares, weight)
+    off2 = (at - one * turn[0] - two * turn[1]) ** 2 * sure
     for _ in range(rounds):
-        weight = base / (1 + off2 / 4.0)  # Cauchy, two sigmas
-        turn, normal = _weighted(rows, value, weight)
-        off2 = _squared_misfit(rows, value, turn, base)
+        weight = sure / (1 + off2 / 4.0)  # Cauchy, two sigmas
+        inverse, turn = _solved(squares, weight)
+        off2 = (at - one * turn[0] - two * turn[1]) ** 2 * sure
+    shape = found.shape[:-1]
+    off2, weight = (v.T.reshape(found.shape) for v in (off2, weight))
     used = found & (off2 < 9.0)
     count = used.sum(axis=-1)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
     factor = np.maximum(scatter, 1.0) * np.maximum(count / MEASUREMENTS_AN_EDGE, 1.0)
-    covariance = np.linalg.inv(normal) * factor[..., None, None]
-    operator = np.linalg.solve(normal, (rows * weight[..., None]).mT)
+    inverse = np.moveaxis(inverse.reshape(2, 2, *shape), (0, 1), (-2, -1))
+    operator = inverse @ (rows * weight[..., None]).mT
     good = (count >= FEWEST_PLACES_FOR_TILT) & (count >= 0.5 * found.sum(axis=-1))
+    covariance = inverse * factor[..., None, None]
     good &= np.isfinite(covariance).all(axis=(-1, -2))
-    return EdgeFits(turn, basis, covariance, operator, used, good)
+    return EdgeFits(turn.T.reshape(*shape, 2), basis, covariance, operator, used, good)
 
 
 def _middle_ray(points: EdgePoints) -> Array:
@@ -414,17 +448,18 @@ def _middle_ray(points: EdgePoints) -> Array:
     return ray / np.sqrt(dot(ray, ray))[..., None]
 
 
-def _squared_misfit(rows: Array, value: Array, turn: Array, base: Array) -> Array:
-    return (value - (rows @ turn[..., None])[..., 0]) ** 2 * base
+def _solved(squares: Array, weight: Array) -> tuple[Array, Array]:
+    """Weighted least squares of n values on two unknowns each, N times over: the inverses (2, 2, N)
+    of the normal matrices, and the unknowns (2, N).
 
-
-def _weighted(rows: Array, value: Array, weight: Array) -> tuple[Array, Array]:
-    """Weighted least squares of value (..., n) on rows (..., n, 2): solution and normal matrix."""
-    weighted = (rows * weight[..., None]).mT
-    normal = weighted @ rows
-    ridge = 1e-12 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] + 1e-30
-    normal = normal + ridge * np.eye(2)
-    return np.linalg.solve(normal, weighted @ value[..., None])[..., 0], normal
+    squares : (5, n, N) products of the rows' entries, then of these with the values. weight :
+    (n, N).
+    """
+    a, b, c, p, q = np.einsum("pnx,nx->px", squares, weight)
+    ridge = 1e-12 * (a + c) + 1e-30
+    a, c = a + ridge, c + ridge
+    inverse = np.stack([c, -b, -b, a]).reshape(2, 2, -1) / (a * c - b * b)
+    return inverse, inverse[0] * p + inverse[1] * q
 
 
 def edge_set(

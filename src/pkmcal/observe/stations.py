@@ -197,7 +197,7 @@ def _found(
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
     # tell the place better
     best = candidates[:1]
-    nearer = descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
+    nearer = descend(view, best, every, 8, (5, 3, 2, 1.5))
     ends = np.concatenate([nearer, best])
     scores, each = score(view, ends, every, LAST_REACH), grain(view, candidates[0])
     return FoundStation(
@@ -322,7 +322,7 @@ def evidence_nearby(
         each = np.stack(near)
     count = each.shape[1]
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
-    ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 10, 8, 6, 5))
+    ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 8, 5))
     told = score(view, ends, few, 5).reshape(-1, count)
     asked = np.argsort(told.min(axis=1)[1:])[:HYPOTHESES_SETTLED] + 1
     asked = np.concatenate([[0], asked])
