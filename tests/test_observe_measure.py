@@ -245,6 +245,35 @@ def test_a_common_shift_of_all_points_is_what_shift_says():
     np.testing.assert_array_equal(still.leg, np.tile(tubes.leg, 6))
 
 
+def test_turns_are_those_of_weighted_least_squares():
+    """Against NumPy's, edge by edge, from all places down to none; of one or two nothing is told,
+    and nothing is spoilt.
+    """
+    rng = np.random.default_rng(0)
+    _, points = predicted()
+    shape = points.along.shape
+    found = rng.random(shape) < rng.uniform(0, 1, shape[:2])[..., None]
+    basis = fitted(np.zeros(shape))[0].basis
+    rows = points.by_normal() @ basis
+    turn = 1e-3 * rng.normal(size=(*shape[:2], 2))
+    fits = fit_edges(points, np.einsum("kenj,kej->ken", rows, turn), np.full(shape, 0.1), found)
+    count = found.sum(axis=-1)
+    assert set(count.ravel()) == set(range(SAMPLES + 1))
+    np.testing.assert_array_equal(fits.good, count > 2)
+    assert np.isfinite(fits.turn).all()
+    variance = 0.1**2 + EDGE_SIGMA_FLOOR**2
+    for k, e in zip(*np.nonzero(fits.good), strict=True):
+        seen = found[k, e]
+        mine = rows[k, e, seen]
+        np.testing.assert_allclose(fits.turn[k, e], turn[k, e], rtol=1e-6, atol=1e-11)
+        solution = np.linalg.pinv(mine)
+        scale = np.abs(solution).max()
+        np.testing.assert_allclose(fits.operator[k, e][:, seen], solution, atol=1e-6 * scale)
+        assert not fits.operator[k, e][:, ~seen].any()
+        expected = solution @ solution.T * variance * max(count[k, e] / MEASUREMENTS_AN_EDGE, 1)
+        np.testing.assert_allclose(fits.covariance[k, e], expected, rtol=1e-6)
+
+
 def test_positions_on_a_highlight_do_not_pull_the_edge():
     """Two of eight places half a pixel inside: left out, and the edge stays within 0.03 px."""
     noise = 0.05 * np.random.default_rng(0).normal(size=(6, 24, SAMPLES))
