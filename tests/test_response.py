@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pkmcal
-from pkmcal.calibration import responses
+from pkmcal.calibration import responses, turns
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.recognise import read_photographs
 from pkmcal.calibration.responses import (
@@ -213,6 +213,28 @@ def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(coded, monkeyp
     (held_back,) = _scored(measurements, whole[0], few)[0].values()
     assert gain > 5 * LEAST_RESPONSE_GAIN
     assert gain > 1.5 * held_back
+
+
+def test_right_photographs_are_not_all_asked(demo, monkeypatch):
+    """Those of some configurations tell that there is nothing to gain."""
+    asked: list[int] = []
+
+    def told(session, photographs, measurements, estimate, roughly, measured, of_edges):
+        def some(few):
+            asked.append(sum(len(p.images) for p in few))
+            return roughly(few)
+
+        def every(_):
+            pytest.fail("all were asked")
+
+        asked.append(sum(len(p.images) for p in photographs))
+        return told_by_edges(session, photographs, measurements, estimate, some, every, of_edges)
+
+    monkeypatch.setattr(responses, "POLISHED_SHADING", np.inf)  # or all are asked at once
+    monkeypatch.setattr(turns, "told_by_edges", told)
+    calibrate_session(demo.session)
+    every, some = asked
+    assert 0 < some < every
 
 
 def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
