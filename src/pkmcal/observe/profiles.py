@@ -422,13 +422,16 @@ def fit_edges(
         for v in (rows[..., 0], rows[..., 1], value, base)
     )
     squares = np.stack([one * one, one * two, two * two, one * at, two * at])
+
+    def fitted(weight: Array) -> tuple[Array, Array, Array]:
+        inverse, turn = _solved(squares, weight)
+        return inverse, turn, (at - one * turn[0] - two * turn[1]) ** 2 * sure
+
     weight = sure
-    inverse, turn = _solved(squares, weight)
-    off2 = (at - one * turn[0] - two * turn[1]) ** 2 * sure
+    inverse, turn, off2 = fitted(weight)
     for _ in range(rounds):
         weight = sure / (1 + off2 / 4.0)  # Cauchy, two sigmas
-        inverse, turn = _solved(squares, weight)
-        off2 = (at - one * turn[0] - two * turn[1]) ** 2 * sure
+        inverse, turn, off2 = fitted(weight)
     shape = found.shape[:-1]
     off2, weight = (v.T.reshape(found.shape) for v in (off2, weight))
     used = found & (off2 < 9.0)
