@@ -16,7 +16,8 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.turns import observation_of
 from pkmcal.observe import legs
 from pkmcal.observe.images import binned
-from pkmcal.observe.legs import Photographs, first_binning, measure, sharp_binning
+from pkmcal.observe.legs import first_binning, measure, sharp_binning
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.profiles import BLURS_TRIED
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken

@@ -13,11 +13,11 @@ from pkmcal.observe.legs import (
     FEWEST_PROFILES_A_POINT,
     MOST_PROFILES_A_POINT,
     POINTS_A_SEGMENT,
-    Photographs,
     _segment_profiles,
     measure,
 )
 from pkmcal.observe.levels import levels_at
+from pkmcal.observe.photographs import Photographs, Placed, Window
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import (
     EDGE_SIGMA_FLOOR,
@@ -90,9 +90,9 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     """Each segment's mean is that of profiles taken one by one; an end of an edge that has no image
     makes the rest no poorer.
     """
-    seen, mechanism, camera = taken(), redrawn(0, 0.0005), camera_of()
-    at = mechanism, FRONT, poses()
-    tubes, points, clear = looks.predicted(seen, *at, EDGE_SEGMENTS * POINTS_A_SEGMENT)
+    mechanism, camera = redrawn(0, 0.0005), camera_of()
+    seen = Window.of([Placed(taken(), FRONT, poses())])
+    tubes, points, clear = looks.predicted(seen, mechanism, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     clear[:, :, 7] = False
     width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 1::POINTS_A_SEGMENT]
     full, across = _segment_profiles(seen, points, clear, width)
@@ -211,7 +211,8 @@ def fitted(position, sigma=0.1, found=None):
     tubes, points = predicted()
     found = np.ones(position.shape, dtype=bool) if found is None else found
     fits = fit_edges(points, position, np.full(position.shape, sigma), found)
-    return fits, edge_set(points, fits, tubes, 0, np.arange(6), fits.good)
+    station = np.zeros(6, dtype=int)
+    return fits, edge_set(points, fits, tubes, station, np.arange(6), fits.good)
 
 
 def positions_of(mechanism):

@@ -13,7 +13,8 @@ from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotat
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import evidence, stations
 from pkmcal.observe.evidence import StationView, score
-from pkmcal.observe.legs import LEG_SEARCH_REACH, Photographs, search, search_legs
+from pkmcal.observe.legs import LEG_SEARCH_REACH, search, search_legs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
 from pkmcal.observe.stations import find_station

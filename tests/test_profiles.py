@@ -129,14 +129,16 @@ def make(
         clipped.append(np.any(samples >= SATURATED_GREY_LEVEL, axis=0))
     counts = np.full(number, float(count))
     explained = np.array(clipped)[:, -len(profile_offsets()) :]
-    profiles = Profiles.of(np.array(grey), explained, counts, np.array(widths))
+    station = np.zeros(number, dtype=int)
+    profiles = Profiles.of(np.array(grey), explained, counts, np.array(widths), station)
     return Made(profiles, np.array(truth))
 
 
 def plain(grey, half_width):
     """Whole profiles (N, samples) at the places that the model explains."""
     count, none = len(grey), np.zeros(len(grey), dtype=int)
-    return Profiles(grey, np.full(count, 24.0), np.full(count, half_width), none, none, none > 0)
+    many, width = np.full(count, 24.0), np.full(count, half_width)
+    return Profiles(grey, many, width, none, none, none, none > 0)
 
 
 def steepest(profiles):
@@ -154,7 +156,7 @@ def rms(values):
 
 def located(profiles, blur):
     """Positions of profiles each by itself: about the trial position that leaves least."""
-    curves = residual_curves(profiles, blur)
+    curves = residual_curves(profiles, {0: blur})
     return locate(profiles, curves, EDGE_SHIFTS[curves.argmin(axis=-1)])
 
 
@@ -280,7 +282,7 @@ def test_a_highlight_is_not_taken_for_the_limb():
     """Its outer border lies up to a pixel within the limb, and is the likelier edge of the two."""
     dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
     made = make(8, half_width=(7, 14), lamp=10.0, **dark)
-    less, highlight = without_highlights(made.profiles, 0.7)
+    less, highlight = without_highlights(made.profiles, {0: 0.7})
     assert highlight.mean() > 0.85
     at = located(less, 0.7)
     off = at.position - made.truth
@@ -292,7 +294,7 @@ def test_what_lies_beyond_a_highlights_middle_is_left_out():
     """Where it stands out less than the limb itself, the profile is good for that."""
     dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
     made = make(8, half_width=(7, 14), lamp=3.0, **dark)
-    less, highlight = without_highlights(made.profiles, 0.7)
+    less, highlight = without_highlights(made.profiles, {0: 0.7})
     assert np.mean(less.cut > made.profiles.cut) > 0.9
     cut, whole = located(less, 0.7), located(made.profiles, 0.7)
     off, before = (np.abs(at.position - made.truth)[at.found] for at in (cut, whole))
@@ -305,7 +307,7 @@ def test_what_lies_beyond_a_highlights_middle_is_left_out():
 def test_diffuse_light_is_kept():
     """The limb of a matt tube under a lamp from the side turns from light to dark as well."""
     made = make(5, half_width=(9, 50))
-    less, highlight = without_highlights(made.profiles, 0.7)
+    less, highlight = without_highlights(made.profiles, {0: 0.7})
     assert np.mean(less.cut > made.profiles.cut) < 0.02
     assert not highlight.any()
 
@@ -313,7 +315,7 @@ def test_diffuse_light_is_kept():
 def test_paint_with_the_light_behind_it_shows_no_highlight():
     """Its limbs are bright strips too, of which the model is true."""
     made = make(5, half_width=(9, 50), light=(1.5, 2.2), least_contrast=20)
-    less, highlight = without_highlights(made.profiles, 0.7)
+    less, highlight = without_highlights(made.profiles, {0: 0.7})
     assert np.mean(less.cut > made.profiles.cut) > 0.2
     assert highlight.mean() < 0.01
 
@@ -351,12 +353,13 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
     np.testing.assert_allclose(at.position, truth, atol=0.014)
 
 
-def test_profiles_of_many_widths_and_cuts_are_worked_out_as_each_by_itself():
-    profiles = make(22, 60, half_width=(2, 90)).profiles
-    cut = np.random.default_rng(22).integers(0, len(profile_offsets()) - 2, len(profiles.cut))
-    mixed = replace(profiles, cut=cut)
-    together = residual_curves(mixed, 0.7)
-    alone = [residual_curves(mixed.select(np.array([k])), 0.7)[0] for k in range(len(cut))]
+def test_profiles_of_many_widths_cuts_and_blurs_are_worked_out_as_each_by_itself():
+    profiles, rng = make(22, 60, half_width=(2, 90)).profiles, np.random.default_rng(22)
+    cut = rng.integers(0, len(profile_offsets()) - 2, len(profiles.cut))
+    mixed = replace(profiles, cut=cut, station=rng.choice([0, 3, 7], len(cut)))
+    blur = {0: 0.7, 3: 0.5, 7: 1.1}
+    together = residual_curves(mixed, blur)
+    alone = [residual_curves(mixed.select(np.array([k])), blur)[0] for k in range(len(cut))]
     np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-14)
 
 

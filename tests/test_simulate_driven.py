@@ -313,7 +313,7 @@ def test_the_blur_is_not_told_by_a_few_odd_profiles():
         np.concatenate([sharp.count, slim.count]),
         np.concatenate([sharp.half_width, slim.half_width]),
         cut,
-        np.zeros(len(cut), dtype=int),
+        *np.zeros((2, len(cut)), dtype=int),
         np.zeros(len(cut), dtype=bool),
     )
     assert estimate_blur(both) == pytest.approx(0.7, abs=0.06)

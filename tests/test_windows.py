@@ -12,8 +12,11 @@ import pytest
 
 from pkmcal.calibration import recognise, turns
 from pkmcal.calibration.recognise import mistake_in, platform_poses, read_photographs
+from pkmcal.geometry.rigid import perturb
 from pkmcal.observe import legs
-from pkmcal.observe.legs import measure, search
+from pkmcal.observe import photographs as passing
+from pkmcal.observe.legs import measure, measure_stations, search, search_stations
+from pkmcal.observe.photographs import Placed, windows
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import load_session
 from test_observe_drawing import FRONT, poses, redrawn
@@ -59,10 +62,22 @@ LOOKS = {
 }
 
 
+def same(look, other):
+    """Two looks show the same."""
+    assert look.rejected == other.rejected
+    for field in fields(other.edges):
+        ours, theirs = (getattr(one.edges, field.name) for one in (look, other))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(look.point_edge, other.point_edge)
+    np.testing.assert_allclose(look.points, other.points, atol=1e-9)
+    np.testing.assert_allclose(look.moved, other.moved, atol=1e-12)
+    np.testing.assert_allclose(look.blur, other.blur, atol=1e-12)
+
+
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
 def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
-    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", window)
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", window)
     photographs, seen, fresh = many()
     look(photographs, seen)
     assert fresh.most == window
@@ -75,20 +90,14 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 def test_windows_change_nothing(monkeypatch, name):
     photographs, seen, _ = many()
     whole = LOOKS[name](photographs, seen)
-    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", 4)
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
     found = LOOKS[name](photographs, seen)
-    assert found.rejected == whole.rejected
-    for field in fields(whole.edges):
-        ours, theirs = (getattr(look.edges, field.name) for look in (found, whole))
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(found.point_edge, whole.point_edge)
-    np.testing.assert_allclose(found.points, whole.points, atol=1e-9)
-    np.testing.assert_allclose(found.moved, whole.moved, atol=1e-12)
+    same(found, whole)
 
 
 def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
     photographs, seen, _ = many()
-    monkeypatch.setattr(legs, "PHOTOGRAPHS_A_WINDOW", 4)
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
     few = photographs.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
     of_few = LOOKS["measure"](photographs.select(few), seen[few]).blur
@@ -96,12 +105,45 @@ def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypat
 
 
 def test_large_photographs_have_small_windows(monkeypatch):
-    photographs, _, _ = many()
+    photographs, seen, _ = many()
     width, height = photographs.camera.image_size
-    monkeypatch.setattr(legs, "WINDOW_BYTES", 5 * width * height)
-    assert [len(part.images) for _, part in photographs.windows()] == [5, 5, 5, 3]
-    monkeypatch.setattr(legs, "WINDOW_BYTES", 1)  # one may take more
+    monkeypatch.setattr(passing, "WINDOW_BYTES", 5 * width * height)
+    placed = [Placed(photographs, FRONT, seen)]
+    assert [len(window.images) for window in windows(placed)] == [5, 5, 5, 3]
+    monkeypatch.setattr(passing, "WINDOW_BYTES", 1)  # one may take more
     assert photographs.window == 1
+
+
+def stations():
+    """Photographs of one camera at three places, the second a little aside, and of another one."""
+    longer = replace(taken().camera, parameters=taken().camera.parameters * 1.0001)
+    made = [replace(taken(), station=number) for number in (2, 5, 7)]
+    made.append(replace(taken(), station=8, camera=longer))
+    aside = perturb(FRONT, np.array([0.0, 0.0, 0.0, 0.0005, 0.0, 0.0]))
+    return [Placed(p, T, poses()) for p, T in zip(made, (FRONT, aside, FRONT, FRONT), strict=True)]
+
+
+def test_stations_of_one_camera_are_looked_at_together(monkeypatch):
+    def shown():
+        return [np.unique(window.station).tolist() for window in windows(stations())]
+
+    assert shown() == [[2, 5, 7], [8]]
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 12)
+    assert shown() == [[2, 5], [7], [8]]
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
+    assert shown() == [[2], [2], [5], [5], [7], [7], [8], [8]]
+
+
+@pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8, 8: 0.7}], ids=["blur", "known"])
+def test_together_stations_are_seen_as_each_alone(known):
+    drawn = redrawn(0, 0.0005)
+    found = [search_stations(stations(), drawn), measure_stations(stations(), drawn, known)]
+    for placed, coarse, fine in zip(stations(), *found, strict=True):
+        p, T, seen = placed
+        same(coarse, search(p, drawn, T, seen))
+        same(fine, measure(p, drawn, T, seen, known.get(p.station)))
+        assert (fine.edges.station == p.station).all()
+        assert fine.blur == known.get(p.station, fine.blur)
 
 
 def test_tables_look_at_each_photograph_once_and_share_their_memory():
@@ -118,18 +160,18 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
 
 @pytest.mark.parametrize("enough", [0.0, np.inf])
 def test_stations_are_looked_at_beside_one_another_or_in_turn(monkeypatch, enough):
-    """With the same result: a look a station, in their order."""
+    """With the same result, in their order."""
     monkeypatch.setattr(turns, "PIXELS_FOR_THREADS", enough)
     photographs = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
 
-    def look(one):
+    def look(some):
         threads.add(get_ident())
-        return legs.joined_looks([], 0.5 + one.station, 0.0)
+        return [legs.joined_looks([], 0.5 + one.station, 0.0) for one in some]
 
-    assert [seen.blur for seen in turns._each(photographs, look)] == [0.5, 1.5, 2.5]
+    assert [seen.blur for seen in turns._looked_at(photographs, look)] == [0.5, 1.5, 2.5]
     assert (get_ident() in threads) == (enough > 0)
-    assert turns._each([], look) == []
+    assert turns._looked_at([], look) == []
 
 
 # ------------------------------------------------------------------ a session

@@ -34,6 +34,7 @@ from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import SAME_PLACE_TURN, Alone, find_alone
 from pkmcal.observe.evidence import StationView
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
@@ -61,7 +62,7 @@ contradicts another that was taken for something else."""
 
 def place(
     session: Session,
-    photographs: list[legs.Photographs],
+    photographs: list[Photographs],
     boards: Boards,
     rng: np.random.Generator,
     told: CalibrationProgress | None = None,
@@ -90,7 +91,7 @@ def place(
 
 def search_by_hand(
     session: Session,
-    photographs: list[legs.Photographs],
+    photographs: list[Photographs],
     boards: Boards,
     known: KnownScene,
     told: CalibrationProgress | None = None,
@@ -186,7 +187,7 @@ class _Answer:
 
 def _with_sure(
     session: Session,
-    photographs: Mapping[int, legs.Photographs],
+    photographs: Mapping[int, Photographs],
     room: Surroundings,
     so_far: _SoFar,
     believed: Array,
@@ -223,7 +224,7 @@ def _with_sure(
     return _SoFar(scene, placed, room.landmarks(placed), bare)
 
 
-def _is_bare(scene: KnownScene, photograph: legs.Photographs) -> bool:
+def _is_bare(scene: KnownScene, photograph: Photographs) -> bool:
     """Whether too few legs can be measured in a photograph where it is."""
     p, machine = photograph, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
@@ -231,7 +232,7 @@ def _is_bare(scene: KnownScene, photograph: legs.Photographs) -> bool:
     return len(shown) < min(FEWEST_LEGS, machine.n_legs)
 
 
-def _alone(session: Session, scene: KnownScene, photograph: legs.Photographs) -> Alone:
+def _alone(session: Session, scene: KnownScene, photograph: Photographs) -> Alone:
     """The places of a photograph by the search in it alone."""
     p = photograph
     view = StationView(
@@ -245,7 +246,7 @@ def _search(
     session: Session,
     room: Surroundings,
     so_far: _SoFar,
-    photograph: legs.Photographs,
+    photograph: Photographs,
     before: _Answer,
 ) -> _Answer:
     """The places that a photograph could show, those of before among them, weighed by its legs and
@@ -273,7 +274,7 @@ def _search(
 
 
 def _legs(
-    session: Session, photograph: legs.Photographs, joined: KnownScene, T_camera_base: Array
+    session: Session, photograph: Photographs, joined: KnownScene, T_camera_base: Array
 ) -> LegsInCamera:
     """Leg axes (H, L, 3) of a photograph taken from places (H, 4, 4), or (1, L, 3) from one."""
     first = photograph.configuration[:1]

@@ -42,6 +42,7 @@ from pkmcal.observe.alone import (
     turned_about,
 )
 from pkmcal.observe.evidence import StationView, distinct_silhouettes, grain, settle_by_evidence
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
 
@@ -64,7 +65,7 @@ ViewOf = Callable[[int, KnownScene], StationView]
 
 def join(
     session: Session,
-    photographs: Mapping[int, legs.Photographs],
+    photographs: Mapping[int, Photographs],
     known: KnownScene,
     places: Mapping[int, Array],
     boards: Boards,
@@ -177,7 +178,7 @@ class AskedPlaces(NamedTuple):
 
 def look_closer(
     session: Session,
-    photograph: legs.Photographs,
+    photograph: Photographs,
     before: KnownScene,
     found: Alone,
     others: Array,

@@ -11,7 +11,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.identify.bundle import MachineTold
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import Photographs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.session.load import Session
 
 

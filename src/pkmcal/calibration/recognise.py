@@ -17,6 +17,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.evidence import StationView
 from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, fitting
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.stations import FoundStation, find_station
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session, Station
@@ -52,18 +53,18 @@ def check_observable(session: Session) -> None:
         )
 
 
-def read_photographs(session: Session) -> list[legs.Photographs]:
+def read_photographs(session: Session) -> list[Photographs]:
     """The photographs of stations that observe legs, each of which can be decoded; the first that
     fit into KEPT_PHOTOGRAPH_BYTES bytes stay so.
     """
 
-    def read(number: int, most: int) -> legs.Photographs:
+    def read(number: int, most: int) -> Photographs:
         station = session.stations[number]
         paths, labels = photograph_files(session, station)
         images = Pictures.read(paths, station.camera.image_size, labels, most)
         rows = np.array([p.configuration for p in station.photographs])
         readings = session.joints[rows]
-        return legs.Photographs(
+        return Photographs(
             number, station.camera, rows, readings, images, station.response,
             legs.first_binning(station.camera.image_size),
         )  # fmt: skip
@@ -185,7 +186,7 @@ class Recognition:
 
 def recognise(
     session: Session,
-    photographs: list[legs.Photographs],
+    photographs: list[Photographs],
     poses: Array,
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
@@ -204,7 +205,7 @@ def recognise(
     most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(photographs), 1))
     seen = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in photographs)
 
-    def view(p: legs.Photographs) -> StationView:
+    def view(p: Photographs) -> StationView:
         tables = distance_tables(p.images)
         return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
 
@@ -270,7 +271,7 @@ def _better(one: FoundStation, other: Search) -> FoundStation:
 
 def mistake_in(
     session: Session,
-    photographs: list[legs.Photographs],
+    photographs: list[Photographs],
     recognition: Recognition,
     rng: np.random.Generator,
 ) -> InputError | None:
@@ -306,7 +307,7 @@ def frozen_in(session: Session) -> InputError | None:
 
 def station_poses(
     session: Session,
-    photographs: list[legs.Photographs],
+    photographs: list[Photographs],
     boards: Boards,
     rng: np.random.Generator,
     told: CalibrationProgress | None = None,
@@ -385,7 +386,7 @@ def _tracker_starts(session: Session) -> list[Array | None]:
     return [table.start(poses) for table in session.trackers]
 
 
-def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
+def boards_of(session: Session, photographs: list[Photographs]) -> Boards:
     """The session's board in its photographs; see :func:`pkmcal.boards.stations.find_boards`.
 
     Photographs that only show the board are decoded one by one, as they are looked at.
@@ -397,9 +398,7 @@ def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
     return find_boards(session, board_images(session, photographs))
 
 
-def board_images(
-    session: Session, photographs: list[legs.Photographs]
-) -> dict[int, Sequence[Integers]]:
+def board_images(session: Session, photographs: list[Photographs]) -> dict[int, Sequence[Integers]]:
     """All stations' photographs by their number: decoded already, or when they are looked at."""
     images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
     for number, station in enumerate(session.stations):

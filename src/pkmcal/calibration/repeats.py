@@ -23,6 +23,7 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
     Groups,
@@ -211,7 +212,7 @@ class _Look:
     dropped: int
 
     @classmethod
-    def of(cls, calibration: Calibration, photographs: legs.Photographs) -> _Look:
+    def of(cls, calibration: Calibration, photographs: Photographs) -> _Look:
         """Measure a station's photographs where the calibration says that the legs are."""
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration

@@ -23,7 +23,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
-from pkmcal.observe.legs import Photographs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 

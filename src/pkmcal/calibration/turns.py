@@ -43,7 +43,8 @@ from pkmcal.measurements import (
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.alone import finest_view
-from pkmcal.observe.profiles import EDGE_SHIFTS, USUAL_BLUR
+from pkmcal.observe.photographs import Photographs, Placed
+from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
 from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
@@ -113,8 +114,8 @@ class Turns(NamedTuple):
     estimate: Estimate
     cameras: CameraRefinement
     responses: tuple[ResponseTold, ...] = ()
-    photographs: Sequence[legs.Photographs] = ()
-    blur: legs.BlurByStation = MappingProxyType({})
+    photographs: Sequence[Photographs] = ()
+    blur: BlurByStation = MappingProxyType({})
     scatter: float = 1.0
     start: State | None = None
     change: float = 0.0
@@ -144,7 +145,7 @@ def take_turns(
     session, photographs, boards, _ = seen
     total, machine = sum(len(p.images) for p in photographs), session.machine
     estimate = _first_estimate(seen, total, told, lap)
-    blur: dict[int, float | None] = {}
+    blur: BlurByStation = {}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses: tuple[ResponseTold, ...] = ()
@@ -172,14 +173,14 @@ def take_turns(
             told("Asking how the photographs code light", share + 0.1)
 
             def measured(
-                some: list[legs.Photographs],
-                blur: legs.BlurByStation,
+                some: list[Photographs],
+                blur: BlurByStation,
                 before: Estimate = before,
                 refine: bool = cameras.active,
             ) -> EdgeSet:
                 lap("identify")
                 look = partial(_measure, estimate=before, blur=blur, refine=refine)
-                edges = concatenate([one.edges for one in _each(some, look)])
+                edges = concatenate([one.edges for one in _looked_at(some, look)])
                 lap("observe")
                 return edges
 
@@ -209,7 +210,8 @@ def take_turns(
                 finer = _binned(session, photographs, blur, more=False)
                 if not finer or turn + 1 == MOST_LOOKS_ASTRAY:
                     break
-                photographs, blur = finer, dict.fromkeys(blur)
+                photographs = finer
+                blur = {}
     observation = observation_of(session, looks, boards, measurements, estimate, photographs)
     return Turns(
         observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start,
@@ -299,28 +301,32 @@ def _variance(changes: Array, measurements: Measurements, estimate: Estimate) ->
 
 def _looked(
     session: Session,
-    photographs: Sequence[legs.Photographs],
+    photographs: Sequence[Photographs],
     estimate: Estimate,
-    blur: legs.BlurByStation,
+    blur: BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.PhotographsLookedAt | None = None,
 ) -> list[legs.StationEdges]:
     """The edges of all photographs, where an estimate has them."""
-    look = partial(_measure, estimate=estimate, blur=blur, refine=refine, done=done)
     whole = partial(_with_silhouettes, session, estimate, scatter, refine)
-    return _each(photographs, lambda p: whole(p, look(p)))
+
+    def look(some: Sequence[Photographs]) -> list[legs.StationEdges]:
+        looks = _measure(some, estimate, blur, refine, done)
+        return [whole(p, one) for p, one in zip(some, looks, strict=True)]
+
+    return _looked_at(photographs, look)
 
 
 def _looked_through(
     session: Session,
-    photographs: Sequence[legs.Photographs],
+    photographs: Sequence[Photographs],
     estimate: Estimate,
-    blur: legs.BlurByStation,
+    blur: BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.PhotographsLookedAt,
-) -> tuple[list[legs.StationEdges], Sequence[legs.Photographs], dict[int, float | None]]:
+) -> tuple[list[legs.StationEdges], Sequence[Photographs], BlurByStation]:
     """A look, the photographs as they were looked at, and their blur: binned more where edges are
     too blurred to be measured, which must not lead an estimate astray.
     """
@@ -337,19 +343,17 @@ def _looked_through(
 
 
 def _blur_of(
-    looks: Sequence[legs.StationEdges], photographs: Sequence[legs.Photographs]
-) -> dict[int, float | None]:
+    looks: Sequence[legs.StationEdges], photographs: Sequence[Photographs]
+) -> dict[int, float]:
     """Px, by station."""
     return {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
 
 
-def _width_of_edges(
-    photographs: Sequence[legs.Photographs], estimate: Estimate
-) -> dict[int, float | None]:
+def _width_of_edges(photographs: Sequence[Photographs], estimate: Estimate) -> dict[int, float]:
     """Px, by station, by how far the steps of some photographs reach: profiles tell no blur that is
     wider than they are. Nothing of stations whose edges do not tell it.
     """
-    out: dict[int, float | None] = {}
+    out: dict[int, float] = {}
     for p in photographs:
         few = p.select(p.spread(PHOTOGRAPHS_FOR_WIDTH))
         T = estimate.state.T_camera_base[p.station]
@@ -362,11 +366,11 @@ def _width_of_edges(
 
 def _binned(
     session: Session,
-    photographs: Sequence[legs.Photographs],
-    blur: legs.BlurByStation,
+    photographs: Sequence[Photographs],
+    blur: BlurByStation,
     *,
     more: bool,
-) -> list[legs.Photographs]:
+) -> list[Photographs]:
     """The photographs as they should be looked at, where their edges, so blurred (px) by station,
     ask for ``more`` pixels as one, or for fewer; nothing where none does. All of one camera alike,
     for its lens is the same.
@@ -374,8 +378,8 @@ def _binned(
     of_camera: dict[str, list[float]] = {}
     files = [session.stations[p.station].camera_file for p in photographs]
     for file, p in zip(files, photographs, strict=True):
-        of_camera.setdefault(file, []).append(blur[p.station] or USUAL_BLUR)
-    out: list[legs.Photographs] = []
+        of_camera.setdefault(file, []).append(blur[p.station])
+    out: list[Photographs] = []
     for file, p in zip(files, photographs, strict=True):
         binning = legs.sharp_binning(p.binning, float(np.median(of_camera[file])))
         most = MOST_BINNING * legs.first_binning(p.camera.image_size)
@@ -490,7 +494,7 @@ def _first_estimate(
     ):
         done = _counted(told, text, total, share)
         search = partial(_whole_legs, known=known, reach=reach, done=done)
-        looks = _each(photographs, search)
+        looks = _looked_at(photographs, search)
         measurements = measurements_of(session, boards, _edges(looks))
         lap("observe")
         start = start or start_state(known.machine, measurements, known.T_camera_base)
@@ -515,30 +519,30 @@ def _share_agreeing(looks: list[legs.StationEdges], edges: EdgeSet, estimate: Es
 
 
 def _whole_legs(
-    photographs: legs.Photographs, known: KnownScene, reach: float, done: legs.PhotographsLookedAt
-) -> legs.StationEdges:
-    machine, T_camera_base, poses = known[:3]
-    at = T_camera_base[photographs.station], poses[photographs.configuration]
-    return legs.search(photographs, machine, *at, reach, done)
+    photographs: Sequence[Photographs],
+    known: KnownScene,
+    reach: float,
+    done: legs.PhotographsLookedAt,
+) -> list[legs.StationEdges]:
+    placed = _placed(photographs, known.T_camera_base, known.T_base_platform)
+    return legs.search_stations(placed, known.machine, reach, done)
 
 
 def _measure(
-    photographs: legs.Photographs,
+    photographs: Sequence[Photographs],
     estimate: Estimate,
-    blur: legs.BlurByStation,
+    blur: BlurByStation,
     refine: bool,
     done: legs.PhotographsLookedAt | None = None,
-) -> legs.StationEdges:
+) -> list[legs.StationEdges]:
     state = estimate.state
-    return legs.measure(
-        photographs,
-        estimate.machine,
-        state.T_camera_base[photographs.station],
-        state.T_base_platform[photographs.configuration],
-        blur.get(photographs.station),
-        refine_camera=refine,
-        done=done,
-    )
+    placed = _placed(photographs, state.T_camera_base, state.T_base_platform)
+    return legs.measure_stations(placed, estimate.machine, blur, refine, done)
+
+
+def _placed(photographs: Sequence[Photographs], T_camera_base: Array, poses: Array) -> list[Placed]:
+    """Of all stations, (S, 4, 4), and configurations, (N, 4, 4)."""
+    return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
 
 
 def _with_silhouettes(
@@ -546,7 +550,7 @@ def _with_silhouettes(
     estimate: Estimate,
     scatter: float,
     refine: bool,
-    photographs: legs.Photographs,
+    photographs: Photographs,
     look: legs.StationEdges,
 ) -> legs.StationEdges:
     """A look at a photograph by hand, and where an edge could not be measured in it, where its
@@ -585,15 +589,16 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
     return float(np.sqrt(squares.mean())) if squares.size > LEAST_NOISE_FREEDOM else 1.0
 
 
-def _each(
-    photographs: Sequence[legs.Photographs],
-    look: Callable[[legs.Photographs], legs.StationEdges],
+def _looked_at(
+    photographs: Sequence[Photographs],
+    look: Callable[[Sequence[Photographs]], list[legs.StationEdges]],
 ) -> list[legs.StationEdges]:
+    """A look at all stations, repeats as one: together, or of large photographs, two at a time."""
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in photographs)
     if pixels < PIXELS_FOR_THREADS:
-        return [combined(look(p)) for p in photographs]
+        return [combined(one) for one in look(photographs)]
     with ThreadPoolExecutor(THREADS) as pool:
-        return [combined(seen) for seen in pool.map(look, photographs)]
+        return [combined(one) for (one,) in pool.map(look, ([p] for p in photographs))]
 
 
 def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
@@ -613,7 +618,7 @@ def observation_of(
     boards: Boards,
     measurements: Measurements,
     estimate: Estimate,
-    photographs: Sequence[legs.Photographs] = (),
+    photographs: Sequence[Photographs] = (),
 ) -> Observation:
     """The last looks joined, with what the estimate gave up among the rejected. photographs : as
     they were looked at.

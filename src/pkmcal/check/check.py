@@ -49,6 +49,7 @@ from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
 from pkmcal.observe.alone import Alone
 from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
 from pkmcal.outcome import Finding, Level, doubtful, note, wrong
@@ -127,9 +128,9 @@ def _workspace(session: Session) -> list[Finding]:
     return []
 
 
-def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Finding]]:
+def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
     """Each station's photographs of legs; those that cannot be decoded are findings."""
-    out: list[legs.Photographs | None] = []
+    out: list[Photographs | None] = []
     findings: list[Finding] = []
     room = KEPT_PHOTOGRAPH_BYTES
     for number, station in enumerate(session.stations):
@@ -162,7 +163,7 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], kept)  # fmt: skip
-        whole = legs.Photographs(
+        whole = Photographs(
             number, station.camera, at, session.joints[at], images, station.response,
             legs.first_binning(station.camera.image_size),
         )  # fmt: skip
@@ -234,7 +235,7 @@ class _Observed(NamedTuple):
 
 def _observed(
     session: Session,
-    photographs: list[legs.Photographs | None],
+    photographs: list[Photographs | None],
     poses: Array | None,
     rng: np.random.Generator,
     progress: CalibrationProgress,
@@ -302,7 +303,7 @@ def _observed(
 
 
 def _station(
-    session: Session, photographs: legs.Photographs, pose: FoundStation, poses: Array
+    session: Session, photographs: Photographs, pose: FoundStation, poses: Array
 ) -> tuple[StationCheck, StationLook]:
     """One station in which the machine was looked for."""
     station, machine = session.stations[photographs.station], session.machine

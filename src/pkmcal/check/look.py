@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.observe.legs import Photographs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.quality import Quality
 from pkmcal.planning.first import spread_over
 from pkmcal.session.load import Session

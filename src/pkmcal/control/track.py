@@ -23,11 +23,11 @@ from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.legs import (
     OUT_OF_SIGHT_REASON,
-    Photographs,
     StationEdges,
     measure,
     search,
 )
+from pkmcal.observe.photographs import Photographs
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -320,8 +320,8 @@ def warm_up(blur: float) -> None:
     cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
     grey = np.zeros((len(width), samples))
     none = np.zeros(len(width), dtype=int)
-    some = profiles.Profiles(grey, np.ones(len(width)), width, cut, none, none > 0)
-    profiles.locate(some, profiles.residual_curves(some, blur), np.zeros(len(width)))
+    some = profiles.Profiles(grey, np.ones(len(width)), width, cut, none, none, none > 0)
+    profiles.locate(some, profiles.residual_curves(some, {0: blur}), np.zeros(len(width)))
 
 
 def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> TrackedLegs:

@@ -31,7 +31,7 @@ from pkmcal.observe.evidence import (
     evidence_of,
     settle_by_evidence,
 )
-from pkmcal.observe.legs import Photographs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.places import CAMERA_DIRECTIONS, SIGHT_LINE_TURNS, frame_of, sphere
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tables import WORKING_WIDTH, distance_tables

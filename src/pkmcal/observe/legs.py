@@ -1,4 +1,4 @@
-"""Each leg found in each photograph, then its edges to sub-pixel: what one look at a station gives.
+"""Each leg found in each photograph, then its edges to sub-pixel: what one look at stations gives.
 
 The drawing's errors leave predictions a few pixels off, more than the distance to highlights,
 shadows and neighbours. But all edges of one leg, two to a tube, move together: so
@@ -8,13 +8,13 @@ edges are strongest. A highlight imitates one edge; four at the right distances 
 Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
 across it (:mod:`pkmcal.observe.profiles`).
 
-Both take the photographs through in windows: what is worked out of one, some megabytes, is
-forgotten with it, and a few hundred numbers of its edges remain.
+Both take the photographs through in windows (:mod:`pkmcal.observe.photographs`): what is worked out
+of one is forgotten with it, and a few hundred numbers of its edges remain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
@@ -22,16 +22,15 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pkmcal.arrays import Array, Booleans, Integers, evenly
-from pkmcal.cameras import Camera
-from pkmcal.cameras.response import Response, light_of_levels
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras.response import light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
-from pkmcal.observe.images import Selected, binned, fitting
 from pkmcal.observe.levels import levels_at
+from pkmcal.observe.photographs import Photographs, Placed, Window, windows
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -40,17 +39,21 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.observe.profiles import FEWEST_PLACES_FOR_TILT, EdgeFits, edge_set, fit_edges
+from pkmcal.observe.profiles import (
+    FEWEST_PLACES_FOR_TILT,
+    BlurByStation,
+    EdgeFits,
+    Profiles,
+    edge_set,
+    estimate_blur,
+    fit_edges,
+)
 
 USUAL_PICTURE_LENGTH = 1024
 """Pixels along the longer side of pictures in which a drawing is off by pixels, tubes are some tens
 of them wide, and all lengths below are meant: photographs are binned to about as many."""
 BLUR_ROUNDING = 1e-6
 """Pixels by which the last of the blurs that are tried may be missed."""
-PHOTOGRAPHS_A_WINDOW = 32
-"""Photographs that are looked at together: their profiles take some 20 MB."""
-WINDOW_BYTES = 96 * 2**20
-"""Bytes that these take as grey levels at most; one may take more."""
 LEG_SEARCH_REACH = 10.0
 """Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
 times over, and what the station's pose leaves."""
@@ -97,8 +100,6 @@ _TOO_LITTLE = "too little of it is seen as a clear edge"
 _NOT_ONE_EDGE = "its places do not lie on one edge"
 
 
-BlurByStation = Mapping[int, float | None]
-"""Px, None where it is still to be estimated."""
 PhotographsLookedAt = Callable[[int], None]
 """Called with how many photographs more were looked at."""
 
@@ -248,63 +249,6 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
 
 
 @dataclass(frozen=True)
-class Photographs:
-    """One station's photographs.
-
-    station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width), decoded or when they are looked at. response : how
-    their levels code light. binning : count of their pixels across, and down, that are one where
-    edges are looked for (:meth:`binned`).
-    """
-
-    station: int
-    camera: Camera
-    configuration: Integers
-    joints: Array
-    images: Sequence[Integers]
-    response: Response = "linear"
-    binning: int = 1
-
-    def select(self, numbers: Integers) -> Photographs:
-        """Some of the photographs."""
-        return replace(
-            self,
-            configuration=self.configuration[numbers],
-            joints=self.joints[numbers],
-            images=Selected(self.images, numbers),
-        )
-
-    def spread(self, most: int) -> Integers:
-        """Numbers of up to ``most`` photographs, evenly over all."""
-        return evenly(len(self.images), most)
-
-    @property
-    def window(self) -> int:
-        """How many photographs are looked at together."""
-        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), PHOTOGRAPHS_A_WINDOW)
-
-    def decoded(self) -> Photographs:
-        """The same with every photograph decoded; for no more than a window of them."""
-        return replace(self, images=list(self.images))
-
-    def binned(self) -> Photographs:
-        """The same as edges are looked for in them, decoded; for no more than a window of them.
-
-        Levels are averaged, not the light that they code: over the pixels of one bin, in which a
-        blurred edge rises by a third, the code bends by half a level.
-        """
-        images = [binned(image, self.binning) for image in self.images]
-        return replace(self, camera=self.camera.binned(self.binning), images=images, binning=1)
-
-    def windows(self) -> Iterator[tuple[slice, Photographs]]:
-        """All photographs, binned, a window at a time, each with its place among them."""
-        for first in range(0, len(self.images), self.window):
-            part = slice(first, first + self.window)
-            numbers = np.arange(len(self.images))[part]
-            yield part, self.select(numbers).binned()
-
-
-@dataclass(frozen=True)
 class StationEdges:
     """What one look at one station gave.
 
@@ -319,6 +263,18 @@ class StationEdges:
     point_edge: Integers
     blur: float
     moved: float
+
+    def of_station(self, station: int) -> StationEdges:
+        """What of a look at several is a station's; blur and moved as they are."""
+        mine = self.edges.station == station
+        at, number = mine[self.point_edge], np.cumsum(mine) - 1
+        return replace(
+            self,
+            edges=self.edges.select(mine),
+            rejected=tuple(r for r in self.rejected if r.station == station),
+            points=self.points[at],
+            point_edge=number[self.point_edge[at]],
+        )
 
     def unbinned(self, count: int) -> StationEdges:
         """What was seen in binned photographs, in the whole ones: points in their pixels, and edges
@@ -338,34 +294,39 @@ def search(
     T_camera_base: Array,
     poses: Array,
     reach: float = LEG_SEARCH_REACH,
-    done: PhotographsLookedAt | None = None,
 ) -> StationEdges:
-    """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel.
+    """:func:`search_stations` of one station's photographs; poses : T_base_platform (K, 4, 4)."""
+    return search_stations([Placed(photographs, T_camera_base, poses)], machine, reach)[0]
 
-    poses : T_base_platform (K, 4, 4) of the photographs.
-    """
+
+def search_stations(
+    placed: Sequence[Placed],
+    machine: Machine,
+    reach: float = LEG_SEARCH_REACH,
+    done: PhotographsLookedAt | None = None,
+) -> list[StationEdges]:
+    """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel."""
     looks: list[StationEdges] = []
-    for part, window in photographs.windows():
-        looks.append(_searched(window, machine, T_camera_base, poses[part], reach))
+    for window in windows(placed):
+        looks.append(_searched(window, machine, reach))
         if done is not None:
             done(len(window.images))
         del window  # before the next one is decoded
-    return joined_looks(looks, float("nan"), reach)
+    every = joined_looks(looks, float("nan"), reach)
+    return [every.of_station(one.photographs.station) for one in placed]
 
 
-def _searched(
-    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, reach: float
-) -> StationEdges:
-    """One window's part of :func:`search`."""
-    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
-    places = search_legs(photographs.images, tubes, points, clear, reach)
+def _searched(window: Window, machine: Machine, reach: float) -> StationEdges:
+    """One window's part of :func:`search_stations`."""
+    tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
+    places = search_legs(window.images, tubes, points, clear, reach)
     found = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
     fits = fit_edges(points, position, np.full(position.shape, SEARCH_SIGMA), found)
     keep = fits.good & places.clear[:, tubes.leg]
-    edges = edge_set(points, fits, tubes, photographs.station, photographs.configuration, keep)
+    edges = edge_set(points, fits, tubes, window.station, window.configuration, keep)
     rejected = [
-        Rejection(photographs.station, int(photographs.configuration[k]), int(leg), -1, -1, why)
+        Rejection(int(window.station[k]), int(window.configuration[k]), int(leg), -1, -1, why)
         for k, leg in zip(*np.nonzero(~places.clear), strict=True)
         for why in [OUT_OF_SIGHT_REASON if places.share[k, leg] < 0.1 else _NO_PLACE]
         if leg in tubes.leg
@@ -381,33 +342,64 @@ def measure(
     poses: Array,
     blur: float | None = None,
     refine_camera: bool = False,
-    done: PhotographsLookedAt | None = None,
 ) -> StationEdges:
+    """:func:`measure_stations` of one station's photographs; poses : T_base_platform (K, 4, 4)."""
+    told = {} if blur is None else {photographs.station: blur}
+    placed = Placed(photographs, T_camera_base, poses)
+    return measure_stations([placed], machine, told, refine_camera)[0]
+
+
+def measure_stations(
+    placed: Sequence[Placed],
+    machine: Machine,
+    blur: BlurByStation,
+    refine_camera: bool = False,
+    done: PhotographsLookedAt | None = None,
+) -> list[StationEdges]:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
-    blur : px, from an earlier look; when absent, estimated from the profiles of as many photographs
-    as are looked at together, spread over all. refine_camera : also how the edges depend on the
-    camera's parameters.
+    blur : from an earlier look; where a station has none, estimated from the profiles of as many of
+    its photographs as are looked at together, spread over all. refine_camera : also how the edges
+    depend on the camera's parameters.
     """
+    known = dict(blur)
+    for one in placed:
+        p = one.photographs
+        if p.station not in known and len(p.images) > p.window:
+            few = next(windows([one.select(p.spread(p.window))]))
+            known |= _blur_in(_seen(few, machine).across, [p.station])
+            del few
     looks: list[StationEdges] = []
-    moved: list[Array] = []
-    ready: _Seen | None = None
-    if blur is None:
-        few = photographs.spread(photographs.window)
-        seen = _seen(photographs.select(few).binned(), machine, T_camera_base, poses[few])
-        blur = profiles.estimate_blur(seen.across) if seen.full.any() else profiles.USUAL_BLUR
-        ready = seen if len(few) == len(photographs.images) else None
-        del seen
-    for part, window in photographs.windows():
-        seen = ready or _seen(window, machine, T_camera_base, poses[part])
-        look, away = _measured(window, seen, blur, refine_camera)
-        looks.append(look.unbinned(photographs.binning))
-        moved.append(away)
+    moved: dict[int, list[Array]] = {one.photographs.station: [] for one in placed}
+    for window in windows(placed):
+        seen, shown = _seen(window, machine), np.unique(window.station).tolist()
+        known |= _blur_in(seen.across, [station for station in shown if station not in known])
+        look, away = _measured(window, seen, known, refine_camera)
+        looks.append(look.unbinned(window.binning))
+        at = look.edges.station[look.point_edge]
+        for station in shown:
+            moved[station].append(away[at == station])
         if done is not None:
             done(len(window.images))
         del seen, window  # before the next one is decoded
-    away = np.concatenate(moved)
-    return joined_looks(looks, blur, float(np.median(away)) if len(away) else 0.0)
+    every = joined_looks(looks, float("nan"), float("nan"))
+    out: list[StationEdges] = []
+    for station, parts in moved.items():
+        away = np.concatenate([np.zeros(0), *parts])
+        middle = float(np.median(away)) if len(away) else 0.0
+        told = known.get(station, profiles.USUAL_BLUR)
+        out.append(replace(every.of_station(station), blur=told, moved=middle))
+    return out
+
+
+def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
+    """Px by station, as profiles tell it; where there are none, the usual one."""
+    out: dict[int, float] = {}
+    for station in stations:
+        own = np.flatnonzero(across.station == station)
+        some = own.size > 0
+        out[station] = estimate_blur(across.select(own)) if some else profiles.USUAL_BLUR
+    return out
 
 
 def joined_looks(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
@@ -433,24 +425,24 @@ class _Seen:
     tubes: TubeList
     places: EdgePoints
     full: Booleans
-    across: profiles.Profiles
+    across: Profiles
 
 
-def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
-    tubes, points, clear = predicted(
-        photographs, machine, T_camera_base, poses, EDGE_SEGMENTS * POINTS_A_SEGMENT
-    )
+def _seen(window: Window, machine: Machine) -> _Seen:
+    tubes, points, clear = predicted(window, machine, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    return _Seen(tubes, places, *_segment_profiles(photographs, points, clear, half_width))
+    return _Seen(tubes, places, *_segment_profiles(window, points, clear, half_width))
 
 
 def _measured(
-    photographs: Photographs, seen: _Seen, blur: float, refine_camera: bool
+    window: Window, seen: _Seen, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
-    """One window's part of :func:`measure`, and how far (px) each place was from its prediction."""
+    """One window's part of :func:`measure_stations`, and how far (px) each place was from its
+    prediction.
+    """
     tubes, places, full = seen.tubes, seen.places, seen.full
     across, highlight = profiles.without_highlights(seen.across, blur)
     curves = profiles.residual_curves(across, blur)
@@ -459,34 +451,33 @@ def _measured(
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], found[full] = at.position, at.sigma, at.found & ~highlight
     fits = fit_edges(places, position, sigma, found)
-    by_camera = photographs.camera.project_jacobians(places.point)[1] if refine_camera else None
-    edges = edge_set(
-        places, fits, tubes, photographs.station, photographs.configuration, fits.good, by_camera
-    )
+    by_camera = window.camera.project_jacobians(places.point)[1] if refine_camera else None
+    names = window.station, window.configuration
+    edges = edge_set(places, fits, tubes, *names, fits.good, by_camera)
     lamps = full.copy()
     lamps[full] = at.found & highlight
-    rejected = _rejections(photographs, tubes, full, found, lamps, fits)
+    rejected = _rejections(*names, tubes, full, found, lamps, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
     number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
-    look = StationEdges(edges, rejected, xy, number[k, e], blur, float("nan"))
+    look = StationEdges(edges, rejected, xy, number[k, e], float("nan"), float("nan"))
     return look, np.abs(position[k, e, s])
 
 
 def predicted(
-    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, samples: int
+    window: Window, machine: Machine, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
     """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
     tubes = tubes_of(machine)
-    legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
-    points = edge_points(machine, photographs.camera, legs, tubes, samples)
-    clear = unobstructed(machine, photographs.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
+    legs = legs_in_camera(machine, window.T_camera_base, window.poses, window.joints)
+    points = edge_points(machine, window.camera, legs, tubes, samples)
+    clear = unobstructed(machine, window.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
     return tubes, points, clear
 
 
 def _segment_profiles(
-    photographs: Photographs, points: EdgePoints, clear: Booleans, half_width: Array
-) -> tuple[Booleans, profiles.Profiles]:
+    window: Window, points: EdgePoints, clear: Booleans, half_width: Array
+) -> tuple[Booleans, Profiles]:
     """Mean profiles over each segment's clear samples.
 
     Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
@@ -499,16 +490,16 @@ def _segment_profiles(
     each = np.clip(np.ceil(pitch), FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT).astype(int)
     count = each * seen[full].sum(axis=-1)
     which, at = _between(seen[full], each)
-    pixel = photographs.camera.project(_on_edges(points, full, which, at))
+    pixel = window.camera.project(_on_edges(points, full, which, at))
     outward = _by_segment(points.outward.astype(np.float32))[full].reshape(-1, 2)[which]
     offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
     total = np.empty((len(count), len(offsets)), np.float32)
     clipped = np.zeros((len(count), explained), dtype=bool)
-    response = photographs.response
+    response = window.response
     clipped_from = light_of_levels(response)[profiles.SATURATED_GREY_LEVEL]
     first = np.concatenate([[0], np.cumsum(count)])  # profile of each segment
     parts = pairwise(np.cumsum([0, *full.sum(axis=(1, 2))]))
-    for image, (start, end) in zip(photographs.images, parts, strict=True):
+    for image, (start, end) in zip(window.images, parts, strict=True):
         taken, begin = slice(first[start], first[end]), first[start:end] - first[start]
         across = _outward_of(pixel[taken], outward[taken], offsets)
         grey = levels_at(image, *across, cubic=True, response=response)
@@ -517,7 +508,8 @@ def _segment_profiles(
             bright = grey[:, -explained:] >= clipped_from
             np.logical_or.reduceat(bright, begin, axis=0, out=clipped[start:end])
     mean = total / count[:, None].astype(np.float32)
-    return full, profiles.Profiles.of(mean, clipped, count, half_width[full])
+    station = window.station[np.nonzero(full)[0]]
+    return full, Profiles.of(mean, clipped, count, half_width[full], station)
 
 
 def _by_segment(values: Array | Booleans) -> Any:
@@ -572,14 +564,15 @@ def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList)
 
 
 def _rejections(
-    photographs: Photographs,
+    station: Integers,
+    configuration: Integers,
     tubes: TubeList,
     full: Booleans,
     found: Booleans,
     lamps: Booleans,
     fits: EdgeFits,
 ) -> tuple[Rejection, ...]:
-    """Edges without a measurement, each with its reason."""
+    """Edges without a measurement, each with its reason. station, configuration : (K,)."""
     k, e = np.nonzero(~fits.good)
     visible, seen, mirrored = (where[k, e].sum(axis=-1) for where in (full, found, lamps))
     few = seen < FEWEST_PLACES_FOR_TILT
@@ -587,8 +580,5 @@ def _rejections(
     why = np.select(
         [visible == 0, lamp, few], [OUT_OF_SIGHT_REASON, _LAMP, _TOO_LITTLE], _NOT_ONE_EDGE
     )
-    names = photographs.configuration[k], tubes.leg[e], tubes.tube[e], tubes.side[e], why
-    return tuple(
-        Rejection(photographs.station, *name)
-        for name in zip(*(v.tolist() for v in names), strict=True)
-    )
+    names = station[k], configuration[k], tubes.leg[e], tubes.tube[e], tubes.side[e], why
+    return tuple(Rejection(*name) for name in zip(*(v.tolist() for v in names), strict=True))

@@ -12,6 +12,7 @@ residual over a grid of positions is a matrix product, and its minimum is the ed
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -92,6 +93,10 @@ FEWEST_PLACES_FOR_TILT = 3
 """Places along an edge without which its tilt is a guess."""
 
 
+BlurByStation = Mapping[int, float]
+"""Px, standard deviation, of the edges in a station's photographs."""
+
+
 @dataclass(frozen=True)
 class ProfileEdges:
     """Edge positions in profiles: position (...) px outward from the predicted edge, its
@@ -150,17 +155,17 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
 
 
 class _Kinds(NamedTuple):
-    """Profiles by kind: a few dozen combinations of half width and cut.
+    """Profiles by kind: a few dozen combinations of station, half width and cut.
 
     scaled : (N, samples) in contrasts, less the outermost, in the order of the kinds. square : (N,)
     sums of their squares. order : (N,) the profile that each is. parts : the first and the end of
-    each kind, and its half width (px) and cut.
+    each kind, and its station, half width (px) and cut.
     """
 
     scaled: Array
     square: Array
     order: Integers
-    parts: list[tuple[tuple[int, int], float, int]]
+    parts: list[tuple[tuple[int, int], int, float, int]]
 
 
 @dataclass(frozen=True)
@@ -170,23 +175,27 @@ class Profiles:
     grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
     averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
     are not used: clipped at the camera's brightest level, or too deep inside a slim leg.
-    strip, bright : (N,), see :func:`strips`.
+    station : (N,) whose blur each has. strip, bright : (N,), see :func:`strips`.
     """
 
     grey: Array
     count: Array
     half_width: Array
     cut: Integers
+    station: Integers
     strip: Integers
     bright: Booleans
 
     @classmethod
-    def of(cls, grey: Array, clipped: Booleans, count: Array, half_width: Array) -> Profiles:
+    def of(
+        cls, grey: Array, clipped: Booleans, count: Array, half_width: Array, station: Integers
+    ) -> Profiles:
         """From grey (N, samples) at :func:`sampled_offsets`, and whether it is clipped at
         :func:`profile_offsets`.
         """
         explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width)
-        return cls(explained, count, half_width, cut, *strips(grey, count, half_width))
+        strip = strips(grey, count, half_width)
+        return cls(explained, count, half_width, cut, station, *strip)
 
     def select(self, keep: Booleans | Integers) -> Profiles:
         """The profiles at a mask or at positions."""
@@ -206,13 +215,16 @@ class Profiles:
         samples = scaled.shape[1]
         scaled[np.arange(samples) < self.cut[:, None]] = 0.0
         width = np.searchsorted(_BETWEEN_HALF_WIDTHS, self.half_width)
-        kind = width * samples + np.minimum(self.cut, samples - 1)
+        kind = np.minimum(self.cut, samples - 1) + samples * (
+            width + len(HALF_WIDTHS) * self.station
+        )
         order = np.argsort(kind, kind="stable")
         kind = kind[order]
         first = np.flatnonzero(np.diff(kind, prepend=-1))
         widths, cuts = divmod(kind[first], samples)
-        ends = [*first.tolist(), len(kind)]
-        parts = zip(pairwise(ends), HALF_WIDTHS[widths].tolist(), cuts.tolist(), strict=True)
+        stations, widths = divmod(widths, len(HALF_WIDTHS))
+        columns = (v.tolist() for v in (stations, HALF_WIDTHS[widths], cuts))
+        parts = zip(pairwise([*first.tolist(), len(kind)]), *columns, strict=True)
         scaled = scaled[order]
         return _Kinds(scaled, np.einsum("ni,ni->n", scaled, scaled), order, list(parts))
 
@@ -259,7 +271,7 @@ def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Bool
     return np.where(there, cut, 0), there & (departure[which, largest] > 0)
 
 
-def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Booleans]:
+def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profiles, Booleans]:
     """Profiles without what lies deeper than a strip's middle, and those (N,) that show a
     highlight for the limb.
 
@@ -278,12 +290,12 @@ def without_highlights(profiles: Profiles, blur: float) -> tuple[Profiles, Boole
     return replace(profiles, cut=np.maximum(profiles.cut, profiles.strip)), odd
 
 
-def residual_curves(profiles: Profiles, blur: float) -> Array:
+def residual_curves(profiles: Profiles, blur: BlurByStation) -> Array:
     """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
     kinds, shifts = profiles.by_kind, len(EDGE_SHIFTS)
     explained = np.empty((len(kinds.scaled), shifts))
-    for (first, end), half_width, cut in kinds.parts:
-        bases = _projections(round(float(blur), 3), half_width, cut)
+    for (first, end), station, half_width, cut in kinds.parts:
+        bases = _projections(round(float(blur[station]), 3), half_width, cut)
         along = (kinds.scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
         np.einsum("nbs,nbs->ns", along, along, out=explained[first:end])
     out = np.empty_like(explained)
@@ -355,7 +367,7 @@ def _shows_its_edge(profiles: Profiles) -> Booleans:
 
 
 def estimate_blur(profiles: Profiles) -> float:
-    """The blur (px) with which the model leaves least, over the profiles of one camera.
+    """The blur (px) with which the model leaves least, over the profiles of one station.
 
     Contrast differs by edge, so each profile's residual is taken relative to its best; the
     median over profiles decides, so that half of them may be anything. Those of which least is
@@ -371,7 +383,8 @@ def estimate_blur(profiles: Profiles) -> float:
     while True:
         for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS_TRIED))):
             if np.isinf(costs[0, near]):
-                costs[:, near] = residual_curves(profiles, BLURS_TRIED[near]).min(axis=-1)
+                tried = dict.fromkeys(profiles.station.tolist(), BLURS_TRIED[near])
+                costs[:, near] = residual_curves(profiles, tried).min(axis=-1)
         total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
         best = int(np.argmin(total))
         if best == k:
@@ -469,12 +482,13 @@ def edge_set(
     points: EdgePoints,
     fits: EdgeFits,
     tubes: TubeList,
-    station: int,
+    station: Integers,
     configuration: Integers,
     keep: Booleans,
     by_parameters: Array | None = None,
 ) -> EdgeSet:
-    """The fits at ``keep`` (K, E) as measurements; configuration : (K,) of the photographs.
+    """The fits at ``keep`` (K, E) as measurements; station, configuration : (K,) of the
+    photographs.
 
     by_parameters : (K, E, n, 2, p) motion of the predicted pixels by the camera's parameters,
     where the intrinsics are to be refined: the measured places then move the other way.
@@ -486,7 +500,7 @@ def edge_set(
     middle = _middle_ray(points)[k, e]
     along = np.where(fits.used[k, e], points.along[k, e], np.nan)
     return EdgeSet(
-        station=np.full(len(k), station),
+        station=station[k],
         configuration=configuration[k],
         leg=tubes.leg[e],
         tube=tubes.tube[e],

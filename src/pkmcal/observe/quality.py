@@ -9,8 +9,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import SEARCH_SAMPLES, Photographs, predicted, search_legs
+from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
 from pkmcal.observe.levels import levels_at
+from pkmcal.observe.photographs import Photographs, Placed, Window, windows
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
 BLACK_GREY_LEVEL = 8
@@ -62,26 +63,22 @@ def quality(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
 ) -> Quality:
     """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
-    looks = [
-        _quality(window, machine, T_camera_base, poses[part])
-        for part, window in photographs.windows()
-    ]
+    placed = Placed(photographs, T_camera_base, poses)
+    looks = [_quality(window, machine) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
     return Quality(*(np.concatenate([getattr(look, name) for look in looks]) for name in each))
 
 
-def _quality(
-    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
-) -> Quality:
+def _quality(window: Window, machine: Machine) -> Quality:
     """The same of one window."""
-    tubes, points, clear = predicted(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
-    places = search_legs(photographs.images, tubes, points, clear)
+    tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
+    places = search_legs(window.images, tubes, points, clear)
     edge = places.outward(points, clear, tubes)[..., None]
     half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]
 
     def look(outward: Array) -> Array:
         pixel = points.pixel[..., None, :] + outward[..., None] * points.outward[..., None, :]
-        pairs = zip(photographs.images, pixel, strict=True)
+        pairs = zip(window.images, pixel, strict=True)
         return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs])
 
     inside = look(edge - DEPTHS_INSIDE_EDGE * half_width)

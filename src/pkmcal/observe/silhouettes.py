@@ -54,7 +54,8 @@ def silhouette_edges(
     sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(found, weight, 1.0))
     fits = fit_edges(points, position, sigma, found)
     by_camera = view.camera.project_jacobians(points.point)[1] if refine_camera else None
-    edges = edge_set(points, fits, tubes, station, view.configuration, fits.good, by_camera)
+    names = np.array([station]), view.configuration
+    edges = edge_set(points, fits, tubes, *names, fits.good, by_camera)
     edges = replace(edges, coarse=np.ones(len(edges), dtype=bool))
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = points.pixel[k, e, s] + position[k, e, s, None] * points.outward[k, e, s]

@@ -21,6 +21,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
@@ -117,7 +118,7 @@ def spread_over(
 
 def first_edges(
     session: Session,
-    photographs: Sequence[legs.Photographs],
+    photographs: Sequence[Photographs],
     rows: Sequence[Integers],
     T_camera_base: Array,
     poses: Array,
@@ -166,7 +167,7 @@ def first_edges(
 
 
 def _told(
-    few: Sequence[legs.Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
+    few: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
 ) -> FirstEdges:
     """What an edge that ought to be seen tells on average, lost ones with nothing."""
     machine, state = estimate.machine, estimate.state

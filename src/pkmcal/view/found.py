@@ -15,6 +15,7 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
 from pkmcal.pages.drawn import (
     EDGE_CURVE_POINTS,
@@ -65,7 +66,7 @@ def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
 def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
     """What is found of the legs, put into the answer."""
     row = viewed.photograph(look.station, look.photograph).configuration
-    taken = legs.Photographs(
+    taken = Photographs(
         look.station,
         pane.camera,
         np.array([row]),
