@@ -17,7 +17,7 @@ from pkmcal.observe.legs import (
     measure,
 )
 from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, Placed, Window
+from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import (
     EDGE_SIGMA_FLOOR,
@@ -91,7 +91,7 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     makes the rest no poorer.
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
-    seen = Window.of([Placed(taken(), FRONT, poses())])
+    seen = PhotographWindow.of([Placed(taken(), FRONT, poses())])
     tubes, points, clear = looks.predicted(seen, mechanism, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     clear[:, :, 7] = False
     width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 1::POINTS_A_SEGMENT]

@@ -30,7 +30,7 @@ from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
 from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, Placed, Window, windows
+from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed, windows
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -316,7 +316,7 @@ def search_stations(
     return [every.of_station(one.photographs.station) for one in placed]
 
 
-def _searched(window: Window, machine: Machine, reach: float) -> StationEdges:
+def _searched(window: PhotographWindow, machine: Machine, reach: float) -> StationEdges:
     """One window's part of :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear, reach)
@@ -428,7 +428,7 @@ class _Seen:
     across: Profiles
 
 
-def _seen(window: Window, machine: Machine) -> _Seen:
+def _seen(window: PhotographWindow, machine: Machine) -> _Seen:
     tubes, points, clear = predicted(window, machine, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
     per_point = (f.name for f in fields(points) if f.name != "normal")
@@ -438,7 +438,7 @@ def _seen(window: Window, machine: Machine) -> _Seen:
 
 
 def _measured(
-    window: Window, seen: _Seen, blur: BlurByStation, refine_camera: bool
+    window: PhotographWindow, seen: _Seen, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
     """One window's part of :func:`measure_stations`, and how far (px) each place was from its
     prediction.
@@ -465,7 +465,7 @@ def _measured(
 
 
 def predicted(
-    window: Window, machine: Machine, samples: int
+    window: PhotographWindow, machine: Machine, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
     """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
     tubes = tubes_of(machine)
@@ -476,7 +476,7 @@ def predicted(
 
 
 def _segment_profiles(
-    window: Window, points: EdgePoints, clear: Booleans, half_width: Array
+    window: PhotographWindow, points: EdgePoints, clear: Booleans, half_width: Array
 ) -> tuple[Booleans, Profiles]:
     """Mean profiles over each segment's clear samples.
 

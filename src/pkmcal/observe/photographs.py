@@ -99,7 +99,7 @@ class Placed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Window:
+class PhotographWindow:
     """Photographs that are looked at together, as edges are looked for in them, decoded.
 
     camera, response : of all. binning : how many pixels became one. station, configuration : (K,)
@@ -118,7 +118,7 @@ class Window:
     poses: Array
 
     @classmethod
-    def of(cls, placed: Sequence[Placed]) -> Window:
+    def of(cls, placed: Sequence[Placed]) -> PhotographWindow:
         """Of stations whose photographs are alike, no more than a window in all."""
         count = [len(one.poses) for one in placed]
         seen = [one.photographs.binned() for one in placed]
@@ -135,7 +135,7 @@ class Window:
         )
 
 
-def windows(placed: Sequence[Placed]) -> Iterator[Window]:
+def windows(placed: Sequence[Placed]) -> Iterator[PhotographWindow]:
     """All photographs, station after station, each with as many of those before it as are looked at
     together.
     """
@@ -146,8 +146,8 @@ def windows(placed: Sequence[Placed]) -> Iterator[Window]:
             part = one.select(np.arange(first, min(first + most, len(one.poses))))
             count = sum(len(other.poses) for other in (*together, part))
             if together and not (count <= most and together[0].photographs.alike(part.photographs)):
-                yield Window.of(together)
+                yield PhotographWindow.of(together)
                 together = []
             together.append(part)
     if together:
-        yield Window.of(together)
+        yield PhotographWindow.of(together)

@@ -11,7 +11,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
 from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, Placed, Window, windows
+from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed, windows
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
 BLACK_GREY_LEVEL = 8
@@ -69,7 +69,7 @@ def quality(
     return Quality(*(np.concatenate([getattr(look, name) for look in looks]) for name in each))
 
 
-def _quality(window: Window, machine: Machine) -> Quality:
+def _quality(window: PhotographWindow, machine: Machine) -> Quality:
     """The same of one window."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear)
