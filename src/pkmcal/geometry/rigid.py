@@ -59,7 +59,9 @@ def of_components(*parts: Array) -> Array:
 
     In memory the components are slowest, so that NumPy runs along many vectors at once.
     """
-    shape = np.broadcast_shapes(*(part.shape for part in parts))
+    shape = parts[0].shape
+    if any(part.shape != shape for part in parts):
+        shape = np.broadcast_shapes(*(part.shape for part in parts))
     out = np.empty((len(parts), *shape), dtype=np.result_type(*parts))
     for k, part in enumerate(parts):
         out[k] = part

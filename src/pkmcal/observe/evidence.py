@@ -42,8 +42,6 @@ LEAST_EVIDENCE_GAIN = 0.1
 SILHOUETTE_PLACES_AT_ONCE = 30_000
 """Places on silhouettes that are looked up together, so that what is worked out of them stays in
 the processor's cache."""
-NAMES_AT_ONCE = 16
-"""Names under which all photographs are looked at together: some 15 MB of 64 photographs."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
@@ -370,14 +368,17 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
     every = view.few(len(view.configuration))
     own = distances_under(view, T_camera_base[None], every, 8)
     mixture = own.mixture(first_mixture(1), rounds=10)
+    # where the legs are under a name, they are so in any photograph
+    legs = view.all_legs[names].moved(T_camera_base[None])
+    points = edge_points(view.machine, view.camera, legs, view.tubes, 8)
+    direction = view.tables.direction(points.outward)
     fits: list[Array] = []
-    for first in range(0, len(names), NAMES_AT_ONCE):
-        some = names[first : first + NAMES_AT_ONCE]
-        guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
-        places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
-        found = distances_under(replace(view, guessed=guessed), places, every, 8)
-        fits.append(by_photograph(found.evidence(mixture), len(every)))
-    return np.concatenate(fits).T
+    for part in _parts(view, len(every), len(names) * 8):
+        number = every[part, None, None, None]
+        found, inside = view.tables.look(direction, points.pixel, number, between=True)
+        named = _distances(view, points, direction, found, inside & points.valid)
+        fits.append(by_photograph(named.evidence(mixture), len(names)))
+    return np.concatenate(fits)
 
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
@@ -463,10 +464,11 @@ def _edges_under(
 def _distances(
     view: StationView, points: EdgePoints, direction: Integers, found: Array, inside: Booleans
 ) -> Distances:
-    """Distances that were ``found`` at predicted points (H, K, E, n), and where these are
+    """Distances that were ``found`` (H, K, E, n) at predicted points, and where these are
     ``inside``, of all photographs in a row.
     """
     shape = (len(found), -1, found.shape[-1])
+    inside = np.broadcast_to(inside, found.shape)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
     length = np.hypot(chord[..., 0], chord[..., 1])
     length /= np.float32(view.tables.scale * (shape[-1] - 1))
@@ -496,8 +498,8 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
     powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * look.slope
-    one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
-    here, there = np.moveaxis((weighted * look.distances.found) @ powers[:, :2], -1, 0)
+    one, both, two = ((weighted * look.slope) @ powers).transpose(2, 0, 1)[:, :, None]
+    here, there = ((weighted * look.distances.found) @ powers[:, :2]).transpose(2, 0, 1)
     begins, grows = look.begins, look.grows
     normal = (begins * one) @ begins.mT
     mixed = (grows * both) @ begins.mT

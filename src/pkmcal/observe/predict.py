@@ -82,15 +82,11 @@ class LegsInCamera:
     def moved(self, T_camera_base: Array) -> LegsInCamera:
         """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
         T = T_camera_base.astype(self.a.dtype)
-        count = len(T)
-
-        def turned(v: Array, shift: Array | float) -> Array:
-            flat = v.reshape(*v.shape[:-3], -1, 3)
-            out = T[:, :3, :3] @ flat.mT + shift  # (H, 3, K L): one component after the other
-            return np.moveaxis(out.reshape(count, 3, *v.shape[-3:-1]), 1, -1)
-
-        return LegsInCamera(turned(self.a, T[:, :3, 3:]), turned(self.b, T[:, :3, 3:]),
-                            turned(self.u, 0.0))  # fmt: skip
+        shape = self.a.shape[-3:-1]
+        own = np.stack([self.a, self.b, self.u]).reshape(3, -1, shape[0] * shape[1], 3)
+        seen = T[:, :3, :3] @ own.mT  # (3, H, 3, K L): one component after the other
+        seen[:2] += T[:, :3, 3:]  # directions do not shift
+        return LegsInCamera(*seen.reshape(3, len(T), 3, *shape).transpose(0, 1, 3, 4, 2))
 
 
 def legs_in_camera(
