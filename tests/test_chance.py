@@ -30,7 +30,7 @@ def turns_of(photographs, keep=1.0):
         edges, look.rejected + lost, look.points, look.point_edge, FRONT[None], None, np.ones(1)
     )
     estimate = SimpleNamespace(machine=machine(), state=state, edge_weights=np.ones(count))
-    return Turns(seen, None, estimate, None, photographs=[photographs], blur={0: None})
+    return Turns(seen, None, estimate, None, photographs=[photographs], blur={})
 
 
 def aside(photographs, px):

@@ -144,6 +144,19 @@ def view_of(pictures, mechanism=None, seen=None):
     return StationView(mechanism, camera_of(), names, readings, seen, tables)
 
 
+def test_photographs_are_asked_under_each_name_as_if_they_bore_it():
+    view, names = view_of(images()), np.array([4, 0, 3])
+    fits = evidence.evidence_by_name(view, FRONT, names)
+    every = np.arange(len(images()))
+    own = evidence.distances_under(view, FRONT[None], every, 8)
+    mixture = own.mixture(evidence.first_mixture(1), rounds=10)
+    for name, fit in zip(names, fits.T, strict=True):
+        named = replace(view, configuration=np.full(len(every), name))
+        found = evidence.distances_under(named, FRONT[None], every, 8).evidence(mixture)
+        np.testing.assert_allclose(fit, evidence.by_photograph(found, len(every))[0], rtol=1e-5)
+        assert fit.argmax() == name
+
+
 def misplaced(T_camera_base):
     """Pixels by which leg points of all configurations are off, the median."""
     ends = machine().base_centers(), machine().platform_centers()

@@ -9,6 +9,7 @@ from threading import get_ident
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from pkmcal.calibration import recognise, turns
 from pkmcal.calibration.recognise import mistake_in, platform_poses, read_photographs
@@ -115,35 +116,56 @@ def test_large_photographs_have_small_windows(monkeypatch):
 
 
 def stations():
-    """Photographs of one camera at three places, the second a little aside, and of another one."""
+    """Photographs of one camera at three places, many at the first, from a little aside and more
+    blurred at the second, and of another camera.
+    """
     longer = replace(taken().camera, parameters=taken().camera.parameters * 1.0001)
-    made = [replace(taken(), station=number) for number in (2, 5, 7)]
-    made.append(replace(taken(), station=8, camera=longer))
-    aside = perturb(FRONT, np.array([0.0, 0.0, 0.0, 0.0005, 0.0, 0.0]))
-    return [Placed(p, T, poses()) for p, T in zip(made, (FRONT, aside, FRONT, FRONT), strict=True)]
+    soft = taken([gaussian_filter(image, 0.6) for image in taken().images])
+    first, seen, _ = many()
+    made = [
+        (replace(first, station=2), FRONT, seen),
+        (replace(soft, station=5), perturb(FRONT, np.array([0, 0, 0, 5e-4, 0, 0])), poses()),
+        (replace(taken(), station=7), FRONT, poses()),
+        (replace(taken(), station=8, camera=longer), FRONT, poses()),
+    ]
+    return [Placed(*one) for one in made]
 
 
-def test_stations_of_one_camera_are_looked_at_together(monkeypatch):
-    def shown():
-        return [np.unique(window.station).tolist() for window in windows(stations())]
+@pytest.mark.parametrize(
+    ("most", "expected"),
+    [
+        (32, [{2: 18, 5: 6, 7: 6}, {8: 6}]),
+        (24, [{2: 18, 5: 6}, {7: 6}, {8: 6}]),
+        (8, [{2: 8}, {2: 8}, {2: 2, 5: 6}, {7: 6}, {8: 6}]),
+    ],
+)
+def test_stations_of_one_camera_share_windows(monkeypatch, most, expected):
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
+    counted = [np.unique(w.station, return_counts=True) for w in windows(stations())]
+    assert [dict(zip(*map(np.ndarray.tolist, c), strict=True)) for c in counted] == expected
 
-    assert shown() == [[2, 5, 7], [8]]
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 12)
-    assert shown() == [[2, 5], [7], [8]]
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
-    assert shown() == [[2], [2], [5], [5], [7], [7], [8], [8]]
+
+@pytest.mark.parametrize("other", [{"response": "srgb"}, {"binning": 2}])
+def test_photographs_that_are_looked_at_otherwise_do_not(other):
+    usual = Placed(taken(), FRONT, poses())
+    others = replace(taken(), station=1, **other)
+    seen = [(w.response, w.binning) for w in windows([usual, usual._replace(photographs=others)])]
+    assert seen == [(p.response, p.binning) for p in (usual.photographs, others)]
 
 
-@pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8, 8: 0.7}], ids=["blur", "known"])
-def test_together_stations_are_seen_as_each_alone(known):
+@pytest.mark.parametrize("most", [8, 32])
+@pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
+def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
+    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
     drawn = redrawn(0, 0.0005)
-    found = [search_stations(stations(), drawn), measure_stations(stations(), drawn, known)]
-    for placed, coarse, fine in zip(stations(), *found, strict=True):
-        p, T, seen = placed
-        same(coarse, search(p, drawn, T, seen))
-        same(fine, measure(p, drawn, T, seen, known.get(p.station)))
-        assert (fine.edges.station == p.station).all()
-        assert fine.blur == known.get(p.station, fine.blur)
+    coarse, fine = search_stations(stations(), drawn), measure_stations(stations(), drawn, known)
+    for (p, T, seen), whole, exact in zip(stations(), coarse, fine, strict=True):
+        same(whole, search(p, drawn, T, seen))
+        same(exact, measure(p, drawn, T, seen, known.get(p.station)))
+        assert (exact.edges.station == p.station).all()
+    told = dict(zip((2, 5, 7, 8), (look.blur for look in fine), strict=True))
+    assert told.items() >= known.items()
+    assert known or told[5] > told[7] + 0.1
 
 
 def test_tables_look_at_each_photograph_once_and_share_their_memory():
@@ -158,19 +180,22 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
         assert alike[0] == alike[1]
 
 
-@pytest.mark.parametrize("enough", [0.0, np.inf])
-def test_stations_are_looked_at_beside_one_another_or_in_turn(monkeypatch, enough):
+@pytest.mark.parametrize(("enough", "each"), [(0.0, [1, 1, 1]), (np.inf, [3])])
+def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enough, each):
     """With the same result, in their order."""
     monkeypatch.setattr(turns, "PIXELS_FOR_THREADS", enough)
     photographs = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
+    counts: list[int] = []
 
     def look(some):
         threads.add(get_ident())
+        counts.append(len(some))
         return [legs.joined_looks([], 0.5 + one.station, 0.0) for one in some]
 
     assert [seen.blur for seen in turns._looked_at(photographs, look)] == [0.5, 1.5, 2.5]
     assert (get_ident() in threads) == (enough > 0)
+    assert counts == each
     assert turns._looked_at([], look) == []
 
 

@@ -11,7 +11,7 @@ import pkmcal
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
-from pkmcal.observe import legs
+from pkmcal.observe.photographs import Photographs
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
@@ -39,7 +39,7 @@ class Case:
         return load_truth(self.folder, self.session.machine)
 
     @cached_property
-    def photographs(self) -> list[legs.Photographs]:
+    def photographs(self) -> list[Photographs]:
         """Decoded photographs by station."""
         return read_photographs(self.session)
 

@@ -18,6 +18,7 @@ from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
+from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.simulation import Truth
 
@@ -161,7 +162,7 @@ def looks(case: Case) -> str:
 
 
 def edge_lines(
-    machine: Machine, photographs: legs.Photographs, T_camera_base: Array, pose: Array, k: int
+    machine: Machine, photographs: Photographs, T_camera_base: Array, pose: Array, k: int
 ) -> Array:
     """Predicted edges in photograph k, (E, n, 2) px; NaN where nothing is seen."""
     tubes = tubes_of(machine)
@@ -218,19 +219,17 @@ def measured_places(case: Case) -> Places:
     found: list[tuple[Array, ...]] = []
     truth = case.truth
     for p in case.photographs:
-        at_edges = (
-            truth.machine, truth.T_camera_base[p.station], truth.T_base_platform[p.configuration],
-        )  # fmt: skip
-        seen = legs._seen(p.decoded(), *at_edges)
-        blur = profiles.estimate_blur(seen.across)
-        dull = profiles.without_highlights(seen.across)
+        poses = truth.T_camera_base[p.station], truth.T_base_platform[p.configuration]
+        seen = legs._seen(PhotographWindow.of([Placed(p, *poses)]), truth.machine)
+        blur = {p.station: profiles.estimate_blur(seen.across)}
+        dull, _ = profiles.without_highlights(seen.across, blur)
         curves = profiles.residual_curves(dull, blur)
         chances = profiles.shift_log_likelihoods(dull, curves)
         about = legs._leg_lines(chances, seen.places.along, seen.full, seen.tubes)
         at = profiles.locate(dull, curves, about)
         tube = seen.tubes.tube[np.nonzero(seen.full)[1]]
         steep = strongest_gradient(seen.across.grey)
-        blurs = np.full(len(tube), blur)
+        blurs = np.full(len(tube), blur[p.station])
         columns = (
             seen.across.grey, seen.across.half_width, blurs, tube, at.position, steep,
         )  # fmt: skip

@@ -18,6 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.turns import FEW_MEASURED, Turns
 from pkmcal.observe import legs
+from pkmcal.observe.photographs import Photographs, placed_at
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.stations import BY_CHANCE
 from pkmcal.session.load import Session
@@ -110,18 +111,13 @@ def _count(turns: Turns, stations: Sequence[int], aside: Array) -> int:
     """Edges measured from some stations with the pictures moved ``aside`` (2,), in the pixels that
     edges are in.
     """
-    state, total = turns.estimate.state, 0
+    state = turns.estimate.state
+    moved: list[Photographs] = []
     for p in turns.photographs:
-        if p.station not in stations:
-            continue
-        parameters = p.camera.parameters.copy()
-        parameters[2:4] += p.binning * aside  # the centre, always third and fourth
-        look = legs.measure(
-            replace(p, camera=replace(p.camera, parameters=parameters)),
-            turns.estimate.machine,
-            state.T_camera_base[p.station],
-            state.T_base_platform[p.configuration],
-            turns.blur.get(p.station),
-        )
-        total += len(combined(look).edges)  # as those that were measured
-    return total
+        if p.station in stations:
+            parameters = p.camera.parameters.copy()
+            parameters[2:4] += p.binning * aside  # the centre, always third and fourth
+            moved.append(replace(p, camera=replace(p.camera, parameters=parameters)))
+    placed = placed_at(moved, state.T_camera_base, state.T_base_platform)
+    looks = legs.measure_stations(placed, turns.estimate.machine, turns.blur)
+    return sum(len(combined(look).edges) for look in looks)  # as those that were measured

@@ -43,7 +43,7 @@ from pkmcal.measurements import (
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.alone import finest_view
-from pkmcal.observe.photographs import Photographs, Placed
+from pkmcal.observe.photographs import Photographs, placed_at
 from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
 from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
@@ -524,7 +524,7 @@ def _whole_legs(
     reach: float,
     done: legs.PhotographsLookedAt,
 ) -> list[legs.StationEdges]:
-    placed = _placed(photographs, known.T_camera_base, known.T_base_platform)
+    placed = placed_at(photographs, known.T_camera_base, known.T_base_platform)
     return legs.search_stations(placed, known.machine, reach, done)
 
 
@@ -536,13 +536,8 @@ def _measure(
     done: legs.PhotographsLookedAt | None = None,
 ) -> list[legs.StationEdges]:
     state = estimate.state
-    placed = _placed(photographs, state.T_camera_base, state.T_base_platform)
+    placed = placed_at(photographs, state.T_camera_base, state.T_base_platform)
     return legs.measure_stations(placed, estimate.machine, blur, refine, done)
-
-
-def _placed(photographs: Sequence[Photographs], T_camera_base: Array, poses: Array) -> list[Placed]:
-    """Of all stations, (S, 4, 4), and configurations, (N, 4, 4)."""
-    return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
 
 
 def _with_silhouettes(

@@ -7,7 +7,7 @@ because a loop runs a hundred thousand samples.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class Eye:
             for side in (0, 1)
         ]
         picked = np.array(rows)
-        return cls(true, camera, TubeList(*(column[picked] for column in vars(every).values())))
+        return cls(true, camera, TubeList(*(getattr(every, f.name)[picked] for f in fields(every))))
 
     def points(self, poses: Array, readings: Array, places: int = IMAGED_EDGE_PLACES) -> EdgePoints:
         """Places (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""

@@ -357,7 +357,7 @@ def evidence_of(view: StationView, candidates: Array, photographs: Integers, sam
 
 
 def by_photograph(evidence: Array, count: int) -> Array:
-    """Sums (H, K) over each photograph's places, (H, E, n) of all in a row."""
+    """Sums (H, K) over each photograph's places, or each name's, (H, E, n) of all in a row."""
     return evidence.reshape(len(evidence), count, -1).sum(axis=-1, dtype=float)
 
 
@@ -409,7 +409,9 @@ def grain(view: StationView, T_camera_base: Array) -> float:
 
 
 def _parts(view: StationView, count: int, places: int) -> list[slice]:
-    """Of so many hypotheses those that are looked at together, at so many places of each edge."""
+    """Of so many hypotheses, or photographs, those that are looked at together, at so many places
+    of each edge.
+    """
     each = max(places * len(view.tubes), 1)
     parts = max(min(round(count * each / SILHOUETTE_PLACES_AT_ONCE), count), 1)
     ends = [count * k // parts for k in range(parts + 1)]

@@ -3,7 +3,7 @@
 Six thousand photographs do not fit into memory, and an ordinary session's should not be decoded at
 every look: so the first that fit into KEPT_PHOTOGRAPH_BYTES bytes are kept, and the others decoded
 when they are looked at and forgotten again. What looks at many does so in windows
-(`pkmcal.observe.legs`).
+(`pkmcal.observe.photographs`).
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def search_legs(
     clear: Booleans,
     reach: float = LEG_SEARCH_REACH,
 ) -> LegPlaces:
-    """Shift and tilt of every leg in the photographs of one station.
+    """Shift and tilt of every leg in photographs.
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
@@ -183,13 +183,13 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
         ends = towards[..., :1], towards[..., -1:]
         wide = [np.broadcast_to(end, (*end.shape[:-1], beyond)) for end in ends]
         towards = np.concatenate([wide[0], towards, wide[1]], axis=-1)
-    windows = sliding_window_view(towards.reshape(-1, towards.shape[-1]), count, axis=-1)
+    shifted = sliding_window_view(towards.reshape(-1, towards.shape[-1]), count, axis=-1)
     row = np.arange(place.size).reshape(place.shape)
-    legs, first_edge = np.unique(tubes.leg, return_index=True)  # tubes come leg by leg
+    legs, first_edge = tubes.by_leg
     out = np.zeros((len(values), tubes.leg.max() + 1, len(tilts), count), values.dtype)
     for i, tilt in enumerate(tilts):
         first = np.rint(tilt * place).astype(int) + (room + beyond)
-        by_edge = windows[row, first].sum(axis=2)
+        by_edge = shifted[row, first].sum(axis=2)
         out[:, legs, i] = np.add.reduceat(by_edge, first_edge, axis=1)
     return out
 
@@ -223,7 +223,7 @@ def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
     """Place of every point between the ends of its leg's visible part, -1..1; (K, E, n)."""
-    legs, first_edge = np.unique(tubes.leg, return_index=True)  # tubes come leg by leg
+    legs, first_edge = tubes.by_leg
     ends: list[Array] = []
     for reduce, beyond in ((np.minimum, np.inf), (np.maximum, -np.inf)):
         of_edge = reduce.reduce(np.where(clear, along, beyond), axis=2)
@@ -250,7 +250,7 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
 
 @dataclass(frozen=True)
 class StationEdges:
-    """What one look at one station gave.
+    """What one look gave, at one station or, before it is taken apart, at several.
 
     points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports.
     blur : px, of the pictures' edges; nan where not estimated. moved : median distance (px) of
@@ -370,24 +370,24 @@ def measure_stations(
             known |= _blur_in(_seen(few, machine).across, [p.station])
             del few
     looks: list[StationEdges] = []
-    moved: dict[int, list[Array]] = {one.photographs.station: [] for one in placed}
+    moved: list[Array] = [np.zeros(0)]
     for window in windows(placed):
-        seen, shown = _seen(window, machine), np.unique(window.station).tolist()
-        known |= _blur_in(seen.across, [station for station in shown if station not in known])
+        seen = _seen(window, machine)
+        untold = [k for k in np.unique(window.station).tolist() if k not in known]
+        known |= _blur_in(seen.across, untold)
         look, away = _measured(window, seen, known, refine_camera)
         looks.append(look.unbinned(window.binning))
-        at = look.edges.station[look.point_edge]
-        for station in shown:
-            moved[station].append(away[at == station])
+        moved.append(away)
         if done is not None:
             done(len(window.images))
         del seen, window  # before the next one is decoded
     every = joined_looks(looks, float("nan"), float("nan"))
+    away, at = np.concatenate(moved), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
-    for station, parts in moved.items():
-        away = np.concatenate([np.zeros(0), *parts])
-        middle = float(np.median(away)) if len(away) else 0.0
-        told = known.get(station, profiles.USUAL_BLUR)
+    for one in placed:
+        station = one.photographs.station
+        own, told = away[at == station], known.get(station, profiles.USUAL_BLUR)
+        middle = float(np.median(own)) if own.size else 0.0
         out.append(replace(every.of_station(station), blur=told, moved=middle))
     return out
 

@@ -98,6 +98,13 @@ class Placed(NamedTuple):
         return Placed(self.photographs.select(numbers), self.T_camera_base, self.poses[numbers])
 
 
+def placed_at(
+    photographs: Sequence[Photographs], T_camera_base: Array, poses: Array
+) -> list[Placed]:
+    """Those of stations among all, (S, 4, 4), at poses of all configurations, (N, 4, 4)."""
+    return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
+
+
 @dataclass(frozen=True)
 class PhotographWindow:
     """Photographs that are looked at together, as edges are looked for in them, decoded.
@@ -120,7 +127,7 @@ class PhotographWindow:
     @classmethod
     def of(cls, placed: Sequence[Placed]) -> PhotographWindow:
         """Of stations whose photographs are alike, no more than a window in all."""
-        count = [len(one.poses) for one in placed]
+        count = [len(one.photographs.images) for one in placed]
         seen = [one.photographs.binned() for one in placed]
         return cls(
             camera=seen[0].camera,
@@ -136,16 +143,16 @@ class PhotographWindow:
 
 
 def windows(placed: Sequence[Placed]) -> Iterator[PhotographWindow]:
-    """All photographs, station after station, each with as many of those before it as are looked at
-    together.
+    """All photographs of stations, whose numbers differ, in their order; such as follow one another
+    and are alike share a window, as far as they fit.
     """
     together: list[Placed] = []
     for one in placed:
-        most = one.photographs.window
-        for first in range(0, len(one.poses), most):
-            part = one.select(np.arange(first, min(first + most, len(one.poses))))
-            count = sum(len(other.poses) for other in (*together, part))
-            if together and not (count <= most and together[0].photographs.alike(part.photographs)):
+        most, total = one.photographs.window, len(one.photographs.images)
+        for first in range(0, total, most):
+            part = one.select(np.arange(first, min(first + most, total)))
+            count = sum(len(other.photographs.images) for other in (*together, part))
+            if together and (count > most or not together[0].photographs.alike(part.photographs)):
                 yield PhotographWindow.of(together)
                 together = []
             together.append(part)

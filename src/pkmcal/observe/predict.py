@@ -1,7 +1,7 @@
 """Where the edges of every leg should lie in every photograph, from what is known so far.
 
-Arrays have the axes (..., E edges of a machine, n samples along an edge), with K photographs of
-one station before them; the E edges are the same in every photograph: each visible tube of each
+Arrays have the axes (..., E edges of a machine, n samples along an edge), with K photographs before
+them; the E edges are the same in every photograph: each visible tube of each
 leg, side 0 then side 1.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,11 @@ class TubeList:
 
     def __len__(self) -> int:
         return len(self.leg)
+
+    @cached_property
+    def by_leg(self) -> tuple[Integers, Integers]:
+        """Legs with tubes, and the first edge of each: edges come leg by leg."""
+        return np.unique(self.leg, return_index=True)
 
 
 def tubes_of(machine: Machine) -> TubeList:
@@ -83,7 +89,8 @@ class LegsInCamera:
         """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
         T = T_camera_base.astype(self.a.dtype)
         shape = self.a.shape[-3:-1]
-        own = np.stack([self.a, self.b, self.u]).reshape(3, -1, shape[0] * shape[1], 3)
+        lead = self.a.shape[:-3] or (1,)
+        own = np.stack([self.a, self.b, self.u]).reshape(3, *lead, shape[0] * shape[1], 3)
         seen = T[:, :3, :3] @ own.mT  # (3, H, 3, K L): one component after the other
         seen[:2] += T[:, :3, 3:]  # directions do not shift
         return LegsInCamera(*seen.reshape(3, len(T), 3, *shape).transpose(0, 1, 3, 4, 2))

@@ -155,7 +155,7 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
 
 
 class _Kinds(NamedTuple):
-    """Profiles by kind: a few dozen combinations of station, half width and cut.
+    """Profiles by kind: of each station a few dozen combinations of half width and cut.
 
     scaled : (N, samples) in contrasts, less the outermost, in the order of the kinds. square : (N,)
     sums of their squares. order : (N,) the profile that each is. parts : the first and the end of

@@ -21,7 +21,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.photographs import Photographs
+from pkmcal.observe.photographs import Photographs, placed_at
 from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
@@ -143,21 +143,14 @@ def first_edges(
             edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
         )
 
-    looks = [
-        legs.search(p, machine, T, poses[p.configuration])
-        for p, T in zip(few, T_camera_base, strict=True)
-    ]
+    looks = legs.search_stations(placed_at(few, T_camera_base, poses), machine)
     coarse = replace(measurements(concatenate([one.edges for one in looks])), shaded=False)
     # a pixel is what the search is good to, so there is no noise to be estimated
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
     state = estimate.state
-    looks = [
-        legs.measure(
-            p, estimate.machine, state.T_camera_base[k], state.T_base_platform[p.configuration]
-        )
-        for k, p in enumerate(few)
-    ]
+    placed = placed_at(few, state.T_camera_base, state.T_base_platform)
+    looks = legs.measure_stations(placed, estimate.machine, {})
     fine = measurements(concatenate([one.edges for one in looks]))
     held = refinement_of(session, refine=False)
     fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
