@@ -94,7 +94,7 @@ def two_stations(second, **told):
     )
     both = [*one.photographs, replace(second, station=1)]
     measured = SimpleNamespace(poses=SimpleNamespace(station=np.array(told.pop("boards", []))))
-    turns = Turns(seen, measured, estimate, None, photographs=both, blur={0: None, 1: None})
+    turns = Turns(seen, measured, estimate, None, photographs=both, blur={})
     station = SimpleNamespace(**{"handheld": False, "T_camera_base": None, **told})
     return SimpleNamespace(stations=(station, station)), turns
 
