@@ -11,10 +11,11 @@ import pytest
 import yaml
 
 import pkmcal
+from pkmcal.calibration import calibrate
 from pkmcal.calibration.gather import refinement_of
 from pkmcal.calibration.saved import load
 from pkmcal.calibration.source import load_source
-from pkmcal.calibration.upside_down import turned_round, upside_down
+from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.cameras import load_camera
 from pkmcal.identify.score import Departures, Freed
 from pkmcal.judge.new_data import _as_then
@@ -74,6 +75,28 @@ def test_upright_photographs_are_left_as_they_are(calibrated):
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)
 
 
+def test_where_it_is_likely_it_is_said(demo, monkeypatch):
+    """And the photographs are measured as they are."""
+
+    def likely(session, turns):
+        station = session.stations[0]
+        file, camera = station.camera_file, station.camera.turned_by_half()
+        return (UpsideDown(file, ("station1",), camera, np.log(376.0)),)
+
+    monkeypatch.setattr(calibrate, "upside_down", likely)
+    found = pkmcal.calibrate(demo.session)
+    (warning,) = [text for text in found.verdict.warnings if "upside down" in text]
+    assert warning == (
+        "The photographs of station1 may be upside down against cameras/camera.yaml: so say their"
+        " edges, at odds of 376 to 1, too few to be believed. They are measured as they are; if it"
+        " is so, errors are larger than stated. Hold one beside the machine: if a program has"
+        " turned them by half, turn them back."
+    )
+    assert found.upside_down == ()
+    own = load_camera(demo.session / "cameras" / "camera.yaml")
+    np.testing.assert_array_equal(found.session.stations[0].camera.parameters, own.parameters)
+
+
 def lens(session, centre, covariance=None):
     """A session whose camera's centre is so many px beside the middle, as its file would say."""
     file, camera = session.stations[0].camera_file, session.stations[0].camera
@@ -85,11 +108,12 @@ def lens(session, centre, covariance=None):
 
 @pytest.mark.parametrize(
     ("values", "sigma", "known"),
-    [((0.0, 0.1, -0.1), 0.04, False), ((0.9, 1.1, 0.8), 0.12, True), ((0.9, 1.1, 0.8), 0.8, False),
-     ((2.0, 2.1, 2.0), 0.1, False), ((1.0, 1.0, 0.0), 0.1, False), ((1.0, 0.3, 1.0), 0.3, True),
-     ((1.0, 0.0, 0.0), np.array([0.1, np.inf, np.inf]), True), ((0.0, 0.0, 0.0), np.inf, False)],
+    [((0.0, 0.1, -0.1), 0.04, None), ((0.9, 1.1, 0.8), 0.12, True), ((0.9, 1.1, 0.8), 0.8, None),
+     ((2.0, 2.1, 2.0), 0.1, None), ((1.0, 1.0, 0.0), 0.1, None), ((1.0, 0.3, 1.0), 0.3, True),
+     ((1.0, 0.0, 0.0), np.array([0.1, np.inf, np.inf]), True), ((0.0, 0.0, 0.0), np.inf, None),
+     ((0.8, 0.7, 0.75), 0.35, False)],
     ids=["upright", "upside down", "not told", "another camera", "one station is upright",
-         "one tells little", "one alone tells", "none tells"],
+         "one tells little", "one alone tells", "none tells", "not sure"],
 )  # fmt: skip
 def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigma, known):
     sigmas = np.broadcast_to(sigma, 3)
@@ -99,9 +123,9 @@ def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigm
     session = lens(calibrated.session, (8.0, -5.0))
     (camera,) = {id(station.camera): station.camera for station in session.stations}.values()
     found = upside_down(session, calibrated)
-    assert [(one.file, one.entries) for one in found] == [
-        ("cameras/camera.yaml", ("station1", "station2", "station3"))
-    ] * known
+    assert [(one.file, one.entries, one.sure) for one in found] == [
+        ("cameras/camera.yaml", ("station1", "station2", "station3"), known)
+    ] * (known is not None)
     for one in found:
         np.testing.assert_array_equal(one.camera.parameters, camera.turned_by_half().parameters)
 

@@ -162,8 +162,8 @@ def calibrate_session(
         seen = _observe(session, seed, clock)
         turns, richer = _identify(seen, refine_camera, seed, clock)
         turned = upside_down(seen.session, turns)
-        if turned:
-            session = turned_round(session, {one.file: one.camera for one in turned})
+        if sure := {one.file: one.camera for one in turned if one.sure}:
+            session = turned_round(session, sure)
             seen = _observe(session, seed, clock)
             turns, richer = _identify(seen, refine_camera, seed, clock)
         # without one that was in a wrong place, another may show itself to be
@@ -347,14 +347,13 @@ def _judge(
             *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
-            *(one.sentence for one in found.turns.responses if not one.sure),
+            *(one.sentence for one in (*turned, *found.turns.responses) if not one.sure),
         ),
         hints=(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
             *numbering_told(session),
-            *(one.sentence for one in turned),
-            *(one.sentence for one in found.turns.responses if one.sure),
+            *(one.sentence for one in (*turned, *found.turns.responses) if one.sure),
         ),
     )
     clock.lap("identify")
@@ -372,7 +371,7 @@ def _judge(
         boards=seen.boards,
         holdout=found.out,
         departures=departed,
-        upside_down=turned,
+        upside_down=tuple(one for one in turned if one.sure),
         photographs={one.station: one.images for one in seen.photographs},
     )
 

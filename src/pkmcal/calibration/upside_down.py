@@ -5,8 +5,8 @@ turned, too, and no look at them tells. But the camera's centre is then on the o
 picture's middle, which no place of the camera makes up for. So the way from a camera to the same
 one turned is a departure of one number (:mod:`pkmcal.identify.score`), whose fit is 0 where the
 file is right and 1 where the photographs are upside down. Where the edges are sure of that, these
-are measured by the camera turned by half. A camera that is estimated with the machine is not asked
-about.
+are measured by the camera turned by half; where it is but likelier, the verdict says so. A camera
+that is estimated with the machine is not asked about.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ ODDS_FOR_UPSIDE_DOWN = 1000.0
 ODDS_FOR_UPRIGHT = 20.0
 """Odds from which the photographs of one of session.yaml's stations are upright, so that those of
 the same camera are not taken to be turned alike."""
+ODDS_TO_BE_TOLD = 20.0
+"""Odds from which photographs that may be upside down are said to be so."""
 FURTHER_THAN_TURNED = 1.5
 """Times the way, from which what fits is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
@@ -42,16 +44,30 @@ LEAST_CENTRE_ERROR = 1e-6
 @dataclass(frozen=True)
 class UpsideDown:
     """A camera's file against which photographs are upside down. entries : of session.yaml's
-    stations. camera : the one that took them, as they are.
+    stations. camera : the one that took them, as they are. log_odds : for that.
     """
 
     file: str
     entries: tuple[str, ...]
     camera: Camera
+    log_odds: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether they are measured so."""
+        return self.log_odds > np.log(ODDS_FOR_UPSIDE_DOWN)
 
     @property
     def sentence(self) -> str:
-        """A hint for the verdict."""
+        """For a verdict: a hint where the edges are sure, else a caution."""
+        if not self.sure:
+            return (
+                f"The photographs of {listed(self.entries)} may be upside down against {self.file}:"
+                f" so say their edges, at odds of {np.exp(self.log_odds):.0f} to 1, too few to be"
+                " believed. They are measured as they are; if it is so, errors are larger than"
+                " stated. Hold one beside the machine: if a program has turned them by half, turn"
+                " them back."
+            )
         centre = ", ".join(f"{value:.6g}" for value in self.camera.document()["center"])
         return (
             f"The photographs of {listed(self.entries)} are upside down against {self.file}: so say"
@@ -63,7 +79,7 @@ class UpsideDown:
 
 
 def upside_down(session: Session, turns: Turns) -> tuple[UpsideDown, ...]:
-    """The cameras against whose files the photographs are upside down."""
+    """The cameras against whose files the photographs are upside down, or may well be."""
     changed = CameraChange.of(session, turns.observation, turns.measurements)
     if changed is None or not len(turns.measurements.edges):
         return ()
@@ -81,10 +97,10 @@ def upside_down(session: Session, turns: Turns) -> tuple[UpsideDown, ...]:
         sigma = np.concatenate([fits[k].sigma for k in own])
         known = _file_sigma(camera)
         alone = [_log_odds(value[[k]], sigma[[k]], known) for k in range(len(own))]
-        sure = _log_odds(value, sigma, known) > np.log(ODDS_FOR_UPSIDE_DOWN)
-        if sure and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
+        odds = _log_odds(value, sigma, known)
+        if odds > np.log(ODDS_TO_BE_TOLD) and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
             names = tuple(list(cameras)[k] for k in own)
-            out.append(UpsideDown(file, names, camera.turned_by_half()))
+            out.append(UpsideDown(file, names, camera.turned_by_half(), odds))
     return tuple(out)
 
 
