@@ -92,7 +92,9 @@ class DirectionTables:
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
-            counted += _counted(table)
+        for first in range(0, len(self.place), rows):  # so many at once, for threads take turns
+            tables = self.picture[: len(self.place) - first, :, first // rows, direction]
+            counted += _counted(tables)
         self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
         self.ready[direction] = True  # at last, as others may look beside
 
@@ -310,14 +312,13 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
     return out
 
 
-def _counted(table: Array) -> Integers:
-    """How often each distance occurs in a table (h, w), (bins,); at every other place of every
+def _counted(tables: Array) -> Integers:
+    """How often each distance occurs in tables (n, h, w), (bins,); at every other place of every
     other row: from fewer, what chance gives would differ between explanations of one picture.
     """
     bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
-    number = np.minimum(table[::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN), bins - 1).astype(
-        np.intp
-    )
+    number = tables[:, ::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN)
+    number = np.minimum(number, bins - 1).astype(np.intp)
     return np.bincount(number.ravel(), minlength=bins)
 
 
