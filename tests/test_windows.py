@@ -183,7 +183,7 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
 @pytest.mark.parametrize(("enough", "each"), [(0.0, [1, 1, 1]), (np.inf, [3])])
 def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enough, each):
     """With the same result, in their order."""
-    monkeypatch.setattr(turns, "PIXELS_FOR_THREADS", enough)
+    monkeypatch.setattr(turns, "KEPT_PHOTOGRAPH_BYTES", enough)
     photographs = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
     counts: list[int] = []

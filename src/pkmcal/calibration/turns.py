@@ -43,6 +43,7 @@ from pkmcal.measurements import (
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.alone import finest_view
+from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES
 from pkmcal.observe.photographs import Photographs, placed_at
 from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
 from pkmcal.observe.quality import quality
@@ -87,10 +88,6 @@ PHOTOGRAPHS_FOR_WIDTH = 4
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
-PIXELS_FOR_THREADS = 24e6
-"""Pixels of all photographs from which stations are looked at two at a time. Of fewer, arrays are
-so small that threads wait for one another: eighteen of 1024x768 take a tenth more time so,
-forty-five a fifteenth less, and where photographs are decoded at each look there are more."""
 FEWEST_EDGES_TO_IDENTIFY = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
@@ -588,9 +585,11 @@ def _looked_at(
     photographs: Sequence[Photographs],
     look: Callable[[Sequence[Photographs]], list[legs.StationEdges]],
 ) -> list[legs.StationEdges]:
-    """A look at all stations, repeats as one: together, or of large photographs, two at a time."""
+    """A look at all stations, repeats as one: together, or two at a time where photographs have to
+    be decoded for it, which runs beside Python.
+    """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in photographs)
-    if pixels < PIXELS_FOR_THREADS:
+    if pixels <= KEPT_PHOTOGRAPH_BYTES:
         return [combined(one) for one in look(photographs)]
     with ThreadPoolExecutor(THREADS) as pool:
         return [combined(one) for (one,) in pool.map(look, ([p] for p in photographs))]
