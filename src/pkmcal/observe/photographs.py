@@ -2,7 +2,7 @@
 
 What is worked out of one photograph takes some megabytes, so those that are looked at are held a
 window at a time. Photographs of several stations are looked at together where one camera took them
-alike: what is done to six in one set of arrays takes half as long as to one photograph six times.
+alike: what is done to six in one set of arrays takes a third as long as to one after the other.
 """
 
 from __future__ import annotations
