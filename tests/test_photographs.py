@@ -28,6 +28,15 @@ def test_sizes_are_those_of_the_decoded_image(tmp_path, suffix, monkeypatch):
     assert decode(path, (37, 21), path.name).shape == (21, 37)
 
 
+@pytest.mark.parametrize("data", [
+    b"P5\n" + b"# " * 400, b"P5\n" + b"#\n" * 400, b"P5" + b" " * 900, b"P5\n37 21",
+    b"P537 21 255\n", b"P5\n37 " + b"2" * 10 + b" 255\n", b"P5\n-37 21 255\n",
+])  # fmt: skip
+def test_headers_without_a_size_are_refused_at_once(tmp_path, data):
+    (tmp_path / "a.pgm").write_bytes(data)
+    assert "not an image" in fault(photograph_header, tmp_path / "a.pgm")
+
+
 def test_sizes_of_headers_that_opencv_does_not_write(tmp_path):
     def size(data):
         (tmp_path / "a").write_bytes(data + b"\0" * 2000)

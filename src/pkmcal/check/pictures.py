@@ -168,7 +168,7 @@ def _colour(leg: int) -> tuple[int, int, int]:
 def leg_colours() -> tuple[tuple[int, int, int], ...]:
     """What the page's style sheet gives legs on photographs: it stands once, there."""
     style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
-    (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)\}", style, flags=re.MULTILINE)
+    (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
     found = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
     numbers = [int(found[str(k + 1)], 16) for k in range(N_COLOURS)]
     return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

@@ -183,7 +183,7 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     return defect, INTERNAL_ERROR_EXIT
 
 
-_SUGGESTED = re.compile(r"\.? *(Did you mean|\(Possible options:).*")
+_SUGGESTED = re.compile(r"(Did you mean|\(Possible options:).*")
 _MACHINERY = ((r"Value error, ", ""), (r"Input should be", "it should be"), (r", unable to .*", ""))
 """In the complaints of typer's own checks: what names their inside, and what a reader needs."""
 
@@ -195,7 +195,7 @@ def _usage(error: Exception) -> str:
     from pkmcal.files import closest
 
     message = " ".join(getattr(error, "format_message", error.__str__)().split())
-    message = _SUGGESTED.sub("", message).rstrip("?.")
+    message = _SUGGESTED.sub("", message).rstrip("?. ")
     for inside, instead in _MACHINERY:
         message = re.sub(inside, instead, message)
     guess: str | None = None

@@ -333,16 +333,17 @@ def c_comment(lines: Iterable[str]) -> str:
 
 # What is read from the files again
 
-_COMMENT = re.compile(r"/\*.*?\*/", re.S)
+_CONSTANT = re.compile(r"static const \w+ (\w+)")
 _NUMBER = re.compile(r"-?HUGE_VAL|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FIELD = re.compile(r"\.(\w+) = (\{[^{}]*\}|[^\s,{}]+)")
 
 
 def _body(text: str, name: str) -> str:
     """What stands between the braces of a constant, without comments."""
-    plain = _COMMENT.sub("", text)
-    found = re.search(rf"static const \w+ {name}[^=]*= (.*?);", plain, re.S)
-    return found.group(1) if found else ""
+    code, *others = text.split("/*")
+    plain = "".join([code, *(other.partition("*/")[2] for other in others)])
+    ends = (found.end() for found in _CONSTANT.finditer(plain) if found[1] == name)
+    return next((plain[end:].partition("= ")[2].partition(";")[0] for end in ends), "")
 
 
 def numbers_of(text: str, name: str) -> Array:

@@ -518,7 +518,7 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
     return _checked(Document(path, label, data, {}))
 
 
-_ODD = re.compile(r'"(?:\\.|[^"\\])*"|(?P<number>NaN|-?Infinity|-?\d{1000,})')
+_ODD = re.compile(r'"(?:\\.|[^"\\])*"?|(?P<number>NaN|-?Infinity|-?\d{1000,})')
 """Numbers that Python's reader refuses without saying where, outside strings."""
 
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 import zlib
 from typing import BinaryIO, Literal
 
@@ -20,7 +19,8 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By PNG's kinds of colour."""
 _TIFF_STARTS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SHORT = 256, 257, 3
-_PNM = re.compile(rb"P[2356]\s+(?:#.*\s+)*(\d{1,9})\s+(?:#.*\s+)*(\d{1,9})\s")
+_PNM_STARTS = (b"P2", b"P3", b"P5", b"P6")
+_MOST_PNM_DIGITS = 9
 _LONGEST_PNM = 1000
 """Bytes in which a PGM file's size stands, remarks before it included."""
 MOST_DEFLATE_EXPANSION = 1032
@@ -51,8 +51,8 @@ def stated_size(stream: BinaryIO) -> tuple[int, int]:
         width, height, most = _bmp(start)
     elif start[:4] in _TIFF_STARTS:
         width, height, most = _tiff(stream, _TIFF_STARTS[start[:4]])
-    elif found := _PNM.match(start):
-        width, height, most = int(found[1]), int(found[2]), 1.0
+    elif start[:2] in _PNM_STARTS:
+        width, height, most = _pnm(start)
     else:
         return 0, 0
     return (width, height) if 0 < width * height <= most * length else (0, 0)
@@ -80,6 +80,16 @@ def _jpeg(stream: BinaryIO) -> _Stated:
             return *_pair(frame[3:5], frame[1:3]), 8.0 * JPEG_BLOCK
         stream.seek(max(length - 2, 0), 1)
     return 0, 0, 0.0
+
+
+def _pnm(start: bytes) -> _Stated:
+    """The first two words behind the format's, remarks left out: # to the end of its line."""
+    plain = b" ".join(line.partition(b"#")[0] for line in start[2:].splitlines())
+    words = plain.split()[:3]  # behind the second one a third begins, or it may be cut short
+    whole = len(words) == 3 and start[2:3].isspace()
+    if not whole or not all(w.isdigit() and len(w) <= _MOST_PNM_DIGITS for w in words[:2]):
+        return 0, 0, 0.0
+    return int(words[0]), int(words[1]), 1.0
 
 
 def _bmp(start: bytes) -> _Stated:

@@ -18,7 +18,9 @@ from pkmcal.files.documents import shown
 
 LARGEST_UNITLESS_LENGTH = 50.0
 """m; a machine or a camera's place without a unit that is larger was written in millimetres."""
-_QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})")
+_QUANTITY = re.compile(
+    r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})"
+)
 _HEAD = re.compile(r"(.*\S)\s*(?:\[([A-Za-zµμ°%]{1,20})\]|\(([A-Za-zµμ°%]{1,20})\))")
 SHARE_UNIT_NAMES = ("%", "percent", "ppm")
 _ROOTS = {"meter": "m", "radian": "rad", "dimensionless": ""}

@@ -22,7 +22,7 @@ from pkmcal.wording import listed
 
 CONFIGURATION_COLUMN = "configuration"
 """The first column's name."""
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
 """Words for "no number" that programs write into cells; spreadsheets write #N/A or #VALUE!."""

@@ -35,8 +35,8 @@ FULL_STEPS = 200.0
 """Steps a turn of a motor whose section says nothing else, as in Klipper."""
 MOST_CARRIAGE_STEPS = 1e9
 """From an end switch: kilometres of a carriage's way."""
-_SECTION = re.compile(r"\[\s*([^\]]+?)\s*\]")
-_ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=]\s*(.*)")
+_SECTION = re.compile(r"\[([^\]]+)\]")
+_ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=](.*)")
 
 Sections = dict[str, dict[str, tuple[str, str]]]
 """Entries by section and name: their text, and where it stands."""
@@ -137,7 +137,7 @@ def sections(text: str, label: str) -> Sections:
     for n, line in (*saved, *own):
         plain = re.split(r"(?:^|\s)[#;]", line)[0].rstrip()
         if head := _SECTION.fullmatch(plain.strip()):
-            section = head[1]
+            section = head[1].strip()
             out.setdefault(section, {})
         elif section and (entry := _ENTRY.fullmatch(plain)):
             out[section][entry[1].lower()] = entry[2].strip(), f"{label}, line {n}, [{section}]"

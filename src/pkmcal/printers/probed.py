@@ -29,7 +29,7 @@ HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _TRIGGERED = re.compile(rf"probe at {_NUMBER},{_NUMBER} is z={_NUMBER}")
 _CONTACT = re.compile(rf"probe: at {_NUMBER},{_NUMBER} bed will contact at z={_NUMBER}")
-_G30 = re.compile(r"^\s*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
+_G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
 _WORD = re.compile(rf"([PXY])\s*{_NUMBER}", re.IGNORECASE)
 _HEIGHTS = re.compile(rf"bed probe heights:((?:\s+{_NUMBER})+)", re.IGNORECASE)
 

@@ -21,7 +21,7 @@ from pkmcal.export.reprap import (
 from pkmcal.files import shown
 from pkmcal.printers.printer import LARGEST_PRINTER_VALUE, Printer
 
-_M665 = re.compile(r"^\s*M665\b", re.MULTILINE)
+_M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
 _OURS = re.compile(r"\s*M66[56]\b")
 
 
