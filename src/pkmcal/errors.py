@@ -8,14 +8,16 @@ and leaves with `exit_code`. Anything else that escapes is a defect of pkmcal.
 from __future__ import annotations
 
 import re
+import unicodedata
 from functools import partial
 from typing import Any, ClassVar, Self
 
 LONGEST_NAME = 255
 """Characters of a name; file systems take no longer ones."""
 _LONG_NAME = re.compile(rf"[^\s/\\]{{{LONGEST_NAME + 1},}}")
-_UNWRITTEN = re.compile("[\0-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""What would move a terminal's cursor, turn the direction of writing, or cannot be written."""
+_INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
+"""Of Unicode: what moves a terminal's cursor, turns the direction of writing, has no width, breaks
+lines, or is half of a character, as a file's name that is not UTF-8 holds it."""
 LONGEST_FOUND = 500
 """Characters of what was found: enough to recognise it by."""
 
@@ -108,12 +110,25 @@ class GeometryError(PkmcalError):
     """No usable answer here: a leg through the camera, a singular pose, no convergence."""
 
 
-def _brief(text: str, most: int | None = None) -> str:
-    """Text without what is too long to be a name, of which both ends are enough to recognise it;
-    signs that are none to read are spelt out.
+def legible(text: str, keep: str = "") -> str:
+    r"""Text with every character spelt out that cannot be read: ``\x1b`` for ESC, ``\u202e``.
+
+    All that is printed, and all that is written into comments, goes through here; what stays is of
+    one line. keep : characters that stay as they are.
     """
-    text = _UNWRITTEN.sub(lambda sign: repr(sign[0])[1:-1], text)
-    text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", text)
+    if text.isprintable():
+        return text
+    return "".join(
+        repr(c)[1:-1] if c not in keep and unicodedata.category(c) in _INVISIBLE_CATEGORIES else c
+        for c in text
+    )
+
+
+def _brief(text: str, most: int | None = None) -> str:
+    """Legible text without what is too long to be a name, of which both ends are enough to
+    recognise it.
+    """
+    text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", legible(text))
     return text if most is None or len(text) <= most else f"{text[: most - 1]}…"
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 from pkmcal.files import check_writable, entries, json_text, json_value
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
@@ -138,7 +138,7 @@ def calibrated_mechanism_text(calibration: Calibration) -> str:
         f" {CALIBRATION_REPORT_FILE}.",
     ]
     # A session's name may hold a line break; what follows it must stay a comment.
-    comment = "".join(f"# {' '.join(line.split())}\n" for line in lines)
+    comment = "".join(f"# {legible(' '.join(line.split()))}\n" for line in lines)
     return comment + mechanism_text(calibration.machine)
 
 

@@ -19,7 +19,7 @@ from pkmcal.calibration.results import (
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera, written_camera
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
@@ -87,7 +87,7 @@ class MachineSource:
             *conventions,
         )
         # A name may hold a line break; what follows it must stay a comment.
-        return tuple(" ".join(line.split()) for line in lines)
+        return tuple(legible(" ".join(line.split())) for line in lines)
 
     def sigma_lines(self, kinds: Sequence[str] = ()) -> list[str]:
         """One line a parameter, of these kinds or of all: name, value, unit and deviation."""
@@ -188,7 +188,7 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
     above = saved.path.resolve().parent.parent
     name = str((saved.document.get("session") or {}).get("folder", ""))
     for folder in (above, above / name):
-        if folder.name == name and (folder / SESSION_FILE).is_file():
+        if legible(folder.name) == legible(name) and (folder / SESSION_FILE).is_file():
             return folder
     return None
 

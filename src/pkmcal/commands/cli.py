@@ -24,7 +24,7 @@ import typer.main
 
 from pkmcal.commands.console import print_error
 from pkmcal.commands.streams import LostOutput, withstanding
-from pkmcal.errors import InputError, PkmcalError
+from pkmcal.errors import InputError, PkmcalError, legible
 
 INTERNAL_ERROR_EXIT = 70
 """sysexits.h's EX_SOFTWARE: an internal error, which is nothing that a user did."""
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _failed(error: BaseException, words: list[str]) -> int:
     """Tell an error in words, or as JSON where that was asked for; returns the exit code."""
     if os.environ.get(DEBUG_VARIABLE):
-        traceback.print_exception(error, file=sys.stderr)
+        sys.stderr.write(legible("".join(traceback.format_exception(error)), keep="\n"))
     told, code = _in_words(error, words)
     if "--json" in words and not isinstance(error, LostOutput):
         try:

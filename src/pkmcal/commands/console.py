@@ -11,12 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,18 +68,35 @@ def check_positive(option: str, value: float, most: float) -> None:
         )
 
 
+@cache
+def _legible_console() -> type[Console]:
+    """Rich's console, on which all text is legible; only Rich's own colours control a terminal."""
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class LegibleConsole(Console):
+        """As Rich's."""
+
+        def render(
+            self, renderable: RenderableType, options: ConsoleOptions | None = None
+        ) -> Iterable[Segment]:
+            for segment in super().render(renderable, options):
+                if segment.control:
+                    yield segment
+                else:
+                    yield Segment(legible(segment.text, keep="\n"), segment.style)
+
+    return LegibleConsole
+
+
 def out() -> Console:
     """The console of results."""
-    from rich.console import Console
-
-    return Console(highlight=False)
+    return _legible_console()(highlight=False)
 
 
 def err() -> Console:
     """The console of progress and errors."""
-    from rich.console import Console
-
-    return Console(stderr=True, highlight=False)
+    return _legible_console()(stderr=True, highlight=False)
 
 
 def print_error(sentence: str) -> None:
@@ -87,7 +105,7 @@ def print_error(sentence: str) -> None:
     if console.is_terminal:
         print_points(console, [("[bold red]Error:[/]", sentence)])
     else:
-        sys.stderr.write(f"Error: {sentence}\n")
+        sys.stderr.write(f"Error: {legible(sentence)}\n")
 
 
 def print_json(data: Mapping[str, Any]) -> None:
@@ -116,7 +134,7 @@ def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
 
 def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
     """Paths, each with what it is."""
-    files = list(files)
+    files = [(legible(path), what) for path, what in files]
     widest = max(len(path) for path, _ in files)
     for path, what in files:
         console.print(f"  {escaped(path):{widest}}  [dim]{what}[/]", soft_wrap=True)
@@ -141,17 +159,17 @@ def print_table(console: Console, table: Table) -> None:
         shown.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
     console.print()
     if table.title:
-        console.print(table.title, style="bold", markup=False)
+        console.print(legible(table.title), style="bold", markup=False)
     console.print(shown)
     for line in table.legend:
         console.print(f"   {line}", style="dim", markup=False)
 
 
 def escaped(text: str) -> str:
-    """Text that may hold brackets, safe from being taken for markup."""
+    """Text of one line that may hold brackets, safe from being taken for markup."""
     from rich.markup import escape
 
-    return escape(text)
+    return escape(legible(text))
 
 
 @contextmanager
@@ -170,7 +188,11 @@ def progress(quiet: bool = False) -> Generator[ToldProgress]:
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda text, share: bar.update(task, description=text, completed=share)
@@ -189,7 +211,7 @@ def _lines() -> Generator[ToldProgress]:
             text, share = step[0]
             if text:
                 passed = f"{share:.0%}, {time.monotonic() - begin:.0f} s"
-                sys.stderr.write(f"{text} ({passed})\n")
+                sys.stderr.write(f"{legible(text)} ({passed})\n")
 
     # by itself, for a step may take minutes in which nothing else is told
     thread = threading.Thread(target=tell, daemon=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 
 if TYPE_CHECKING:
     from pkmcal.cameras import Camera
@@ -145,7 +145,7 @@ def simulate(
             )
         )
     console.print_points(out, points)
-    out.print(f"\nNext: pkmcal calibrate {shlex.quote(str(folder))}", markup=False)
+    out.print(f"\nNext: pkmcal calibrate {legible(shlex.quote(str(folder)))}", markup=False)
     return 0
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import MachineSource
+from pkmcal.errors import legible
 from pkmcal.export.contract import Difference, Exporter, exact, largest
 from pkmcal.export.limbs import (
     CONSTANT_ROD,
@@ -323,7 +324,7 @@ def c_array(name: str, shape: str, values: Array | Sequence[Array], note: str = 
 def c_comment(lines: Iterable[str]) -> str:
     """Lines as one C comment; nothing in them ends it, or joins lines."""
     safe = (
-        line.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("?", ".")
+        legible(line).replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("?", ".")
         for line in lines
     )
     wrapped = [part for line in safe for part in textwrap.wrap(line, 96) or [""]]

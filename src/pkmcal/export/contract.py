@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pkmcal.calibration.source import MachineSource
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome import Finding
 from pkmcal.wording import listed
@@ -151,7 +151,7 @@ def exact(value: float) -> str:
 
 def commented(lines: Iterable[str], mark: str) -> str:
     """Lines behind a mark each, such as ``#`` or ``;``."""
-    return "".join(f"{mark} {line}".rstrip() + "\n" for line in lines)
+    return "".join(f"{mark} {legible(line)}".rstrip() + "\n" for line in lines)
 
 
 def largest(values: Any, expected: Any = 0.0) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import MachineSource
+from pkmcal.errors import legible
 
 
 def numbers_text(*values: float | Array) -> str:
@@ -19,8 +20,8 @@ def numbers_text(*values: float | Array) -> str:
 
 
 def comment_text(text: str) -> str:
-    """Text that may stand in an XML comment: printable, and no two hyphens in a row."""
-    text = "".join(c for c in text if c.isprintable())
+    """Text that may stand in an XML comment: legible, and no two hyphens in a row."""
+    text = legible(text)
     while "--" in text:
         text = text.replace("--", "- -")
     return f"{text} " if text.endswith("-") else text

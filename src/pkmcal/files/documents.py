@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 from pkmcal.files.regular import check_regular
 from pkmcal.files.writing import finish_replacement
 
@@ -320,10 +320,17 @@ class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
         return True
 
+    def write_double_quoted(self, text: str, split: bool = True) -> None:
+        """Escape all but ASCII where something in the text is not legible."""
+        allowed = self.allow_unicode
+        self.allow_unicode = allowed and legible(text, keep="\n\t") == text
+        super().write_double_quoted(text, split)
+        self.allow_unicode = allowed
+
 
 def _text_node(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    # PyYAML leaves these line breaks bare between single quotes, and reads them back as blanks.
-    style = '"' if any(mark in text for mark in "\x85\u2028\u2029") else None
+    # PyYAML leaves odd line breaks bare between single quotes, and reads them back as blanks.
+    style = None if legible(text, keep="\n\t") == text else '"'
     return dumper.represent_scalar(_TAG + "str", text, style=style)
 
 
@@ -479,7 +486,23 @@ def _text(value: Any, indent: str) -> str:
     return f"{opened}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{closed}"
 
 
-_line = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+_encoded = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+
+
+def _line(value: Any) -> str:
+    """JSON on one line. What is not legible is escaped; halves of characters, which no program
+    reads back, are spelt out.
+    """
+    text = _encoded(value)
+    if text.isprintable():
+        return text
+    return "".join(c if legible(c) == c else _escape(c) for c in text)
+
+
+def _escape(sign: str) -> str:
+    return json.dumps(legible(sign) if "\ud800" <= sign <= "\udfff" else sign)[1:-1]
+
+
 _NUMBERS = {int, float, bool, type(None)}
 
 

@@ -7,6 +7,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from pkmcal.errors import legible
 from pkmcal.files import json_value, remember, remembered
 from pkmcal.wording import count
 
@@ -56,23 +57,29 @@ def filled_template(template: str, **views: Any) -> Markup:
 def environment() -> jinja2.Environment:
     """Templates of this package, each compiled once a machine."""
     import jinja2
+    from markupsafe import Markup
 
     class Compiled(jinja2.BytecodeCache):
         """Templates' code between runs; Jinja checks that it is the template's."""
 
         def load_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
-            code = remembered(f"template-{bucket.key}")
+            code = remembered(f"legible-template-{bucket.key}")
             if code is not None:
                 bucket.bytecode_from_string(code)
 
         def dump_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
-            remember(f"template-{bucket.key}", bucket.bytecode_to_string())
+            remember(f"legible-template-{bucket.key}", bucket.bytecode_to_string())
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pkmcal.pages"),
         bytecode_cache=Compiled(),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=lambda value: (
+            legible(value, keep="\n\t")
+            if isinstance(value, str) and not isinstance(value, Markup)
+            else value
+        ),
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -85,7 +92,17 @@ def environment() -> jinja2.Environment:
 
 def _as_json(value: Any, **options: Any) -> str:
     """What a page's scripts read: browsers stop at NaN, and would then draw no plot at all."""
-    return json.dumps(json_value(value), allow_nan=False, **options)
+    return json.dumps(_legible_texts(json_value(value)), allow_nan=False, **options)
+
+
+def _legible_texts(value: Any) -> Any:
+    if isinstance(value, str):
+        return legible(value, keep="\n\t")
+    if isinstance(value, dict):
+        return {legible(key): _legible_texts(item) for key, item in value.items()}
+    if isinstance(value, list) and not {float, int}.issuperset(map(type, value)):
+        return [_legible_texts(item) for item in value]
+    return value
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.printers.printer import CARRIAGE_STEP, Printer, Touches
@@ -197,7 +197,7 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
     heads = [f"{motor} [mm]" for motor in printer.motors]
     return {
         "session.yaml": PROBED_SESSION_TEXT.format(
-            n=len(names), origin=touches.origin, to=to, **_resolution(printer)
+            n=len(names), origin=legible(touches.origin), to=to, **_resolution(printer)
         ),
         "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE_FIXED_TEXT,
         "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
@@ -219,7 +219,7 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
     ]
     return PRINTER_DRAWING_TEXT.format(
         name=printer.program.lower() + "-delta",
-        label=printer.label,
+        label=legible(printer.label),
         legs="\n".join(legs),
         home=_mm(top / 2),
     )
