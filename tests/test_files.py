@@ -126,7 +126,20 @@ def test_yaml_faults(tmp_path, content, parts):
 def test_a_bomb_of_aliases_is_refused(tmp_path):
     lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
-    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", "\n".join(lines)))
+    assert "aliases (*) repeat many" in fault(
+        read_yaml, written(tmp_path / "a.yaml", "\n".join(lines))
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f"a: [{'1,' * 200_001}]", "a: [" + ",".join(["x" * 1_000_000] * 11) + "]"],
+    ids=["values", "characters"],
+)
+def test_too_much_without_an_alias_is_not_blamed_on_aliases(tmp_path, text):
+    message = fault(read_yaml, written(tmp_path / "a.yaml", text))
+    assert "too many" in message
+    assert "alias" not in message
 
 
 def test_aliases_that_nest_ever_deeper_are_refused(tmp_path):
@@ -145,12 +158,14 @@ def test_a_bomb_of_merges_is_no_more_than_its_keys(tmp_path):
 def test_merges_that_repeat_much_are_refused(tmp_path):
     lines = ["d: &d {" + ", ".join(f"k{n}: {n}" for n in range(1000)) + "}"]
     lines += [f"e{n}: {{<<: *d}}" for n in range(300)]
-    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", "\n".join(lines)))
+    assert "aliases (*) repeat many" in fault(
+        read_yaml, written(tmp_path / "a.yaml", "\n".join(lines))
+    )
 
 
 def test_a_bomb_of_long_texts_is_refused(tmp_path):
     text = f"s: &s {'x' * 100_000}\nl: [{', '.join(['*s'] * 200)}]\n"
-    assert "far too often" in fault(read_yaml, written(tmp_path / "a.yaml", text))
+    assert "aliases (*) repeat many" in fault(read_yaml, written(tmp_path / "a.yaml", text))
 
 
 def test_json_that_cannot_be_written_again(tmp_path):

@@ -447,7 +447,7 @@ WRONG_PRINTERS = {
     changed(CFG, "arm_length: 270.0", "arm_length: long"): "arm_length is no number",
     changed(CFG, "delta_radius: 105.0", "delta_radius: 300"): "longer than the delta radius",
     changed(CFG, "angle: 330.0", "angle: 220"): "two towers stand in nearly one direction",
-    changed(CFG, "microsteps: 16", "microsteps: 0"): "a motor's step has no length",
+    changed(CFG, "height0_pos = ", "height0_pos = 1e8,1e8,1e8 #"): "far below the bed",
     changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not tell where",
     "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
@@ -467,11 +467,42 @@ def test_a_printers_file_that_tells_too_little(text, tmp_path):
     assert not (tmp_path / "kit").exists()
 
 
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e9", "0:1"])
+@pytest.mark.parametrize("name", [
+    "rotation_distance: 40", "microsteps: 16", "arm_length: 270.0", "delta_radius: 105.0",
+    "print_radius: 90", "full_steps_per_rotation: 200", "gear_ratio: 1:1", "gear_ratio: 2:1, 1:2",
+])  # fmt: skip
+def test_what_no_printer_has_is_refused_with_its_line(name, value, tmp_path):
+    """Of the first tower, whose values stand for all."""
+    key, _, right = name.partition(": ")
+    lines = [line for line in CFG.splitlines() if not line.startswith(key)]
+    section = "[printer]" if key in ("delta_radius", "print_radius") else "[stepper_a]"
+    at = lines.index(section) + 1
+    spoilt = [*lines[:at], f"{key}: {right.replace('1', value, 1) if ':' in right else value}"]
+    path = said(tmp_path, "\n".join([*spoilt, *lines[at:]]), "printer.cfg")
+    done = run("new", tmp_path / "kit", "--printer", path)
+    assert done.code == 2
+    assert f"printer.cfg, line {at + 1}, {section}" in " ".join(done.err.split())
+    assert "Warning" not in done.err
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "9999999"])
+@pytest.mark.parametrize("letter", ["L", "R", "H", "B"])
+def test_what_no_reprapfirmware_printer_has_is_refused_with_its_line(letter, value, tmp_path):
+    words = {"L": "270", "R": "105", "H": "300", "B": "90", letter: value}
+    text = "G28\nM665 " + " ".join(f"{k}{v}" for k, v in words.items()) + "\n"
+    done = run("new", tmp_path / "kit", "--printer", said(tmp_path, text, "config.g"), "--board")
+    assert done.code == 2
+    assert letter in done.err
+
+
 MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
     MAP + "-10,10\n0.1\n": "the height map does not tell its grid",
+    MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
+    MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",
     MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,high,0.2\n": "a height is no number",
     "G30 P0 X0 Y0 Z-99999\nG32 bed probe heights: 0.1 0.2, mean 0.1\n": "do not belong together",
 }

@@ -174,6 +174,16 @@ def test_mirrored_photographs(board):
     assert caught.value.where == "0000.png and 0001.png"
 
 
+def test_one_mirrored_photograph_is_named_alone(board):
+    found = detections(board, poses_around(3))
+    found[1] = replace(found[1], mirrored=True)
+    with pytest.raises(InputError) as caught:
+        seen(board, found)
+    assert caught.value.where == "0001.png"
+    assert "Flip this photograph alone" in str(caught.value)
+    assert "2 other photographs" in str(caught.value)
+
+
 def test_corners_that_are_not_this_boards(board):
     """The photographs' squares are half as long again one way."""
     stretched = replace(board, points=board.points * [1.5, 1.0, 1.0])

@@ -324,7 +324,14 @@ def warnings_of(calibration: CameraCalibration) -> list[str]:
             f"Only {len(c.views)} photographs: how far they agree says little; ten are better."
         )
     mirrored = [d.name for d in c.detections if d.mirrored]
-    if mirrored:
+    if mirrored and len(mirrored) < sum(d.found for d in c.detections):
+        one = len(mirrored) == 1
+        found.append(
+            f"{listed(mirrored)} {'is a mirror image' if one else 'are mirror images'} and the other"
+            f" photographs are not: flip {'this one' if one else 'these'} alone, or take"
+            f" {'it' if one else 'them'} again."
+        )
+    elif mirrored:
         found.append(
             f"{len(mirrored)} photographs are mirror images, such as {mirrored[0]}: flip all of"
             " this camera's photographs, for the calibration and for the machine, or the machine's"

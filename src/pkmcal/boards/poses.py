@@ -40,7 +40,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
-from pkmcal.wording import listed, ratio_in_per_cent
+from pkmcal.wording import count, listed, ratio_in_per_cent
 
 BOARD_RESIDUAL_LIMIT = 0.004
 """Share of the image's width that corners lie off their prediction, rms, from which the board file
@@ -198,6 +198,16 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
             expected="an odd and an even number of corners, or a board with markers (charuco)",
         )
     mirrored = [detection.name for detection in detections if detection.mirrored]
+    others = sum(detection.found and not detection.mirrored for detection in detections)
+    if mirrored and others:
+        one = len(mirrored) == 1
+        raise InputError(
+            "this photograph is a mirror image" if one else "these photographs are mirror images",
+            where=listed(mirrored, 3),
+            found=f"the board's markers reversed, and not in {count(others, 'other photograph')}",
+            next_step=f"Flip {'this photograph' if one else 'these photographs'} alone, or take"
+            f" {'it' if one else 'them'} again",
+        )
     if mirrored:
         raise InputError(
             "the photographs are mirror images",

@@ -357,6 +357,8 @@ class _Builder:
         self._merged: dict[int, _Pairs] = {}
         self._count = 0
         self._characters = 0
+        self._counted: set[int] = set()
+        self._aliases = False
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
         """Plain data of a node that stands at `keys`."""
@@ -416,12 +418,22 @@ class _Builder:
         return self._merged.setdefault(id(node), pairs)
 
     def _count_up(self, node: yaml.Node) -> None:
-        """Count a value, and refuse what an alias repeats too often."""
+        """Count a value, and refuse too many; an alias makes thousands of one."""
         self._count += 1
         self._characters += len(node.value) if isinstance(node, yaml.ScalarNode) else 0
-        often = self._count > MOST_VALUES or self._characters > MOST_CHARACTERS
-        if id(node) in self._open or often:
-            raise self._error(node, "an alias (*) repeats without end, or far too often")
+        self._aliases = self._aliases or id(node) in self._counted
+        self._counted.add(id(node))
+        if id(node) in self._open:
+            raise self._error(node, "an alias (*) repeats without end")
+        for number, most, what in (
+            (self._count, MOST_VALUES, "values"),
+            (self._characters, MOST_CHARACTERS, "characters"),
+        ):
+            if number > most:
+                repeated = ", of which aliases (*) repeat many" if self._aliases else ""
+                raise self._error(
+                    node, f"the file holds too many {what}, more than {most}{repeated}"
+                )
 
     def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
         kind = node.tag.removeprefix(_TAG)

@@ -294,7 +294,7 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     names = view.configuration
     if station.elsewhere:
         mirrored = partial(replace, view, tables=view.tables.mirrored())
-        yield Hypothesis(mirrored, _mirrored(station.name))
+        yield Hypothesis(mirrored, _mirrored(station))
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
@@ -374,10 +374,17 @@ def _misnamed(station: SeenStation, photographs: Integers, fitting: Integers) ->
     )
 
 
-def _mirrored(name: str) -> InputError:
+def _mirrored(station: SeenStation) -> InputError:
+    if len(station.files) == 1:
+        return InputError(
+            f"this photograph of {station.name} is mirrored",
+            where=station.files[0],
+            found="the machine is recognised with left and right exchanged",
+            next_step="Flip this photograph, or take it again without mirroring",
+        )
     return InputError(
-        f"the photographs of {name} are mirrored",
-        where=f"session.yaml, stations.{name}",
+        f"the photographs of {station.name} are mirrored",
+        where=f"session.yaml, stations.{station.name}",
         found="the machine is recognised with left and right exchanged",
         next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
         " the photographs and the camera's calibration alike",

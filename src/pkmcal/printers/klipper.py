@@ -10,7 +10,9 @@ _find_autosave_data). ``heightN_pos`` are steps of the three motors since their 
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Callable
 from configparser import ConfigParser
 from functools import partial
 from itertools import count, takewhile
@@ -59,10 +61,10 @@ def printer(text: str, label: str) -> Printer:
             found=shown(kinematics[0]),
             expected="kinematics: delta",
         )
-    radius = _number(found, label, "printer", "delta_radius")
+    radius = _positive(found, label, "printer", "delta_radius")
     each = {
-        name: [_of_tower(found, label, k, name) for k in range(3)]
-        for name in ("arm_length", "position_endstop")
+        name: [_of_tower(found, label, k, name, value) for k in range(3)]
+        for name, value in (("arm_length", _positive), ("position_endstop", _number))
     }
     each["angle"] = [
         _number(found, label, f"stepper_{s}", "angle", default)
@@ -89,7 +91,7 @@ def printer(text: str, label: str) -> Printer:
         angle=np.array(each["angle"]),
         rod=np.array(each["arm_length"]),
         homed=ends,
-        reach=_number(found, label, "printer", "print_radius", radius),
+        reach=_positive(found, label, "printer", "print_radius", radius),
         carriages=partial(klipper_carriage_heights, config),
         offset=_probe(found, label),
         touches=_touches(found, label, ends),
@@ -144,10 +146,10 @@ def sections(text: str, label: str) -> Sections:
     return out
 
 
-def _of_tower(found: Sections, label: str, k: int, name: str) -> float:
+def _of_tower(found: Sections, label: str, k: int, name: str, value: Callable[..., float]) -> float:
     """A tower's value; the second and the third have the first's unless they say otherwise."""
-    first = _number(found, label, "stepper_a", name)
-    return _number(found, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
+    first = value(found, label, "stepper_a", name)
+    return value(found, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
 
 
 def _number(
@@ -174,6 +176,22 @@ def _number(
             where=where,
             found=shown(text),
             expected="a number in mm, or degrees",
+        )
+    return value
+
+
+def _positive(
+    found: Sections, label: str, section: str, name: str, default: float | None = None
+) -> float:
+    """A value of a section that is above zero on every machine."""
+    value = _number(found, label, section, name, default)
+    if value <= 0:
+        text, where = found[section][name]
+        raise InputError(
+            f"{name} is no number that a printer can have",
+            where=where,
+            found=shown(text),
+            expected="a number above zero",
         )
     return value
 
@@ -209,25 +227,19 @@ def _step(found: Sections, label: str, section: str) -> float:
     """Mm of a carriage for a step of its motor."""
     own = {**found.get("stepper_a", {}), **found.get(section, {})}
     both = {section: own}
-    turn = _number(both, label, section, "rotation_distance")
-    micro = _number(both, label, section, "microsteps")
-    full = _number(both, label, section, "full_steps_per_rotation", FULL_STEPS)
+    turn = _positive(both, label, section, "rotation_distance")
+    micro = _positive(both, label, section, "microsteps")
+    full = _positive(both, label, section, "full_steps_per_rotation", FULL_STEPS)
     text, where = own.get("gear_ratio", ("1:1", ""))
     try:
         pairs = [[float(x) for x in part.split(":")] for part in text.split(",") if part.strip()]
-        gears = prod(a / b for a, b in pairs)
-    except (ValueError, ZeroDivisionError):
+    except ValueError:
+        pairs = [[math.nan]]
+    if any(len(p) != 2 or not all(0 < x <= LARGEST_PRINTER_VALUE for x in p) for p in pairs):
         raise InputError(
             "the gears cannot be read", where=where, found=shown(text), expected="such as 80:20"
-        ) from None
-    if not full * micro * gears > 0:
-        raise InputError(
-            "a motor's step has no length",
-            where=f"{label}, [{section}]",
-            found=f"{full:g} steps a turn, {micro:g} microsteps",
-            expected="positive numbers",
         )
-    return turn / (full * micro * gears)
+    return turn / (full * micro * prod(a / b for a, b in pairs))
 
 
 def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:

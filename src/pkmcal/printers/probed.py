@@ -95,20 +95,24 @@ def _map(text: str, label: str) -> Array:
     values = [word.strip() for word in (lines[1] if len(lines) > 1 else "").split(",")]
     known = dict(zip(names, values, strict=False))
 
-    def value(*called: str) -> float:
+    def value(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
         text = next((known[name] for name in called if name in known), "")
         try:
-            return float(text)
+            found = float(text)
         except ValueError:
+            found = np.nan
+        if not above < found <= LARGEST_PRINTER_VALUE:
             raise InputError(
                 "the height map does not tell its grid",
                 where=f"{label}, line 3",
                 found=", ".join(values) or "nothing",
-                expected=f"a number under {called[0]}",
-            ) from None
+                expected=f"a number{'' if above else ' above zero'} under {called[0]}",
+            )
+        return found
 
     x0, y0 = value("xmin", "min0"), value("ymin", "min1")
-    dx, dy = value("xspacing", "spacing0", "spacing"), value("yspacing", "spacing1", "spacing")
+    dx = value("xspacing", "spacing0", "spacing", above=0.0)
+    dy = value("yspacing", "spacing1", "spacing", above=0.0)
     out: list[tuple[float, float, float]] = []
     for row, line in enumerate(lines[2:]):
         for column, word in enumerate(line.split(",")):

@@ -32,11 +32,19 @@ def is_one(text: str) -> bool:
 
 def printer(text: str, label: str) -> Printer:
     """The printer of a file with M665 and M666; what stands later counts."""
-    words = _numbers(text, label)
+    words, places = _numbers(text, label)
     rod, radius, height, reach = (
         _words(words, label, "665" + letter, size)
         for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
     )
+    for name, values in (("665L", rod), ("665R", radius), ("665H", height), ("665B", reach)):
+        if values.min() <= 0:
+            raise InputError(
+                f"M665 {name[-1]} is no number that a printer can have",
+                where=places[name],
+                found=f"{values.min():g}",
+                expected="a number above zero",
+            )
     filled = dict(words)
     filled["665L"] = rod
     for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
@@ -58,16 +66,17 @@ def printer(text: str, label: str) -> Printer:
     )
 
 
-def _numbers(text: str, label: str) -> dict[str, Array]:
-    """Values by command and letter, of M665 and M666 alone."""
+def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
+    """Values by command and letter, of M665 and M666 alone, and where each stands."""
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
     words: dict[str, Array] = {}
+    places: dict[str, str] = {}
     for n, line in lines:
         try:
             found = read_words(line)
         except ValueError:
             found = {"": np.array([np.inf])}
-        if any(np.abs(values).max() > LARGEST_PRINTER_VALUE for values in found.values()):
+        if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in found.values()):
             raise InputError(
                 "a value of this line is no number that a printer can have",
                 where=f"{label}, line {n}",
@@ -75,7 +84,8 @@ def _numbers(text: str, label: str) -> dict[str, Array]:
                 expected="numbers in mm, or degrees",
             )
         words.update({name.upper(): values for name, values in found.items()})
-    return words
+        places.update({name.upper(): f"{label}, line {n}" for name in found})
+    return words, places
 
 
 def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:

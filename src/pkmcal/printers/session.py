@@ -187,6 +187,16 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
             found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
             expected=f"points that belong to the values in {printer.label}",
         )
+    # a rod that touches the bed has its upper end above it; a bed may hang, by less than a rod
+    below = -(touches.carriages / printer.rod).min(axis=0) - 1
+    if below.max() > 0:
+        motor = int(np.argmax(below))
+        raise InputError(
+            "a carriage would have been far below the bed when the bed was felt",
+            where=touches.origin,
+            found=f"{printer.motors[motor]} {-touches.carriages[:, motor].min():.4g} mm below it",
+            expected=f"points that belong to the values in {printer.label}",
+        )
     return touches
 
 
