@@ -327,7 +327,7 @@ def warnings_of(calibration: CameraCalibration) -> list[str]:
     if mirrored and len(mirrored) < sum(d.found for d in c.detections):
         one = len(mirrored) == 1
         found.append(
-            f"{listed(mirrored)} {'is a mirror image' if one else 'are mirror images'} and the other"
+            f"{listed(mirrored)} {'is a mirror image' if one else 'are mirror images'}, the other"
             f" photographs are not: flip {'this one' if one else 'these'} alone, or take"
             f" {'it' if one else 'them'} again."
         )
