@@ -194,7 +194,7 @@ def test_parameters_as_a_data_frame(result):
     ("missing", "ask", "said"),
     [
         ("pandas", lambda r: r.parameters.to_pandas(), "pip install pandas"),
-        ("matplotlib", lambda r: r.plot_tool(), r"pip install 'pkmcal\[plot\]'"),
+        ("matplotlib", lambda r: r.plot_tool(), r"pip install '\.\[plot\]'"),
     ],
 )
 def test_what_is_not_installed_is_told(loaded, monkeypatch, missing, ask, said):
