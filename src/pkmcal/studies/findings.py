@@ -182,15 +182,11 @@ class SweepResult:
         return Summary(float(np.sqrt(square)), float(error / max(np.sqrt(square), 1e-300)))
 
 
-RUNS_BY_DEFAULT = 100
-"""Simulated calibrations of each combination."""
-
-
 def study(
     subject: str,
     vary: Mapping[str, Value | Sequence[Value]] | Sequence[str] = (),
     *,
-    runs: int = RUNS_BY_DEFAULT,
+    runs: int = 100,
     seed: int = 0,
     out: Path | str | None = None,
     scheduler: str | None = None,
