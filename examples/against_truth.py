@@ -10,12 +10,19 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 import pkmcal
 from pkmcal.simulation import load_truth
+
+
+def cell(values: np.ndarray, unit: str, summary: Callable[[np.ndarray], float] = np.mean) -> str:
+    """The mean, or another summary, of the values that are finite; a dash where none is."""
+    finite = values[np.isfinite(values)]  # a machine has no pose at readings that it cannot take
+    return f"{summary(finite):.3f} {unit}" if finite.size else "–"
 
 
 def main() -> int:
@@ -31,14 +38,16 @@ def main() -> int:
     except pkmcal.errors.PkmcalError as error:
         print(error, file=sys.stderr)
         return 2
-    print("            joint centres  platform, mean  at most   turned")
+    print(f"{'':10}{'joint centres':>16}{'platform, mean':>16}{'at most':>16}{'turned':>16}")
     for name, machine in (("drawing", drawing), ("calibrated", result.machine)):
         off = pkmcal.compare(machine, truth.machine, truth.joints)
-        millimetres = 1e3 * np.array([off.centre.mean(), off.position.mean(), off.position.max()])
-        told = "  ".join(f"{v:10.3f} mm" for v in millimetres)
-        print(f"{name:10}{told}  {np.degrees(off.orientation.mean()):.4f}°")
-    stated = result.tool_error(truth.T_base_platform)
-    print(f"stated: platform to {1e3 * stated.position.mean():.3f} mm, one standard deviation")
+        position, turn = 1e3 * off.position, np.degrees(off.orientation)
+        cells = cell(1e3 * off.centre, "mm"), cell(position, "mm"), cell(position, "mm", np.max)
+        print(f"{name:10}" + "".join(f"{text:>16}" for text in (*cells, cell(turn, "°"))))
+        if missed := int(np.sum(np.isnan(position))):
+            print(f"{'':10}without a pose at {missed} of {len(position)} readings")
+    stated = result.tool_error(truth.T_base_platform).position
+    print(f"stated: platform to {cell(1e3 * stated, 'mm')}, one standard deviation")
     return 0
 
 

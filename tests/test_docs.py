@@ -12,6 +12,7 @@ import pytest
 from conftest import run
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
+from pkmcal.commands.cli import COMMANDS_IN_ORDER, app
 from pkmcal.files import parse_yaml, read_json, validated_document
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.session.schema import SessionDocument
@@ -224,3 +225,17 @@ def test_keys_of_a_truth_are_explained(demo):
     for group in ("stations", "configurations"):
         keys |= set(next(iter(document[group].values())))
     assert keys <= quoted(text_of("docs/files.md"))
+
+
+def test_options_that_commands_share_are_theirs():
+    """What docs/commands.md says of all commands, or of some: which have --json, and --quiet."""
+    from typer.main import get_command
+
+    group = get_command(app)
+    options = {
+        name: {word for one in group.get_command(None, name).params for word in one.opts}
+        for name in COMMANDS_IN_ORDER
+    }
+    assert [name for name in options if "--json" not in options[name]] == []
+    quiet = [name for name in options if "--quiet" in options[name]]
+    assert re.findall(r"`--quiet` of `(\w+)`", text_of("docs/commands.md")) == quiet

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from pkmcal.session.load import load_session
 from pkmcal.simulation.demo import camera_of_size
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -56,9 +58,22 @@ def test_a_calibration_is_held_beside_its_truth(demo):
         assert float(rows[name][1]) == pytest.approx(1e3 * told[name]["centre"], abs=6e-4)
         assert float(rows[name][3]) == pytest.approx(1e3 * told[name]["position"], abs=6e-4)
     assert float(rows["calibrated"][3]) < 0.25 * float(rows["drawing"][3])
+    assert "without a pose" not in done.stdout
     done = run_example("against_truth.py", demo.calibration, demo.calibration)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
+
+
+def test_a_drawing_that_cannot_take_the_readings_has_no_figures(demo, tmp_path):
+    """Of the machine's pose; NaN is for programs."""
+    session = shutil.copytree(demo.session, tmp_path / "session")
+    path = session / "mechanism.yaml"
+    path.write_text(path.read_text().replace("[0.2693, 0.02,", "[0.9, 0.02,"))
+    done = run_example("against_truth.py", session, demo.calibration)
+    assert done.returncode == 0, done.stderr
+    assert "nan" not in done.stdout
+    count = len(load_session(session).configurations)
+    assert f"without a pose at {count} of {count} readings" in done.stdout
 
 
 def test_numbered_pictures_stand_in_for_a_camera(demo):

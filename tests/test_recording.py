@@ -16,7 +16,7 @@ from pkmcal.observe.images import decode
 from pkmcal.report import rrd
 from pkmcal.report.recording import RECORDED_GREY, VIEWER_PIXEL_CORNER, recorded
 
-LOUD = "NO RERUN: recordings were not written and read by it (pip install 'pkmcal[rerun]')"
+LOUD = "NO RERUN: recordings were not written and read by it (pip install '.[rerun]')"
 NEAR, MIDDLE = 1.0, 0.15
 """px, of any edge and of the middle one: shading moves single edges by half a pixel, most by less
 than 0.1. A picture's corner taken for a pixel's centre moves all of them by 0.35 and more."""
@@ -180,7 +180,7 @@ def test_without_rerun_it_is_said_before_the_work(session, tmp_path, monkeypatch
     done = run("calibrate", session, "--rrd", tmp_path / "a.rrd", "-o", tmp_path / "out")
     assert done.code == 2
     assert "recordings need rerun, which is not installed" in done.err
-    assert "pip install 'pkmcal[rerun]'" in done.err
+    assert "pip install '.[rerun]'" in done.err
     assert not (tmp_path / "out").exists()
 
 

@@ -81,6 +81,18 @@ def test_the_page_of_python_has_every_public_name(site):
     assert "Read a camera file of pkmcal, OpenCV, ROS or Kalibr" in text
 
 
+def test_docstrings_are_typeset(site):
+    """Sections of numpydoc become lists, and no role of Sphinx is printed as it is written."""
+    text = (site / "api.html").read_text("utf-8")
+    shown = re.sub(r"<[^>]+>", "", text)
+    assert not re.search(r":(class|data|func|meth|mod):", shown)
+    assert not re.search(r"^-{4,}$", shown, re.MULTILINE)
+    for name in ("calibrate", "load_session", "load_mechanism", "load_camera", "plan", "study"):
+        own = shown[shown.index(f"{name}(\n") :]
+        assert re.match(r".*?\bParameters:", own, re.DOTALL), name
+        assert own.index("Parameters:") < 2000, name
+
+
 def test_every_page_stands_in_the_menu_once():
     pages = re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[2])
     there = [path.name for path in (ROOT / "docs").glob("*.md")]

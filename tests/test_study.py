@@ -427,7 +427,7 @@ def test_parquet(tmp_path, one_process, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     done = run(*words)
     assert done.code == 2
-    assert "pip install 'pkmcal[parquet]'" in done.err
+    assert "pip install '.[parquet]'" in done.err
     monkeypatch.undo()
     parquet = pytest.importorskip("pyarrow.parquet")
     assert run(*words).code == 0

@@ -223,7 +223,7 @@ def test_a_folder_where_nothing_was_finished_is_free(tmp_path, one_process):
 
 def test_a_cluster_without_dask_is_told(monkeypatch):
     monkeypatch.setattr(cluster, "find_spec", lambda _name: None)
-    with pytest.raises(InputError, match=r"dask.distributed.*pip install 'pkmcal\[cluster\]'"):
+    with pytest.raises(InputError, match=r"dask.distributed.*pip install '\.\[cluster\]'"):
         study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
 
 

@@ -37,6 +37,10 @@ FENCE = re.compile(r"^```(\w+) [\w ]+$", re.MULTILINE)
 """Of code that the tests run; Python's Markdown takes one word only."""
 
 
+ROLE = re.compile(r":(?:class|data|func|meth|mod):<code>~?(?:pkmcal\.(?:\w+\.)+(?=[A-Z]))?")
+"""Of a docstring, which Markdown leaves before the name."""
+
+
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links that lead out of the pages' folder, and fences of two words."""
     del page
@@ -45,6 +49,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Heads of tables that are empty are no heads to a screen reader, as in the program's pages."""
+    """Docstrings' roles (``:func:`name```) as code alone; and heads of tables that are empty are no
+    heads to a screen reader, as in the program's pages.
+    """
     del page
+    html = ROLE.sub(r"<code>\1", html)
     return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)

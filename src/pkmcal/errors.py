@@ -25,10 +25,17 @@ LONGEST_FOUND = 500
 class PkmcalError(Exception):
     """Base of the family; raise one of its subclasses.
 
-    what : the sentence's core, for example "the camera file does not exist".
-    where : file, line or field, for example "session.yaml, line 12, stations.front.camera".
-    found, expected : what was there, and what should have been.
-    next_step : what the reader can do about it, a sentence.
+    Attributes
+    ----------
+    what :
+        The sentence's core, for example "the camera file does not exist".
+    where :
+        File, line or field, for example "session.yaml, line 12, stations.front.camera".
+    found, expected :
+        What was there, and what should have been.
+    next_step :
+        What the reader can do about it, a sentence.
+
     """
 
     exit_code: ClassVar[int] = 1

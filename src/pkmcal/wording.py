@@ -14,6 +14,11 @@ LARGEST_DECIMALS = 6
 LEG_PARAMETER_NAME = re.compile(r"legs\[(\d+)\]\.(.+)")
 
 
+def install_step(extra: str) -> str:
+    """How to install what an extra of pyproject.toml names; no registry has a release of pkmcal."""
+    return f"In a copy of pkmcal's sources: pip install '.[{extra}]'"
+
+
 def decimals(sigma: float) -> int:
     """Decimals that show ``sigma`` with two significant digits; 3 where it has none."""
     if not math.isfinite(sigma) or sigma <= 0:

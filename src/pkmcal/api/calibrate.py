@@ -36,7 +36,7 @@ class CalibrationResult(Calibration):
         """Write a recording, NAME.rrd, of photographs, edges, poses and the result, which rerun's
         viewer plays (``rerun NAME.rrd``).
 
-        Needs ``pip install 'pkmcal[rerun]'``. Raises InputError without it, or where the file
+        Needs ``pip install '.[rerun]'``. Raises InputError without it, or where the file
         cannot be written or a photograph not be read any more.
         """
         write_rrd(self, path)
@@ -98,10 +98,23 @@ def calibrate(
 
 
 def load_result(source: Path | str) -> SavedCalibration:
-    """Read a calibration back that ``pkmcal calibrate``, or ``result.save``, has written.
+    """Read a calibration that ``pkmcal calibrate``, or ``result.save``, has written.
 
-    source : its folder, or the calibration.json in it. Shows itself as the result of
-    :func:`pkmcal.calibrate` does: ``summary()``, ``parameters``, ``machine``, ``tool_error(poses)``
-    and the plots. Raises InputError where it is none, or was changed by hand.
+    Parameters
+    ----------
+    source :
+        Its folder, or the calibration.json in it.
+
+    Returns
+    -------
+    SavedCalibration
+        ``summary()``, ``parameters``, ``machine``, ``tool_error(poses)`` and the plots, as of
+        :func:`pkmcal.calibrate`.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        The file is missing, is no calibration, or was changed by hand.
+
     """
     return load(source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,12 +12,21 @@ from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.region import Region
-from pkmcal.planning.plan import CONFIGURATIONS_A_CAPTURE, MeasurementPlan
+from pkmcal.planning.defaults import (
+    CONFIGURATIONS_A_CAPTURE,
+    NOMINAL_CORNER_SIGMA,
+    NOMINAL_EDGE_SIGMA,
+    PLACES_AROUND_A_MACHINE,
+    PLANNED_IMAGE_SIZE,
+    UNTOLD_READING_NOISE,
+)
+from pkmcal.planning.plan import MeasurementPlan
 from pkmcal.planning.plan import plan_measurements as run
 from pkmcal.planning.subject import as_it_stands, of_machine
 from pkmcal.session.load import Session, load_session, session_folder
-from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation import board_for
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 
 
 def plan(
@@ -25,32 +34,59 @@ def plan(
     *,
     count: int = CONFIGURATIONS_A_CAPTURE,
     index: Literal["tool", "D", "E", "O1"] = "tool",
-    after: SavedCalibration | Path | str | None = None,
     places: int | None = None,
+    best_of: int | None = None,
+    after: SavedCalibration | Path | str | None = None,
+    from_drawing: bool = False,
+    same_place: bool = False,
+    together: bool | None = None,
     camera: Camera | Path | str | None = None,
+    board: bool = False,
+    tracker: tuple[float, float | None] | None = None,
+    edge_noise: float = NOMINAL_EDGE_SIGMA,
+    corner_noise: float = NOMINAL_CORNER_SIGMA,
+    joint_noise: float = UNTOLD_READING_NOISE,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> MeasurementPlan:
-    """Choose the configurations that tell most of a machine; nothing is written.
+    """Choose the configurations that determine a machine best; nothing is written.
 
     Parameters
     ----------
     subject :
         A session, loaded or its folder, as far as it was measured already; or a machine, a
-        built-in one's name or a mechanism file, for a camera that somebody thinks of.
+        built-in one's name or a mechanism file, with an assumed camera.
     count :
         Configurations from each place.
     index :
-        What is to be small: the tool's variance, or the indices D, E and O1.
-    after :
-        What is known already: a calibrated machine. Of a session with a usable calibration in its
-        folder that one unless given.
+        What is minimised: the tool's variance, or the indices D, E and O1.
     places :
-        Places of the camera to choose as well; of a machine 3 unless given.
+        Number of camera places to choose as well, on a sphere about the machine.
+    best_of :
+        Of a session: number of its stations to choose.
+    after :
+        Of a session: the calibration to continue from; the usable one in its folder unless given.
+    from_drawing :
+        Of a session: ignore the calibration in its folder.
+    same_place :
+        Of a session: the cameras stand as they stood in the calibration.
+    together :
+        Whether all stations measure each configuration, or each its own; by default together where
+        there are several cameras, or a tracker.
     camera :
-        Of a machine: its camera or its file; a small industrial one unless given.
+        Of a machine: its camera or its file; a small industrial one of 1280 x 960 unless given. It
+        stands in three places, or one where a board, a panorama or ``places`` needs no more.
+    board :
+        Of a machine: a board on its platform is seen, not its legs.
+    tracker :
+        Of a machine: a tracker instead of a camera; standard deviations of its positions (m) and of
+        its turns (rad; None where it measures points).
+    edge_noise, corner_noise :
+        Standard deviations of edges and of a board's corners where no image tells them, px.
+    joint_noise :
+        Of a machine: standard deviation of a reading, m or rad.
     seed :
-        Of what is drawn.
+        Seed for all random numbers.
     progress :
         Called with the share that is done, 0 to 1.
 
@@ -66,31 +102,56 @@ def plan(
         What cannot be planned.
 
     """
+    folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
+    planned = {
+        "count": count, "index": index, "together": together, "free_places": places,
+        "best_of": best_of, "seed": seed, "told": progress,
+    }  # fmt: skip
     with threadpool_limits(1, "blas"):
-        region: Region | None = None
-        folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
-        if isinstance(subject, Session) or folder is not None:
-            if camera is not None:
-                raise InputError(
-                    "a session has cameras of its own", where="camera", next_step="Leave it out"
-                )
+        if folder is not None or isinstance(subject, Session):
+            _check_options(
+                "a machine", {"--camera": camera, "--board": board, "--tracker": tracker}
+            )
             session = subject if isinstance(subject, Session) else None
             session = session or load_session(folder or "", measured=False)
-            wanted = as_it_stands(session, after, anywhere=places is not None, seed=seed)
-            region = session.workspace
-            free = places
+            source = as_it_stands(
+                session, after, from_drawing=from_drawing, same_place=same_place,
+                anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
+            )  # fmt: skip
+            return run(source, region=session.workspace, **planned)
+        _check_options(
+            "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
+        )
+        machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
+        if camera is None:
+            eye = camera_of_size(PLANNED_IMAGE_SIZE)
         else:
-            if after is not None:
-                raise InputError(
-                    "what is known already is known of a session's machine",
-                    where="after",
-                    next_step="Name the session, or leave it out",
-                )
-            machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
-            eye = camera if isinstance(camera, Camera) else None
-            eye = eye or (load_camera(camera) if isinstance(camera, Path | str) else demo_camera())
-            wanted, free = of_machine(machine, [eye], machine.joint_names, seed=seed), places or 3
-        return run(
-            wanted, count=count, index=index, region=region, free_places=free, seed=seed,
-            told=progress,
-        )  # fmt: skip
+            eye = camera if isinstance(camera, Camera) else load_camera(camera)
+        # what cannot be planned is the machine's or the camera's fault, by the name it was given
+        name = machine.name if isinstance(subject, Machine) else str(subject)
+        try:
+            one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
+            source = of_machine(
+                machine,
+                [eye] * (1 if one else PLACES_AROUND_A_MACHINE),
+                machine.joint_names,
+                board=board_for(machine, "platform") if board else None,
+                tracker=tracker,
+                joint_noise=joint_noise,
+                edge=edge_noise,
+                corner=corner_noise,
+                seed=seed,
+            )
+        except InputError as error:
+            raise error.located(name) from None
+        try:
+            return run(source, **planned)
+        except InputError as error:
+            raise error.located(str(camera) if isinstance(camera, Path | str) else name) from None
+
+
+def _check_options(owner: str, given: Mapping[str, object]) -> None:
+    """Raise `InputError` for options that mean nothing for this subject."""
+    for name, value in given.items():
+        if value:
+            raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")

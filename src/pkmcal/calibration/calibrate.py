@@ -159,6 +159,10 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = _Clock(progress)
         session = _load(session, refine_camera, clock)
+        if holdout:
+            from pkmcal.calibration.aside import check_predictable
+
+            check_predictable(session, "--holdout")
         seen = _observe(session, seed, clock)
         turns, richer = _identify(seen, refine_camera, seed, clock)
         turned = upside_down(seen.session, turns)

@@ -1,4 +1,4 @@
-"""Plots of a calibration with matplotlib, which is an extra: ``pip install 'pkmcal[plot]'``."""
+"""Plots of a calibration with matplotlib, which is an extra: ``pip install '.[plot]'``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.identify.found import FoundParameters
 from pkmcal.identify.tool import ToolError
+from pkmcal.wording import install_step
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +30,7 @@ def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
         from matplotlib import pyplot
     except ImportError:
         raise InputError(
-            "plots need matplotlib", next_step="Install it with: pip install 'pkmcal[plot]'"
+            "plots need matplotlib", next_step=install_step("plot")
         ) from None
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 

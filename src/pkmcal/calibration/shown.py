@@ -158,7 +158,7 @@ class ShownCalibration(ABC):
     def plot_residuals(self, ax: Axes | None = None) -> Axes:
         """Residuals of all edges and poses in standard deviations, against what noise alone makes.
 
-        ax : axes to draw into; new ones unless given. Needs ``pip install 'pkmcal[plot]'``.
+        ax : axes to draw into; new ones unless given. Needs ``pip install '.[plot]'``.
         """
         from pkmcal.calibration.plots import draw_residuals
 

@@ -27,10 +27,21 @@ from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
-    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; which one is told by its content.
+    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected by content.
 
-    path : of one of several cameras in a Kalibr file with its name, ``camchain.yaml#cam1``. label :
-    the file's name in messages. Every fault is an InputError with its line.
+    Parameters
+    ----------
+    path :
+        The file; one of several cameras in a Kalibr file is named behind it,
+        ``camchain.yaml#cam1``.
+    label :
+        The file's name in messages.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        Any fault of the file, with its line.
+
     """
     path, camera = camera_path(path)
     label = label.removesuffix(f"#{camera}") if label else path.name

@@ -20,9 +20,9 @@ from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
+from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
 from pkmcal.planning.information import tool_by_free
-from pkmcal.planning.plan import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, draw_configurations, view_angle
 

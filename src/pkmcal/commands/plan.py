@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +10,13 @@ import typer
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 from pkmcal.errors import InputError
+from pkmcal.planning.defaults import (
+    CONFIGURATIONS_A_CAPTURE,
+    NOMINAL_CORNER_SIGMA,
+    NOMINAL_EDGE_SIGMA,
+    PLANNED_IMAGE_SIZE,
+    UNTOLD_READING_NOISE,
+)
 
 PLAN_FILES = {
     "plan.html": PAGE_DESCRIPTION,
@@ -31,7 +37,7 @@ def plan(
     configurations: Annotated[
         int,
         typer.Option("-n", "--configurations", metavar="N", help="Configurations from each place."),
-    ] = 15,
+    ] = CONFIGURATIONS_A_CAPTURE,
     index: Annotated[
         Literal["tool", "D", "E", "O1"],
         typer.Option(help="What is to be small: the tool's variance, or D, E, O1."),
@@ -65,7 +71,7 @@ def plan(
     ] = None,
     size: Annotated[
         str, typer.Option(metavar="WxH", help="Of a MACHINE: pixels, without a camera file.")
-    ] = "1280x960",
+    ] = "{}x{}".format(*PLANNED_IMAGE_SIZE),
     board: Annotated[
         bool, typer.Option("--board", help="Of a MACHINE: a board on its platform is seen.")
     ] = False,
@@ -77,30 +83,23 @@ def plan(
     ] = None,
     edge_noise: Annotated[
         float, typer.Option(metavar="PX", help="Of an edge, where no photograph tells.")
-    ] = 0.1,
+    ] = NOMINAL_EDGE_SIGMA,
     corner_noise: Annotated[
         float, typer.Option(metavar="PX", help="Of a board's corner, where no photograph tells.")
-    ] = 0.05,
+    ] = NOMINAL_CORNER_SIGMA,
     joint_noise: Annotated[
         float, typer.Option(metavar="M", help="Of a MACHINE: noise of a reading, m or rad.")
-    ] = 3e-6,
+    ] = UNTOLD_READING_NOISE,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
     """The next configurations worth measuring."""
-    from threadpoolctl import threadpool_limits
-
-    from pkmcal.cameras import load_camera
+    from pkmcal.api.plan import plan as run
     from pkmcal.commands.simulate import parsed_size
     from pkmcal.files import check_own_folder
-    from pkmcal.mechanisms import load_mechanism
-    from pkmcal.planning.plan import plan_measurements as run
-    from pkmcal.planning.subject import as_it_stands, of_machine
     from pkmcal.report.plan import outcome_of
-    from pkmcal.session.load import load_session, session_folder
-    from pkmcal.simulation import board_for
+    from pkmcal.session.load import session_folder
     from pkmcal.simulation.demo import camera_of_size
-    from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 
     console.check_positive("--edge-noise", edge_noise, 100)
     console.check_positive("--corner-noise", corner_noise, 100)
@@ -111,68 +110,29 @@ def plan(
     over = check_own_folder(
         folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"
     )
-    with console.progress(as_json) as told, threadpool_limits(1, "blas"):
+    sized = None if session is not None or camera else camera_of_size(parsed_size(size))
+    with console.progress(as_json) as told:
         told("Looking at what there is", 0.0)
-        region = None
-        if session is not None:
-            _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
-            measured = load_session(session, measured=False)
-            region = measured.workspace
-            source = as_it_stands(
-                measured,
-                after,
-                from_drawing=from_drawing,
-                same_place=same_place,
-                anywhere=places is not None,
-                edge=edge_noise,
-                corner=corner_noise,
-                seed=seed,
-            )
-        else:
-            given = {"--after": after, "--same-place": same_place, "--best-of": best_of}
-            _only_of("a session", given)
-            machine = load_mechanism(subject, label=None)
-            eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-            number = 1 if board or places or view_angle(eye) > PANORAMIC_HALF_VIEW else 3
-            noise = None if tracker is None else _tracker(tracker)
-            try:
-                source = of_machine(
-                    machine,
-                    [eye] * number,
-                    machine.joint_names,
-                    board=board_for(machine, "platform") if board else None,
-                    tracker=noise,
-                    joint_noise=joint_noise,
-                    edge=edge_noise,
-                    corner=corner_noise,
-                    seed=seed,
-                )
-            except InputError as error:
-                raise error.located(subject) from None
-        try:
-            found = run(
-                source,
-                count=configurations,
-                index=index,
-                region=region,
-                together=together,
-                free_places=places,
-                best_of=best_of,
-                seed=seed,
-                told=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
-            )
-        except InputError as error:
-            if session is not None:
-                raise
-            raise error.located(str(camera or subject)) from None
+        found = run(
+            subject,
+            count=configurations,
+            index=index,
+            places=places,
+            best_of=best_of,
+            after=after,
+            from_drawing=from_drawing,
+            same_place=same_place,
+            together=together,
+            camera=camera or sized,
+            board=board,
+            tracker=None if tracker is None else _tracker(tracker),
+            edge_noise=edge_noise,
+            corner_noise=corner_noise,
+            joint_noise=joint_noise,
+            seed=seed,
+            progress=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
+        )
     return finish(outcome_of(found), folder, files, over=over, as_json=as_json)
-
-
-def _only_of(owner: str, given: Mapping[str, object]) -> None:
-    """Raise `InputError` for options that mean nothing here."""
-    for name, value in given.items():
-        if value:
-            raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

@@ -47,12 +47,13 @@ def study(
     from pkmcal.studies.findings import study as simulated
     from pkmcal.studies.store import BATCHES_FOLDER
     from pkmcal.studies.study_report import outcome_of
+    from pkmcal.wording import install_step
 
     if table == "parquet" and find_spec("pyarrow") is None:
         raise InputError(
             "a Parquet table needs pyarrow, which is not installed",
             where="--table",
-            next_step="Install it with: pip install 'pkmcal[parquet]', or leave the option out",
+            next_step=f"{install_step('parquet')}; or leave the option out",
         )
     name = f"study.{table}"
     files = {

@@ -17,7 +17,7 @@ def watch(
     calibration: console.CalibrationFolder,
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", help="New photographs with readings, a few are enough."),
+        typer.Argument(metavar="SESSION", help="New photographs with readings: five from one place."),
     ],
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
     alpha: Annotated[float, typer.Option(metavar="P", help="Share of false alarms.")] = 0.01,

@@ -47,11 +47,23 @@ class MachineErrors:
 def compare(
     machine: Machine, known: Machine, joints: Array, *, legs_seen: bool = True
 ) -> MachineErrors:
-    """How far a machine is from a known one of the same drawing, at readings (n, m).
+    """Errors of a machine against a known one of the same drawing.
 
-    legs_seen : False where a board or a tracker told of the machine and no legs: these leave open
-    where the joints are, and frames are laid over each other by the poses besides.
-    Raises InputError where the two are not of one drawing.
+    Parameters
+    ----------
+    machine, known :
+        The machine, and the one that is known.
+    joints :
+        Readings (n, m), m or rad, at which platform poses are compared.
+    legs_seen :
+        False where a board or a tracker observed the platform and no legs were seen: the joints'
+        places are then unidentifiable, and frames are aligned by the poses besides.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        The two are not of one drawing.
+
     """
     if machine.parameters.names != known.parameters.names:
         raise InputError(

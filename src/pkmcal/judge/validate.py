@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
+from pkmcal.calibration.aside import check_predictable
 from pkmcal.calibration.calibrate import CalibrationProgress
 from pkmcal.calibration.same_machine import read_same_machine
 from pkmcal.calibration.saved import SavedCalibration
@@ -102,6 +103,7 @@ def validate_calibration(
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
+        check_predictable(session, str(session.folder))
         lines, known = paths_of(session), known_rows(saved, session)
         if not regions:
             check_new(known, _photographed(session), *NOT_INDEPENDENT)

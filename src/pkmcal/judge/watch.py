@@ -41,7 +41,7 @@ LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "photographs, or poses, that were taken after the calibration",
-    "Take three to five new photographs with their readings",
+    "Take five or more new photographs from one place, with their readings",
 )
 
 

@@ -48,9 +48,20 @@ def load_mechanism(
 ) -> Machine:
     """Read a mechanism file, or a built-in machine by its name.
 
-    model : one of those that the file names; what it fixes and ties then holds instead of the
-    file's own.
-    Raises InputError with file, line and field for anything that the schema does not allow.
+    Parameters
+    ----------
+    source :
+        A built-in machine's name, or a mechanism file.
+    label :
+        The file's name in messages.
+    model :
+        One of the models that the file names; its ``fixed`` and ``tied`` replace the file's own.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        Anything that the schema does not allow, with file, line and field.
+
     """
     built_in = catalogue()
     path = built_in.get(str(source), Path(source))

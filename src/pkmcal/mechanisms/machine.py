@@ -62,10 +62,17 @@ class _Row(NamedTuple):
 class Machine:
     """A parallel machine with parameter values.
 
-    document : the mechanism file it was read from.
-    parameters : names, drawing values, tolerances, roles.
-    values : (P,) present values, in the table's order.
-    model : the name of the file's model whose ``fixed`` and ``tied`` hold, None for the file's own.
+    Attributes
+    ----------
+    document :
+        The mechanism file it was read from.
+    parameters :
+        Names, drawing values, tolerances, roles.
+    values :
+        Present values (P,), in the table's order.
+    model :
+        The name of the file's model whose ``fixed`` and ``tied`` hold, None for the file's own.
+
     """
 
     document: MechanismDocument

@@ -25,6 +25,7 @@ from pkmcal.planning.candidates import (
     configurations,
     neighbours,
 )
+from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.exchange import PLAN_INDICES, ToldShare, exchanged, greedy
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
@@ -32,8 +33,6 @@ from pkmcal.planning.route import length, motor_distances, shortest_way
 from pkmcal.planning.subject import Subject
 from pkmcal.simulation.placement import StationPlace, usable
 
-CONFIGURATIONS_A_CAPTURE = 15
-"""Configurations from each place, unless told."""
 PLAN_CANDIDATES = 400
 """Configurations among which is chosen."""
 CANDIDATES_FOR_EACH_WANTED = 4

@@ -31,14 +31,10 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
+from pkmcal.planning.defaults import NOMINAL_CORNER_SIGMA, NOMINAL_EDGE_SIGMA
 from pkmcal.planning.first import EXACT_EDGE_NOISE, FIRST_EDGES_SEED, EdgePool, Pools, drawn_edges
-from pkmcal.simulation.edges import EdgeNoise, hidden, pixel_angle, simulate_edges
+from pkmcal.simulation.edges import hidden, pixel_angle, simulate_edges
 
-NOMINAL_EDGE_SIGMA = EdgeNoise().shift
-"""px; how far an edge is off across, and its ends when it turns, before any photograph was looked
-at: what shading leaves on painted legs and bare rods. Polished ones are worse."""
-NOMINAL_CORNER_SIGMA = 0.05
-"""px; the same of a board's corner."""
 FLATTEST_BOARD_COSINE = np.cos(np.deg2rad(70))
 """Cosine of the angle between a board's normal and the line of sight below which it is not read."""
 

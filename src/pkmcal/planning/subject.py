@@ -30,10 +30,13 @@ from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
-from pkmcal.planning.first import Pools, first_edges, spread_over
-from pkmcal.planning.rig import (
+from pkmcal.planning.defaults import (
     NOMINAL_CORNER_SIGMA,
     NOMINAL_EDGE_SIGMA,
+    UNTOLD_READING_NOISE,
+)
+from pkmcal.planning.first import Pools, first_edges, spread_over
+from pkmcal.planning.rig import (
     BoardFrom,
     Instrument,
     LegsFrom,
@@ -49,8 +52,6 @@ from pkmcal.wording import brief, listed
 PLAN_PHOTOGRAPHS_A_STATION = 12
 """Of a station, whose edges are measured, and twice as many of all together: a plan is made once,
 and a few edges tell shading badly."""
-UNTOLD_READING_NOISE = 3e-6
-"""m or rad; noise of a reading where nobody tells: of a good encoder."""
 BOARD_MOUNT_NAME = "board"
 LAST_CALIBRATION_FOLDER = "calibration"
 """Where calibrate writes, inside a session."""

@@ -1,4 +1,4 @@
-"""A calibration for rerun's viewer, which is an extra: ``pip install 'pkmcal[rerun]'``.
+"""A calibration for rerun's viewer, which is an extra: ``pip install '.[rerun]'``.
 
 The SDK is imported only here, when somebody asks for a recording.
 """
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pkmcal.errors import InputError
 from pkmcal.files import check_writable, staged_file
 from pkmcal.report.recording import Logged, recorded
+from pkmcal.wording import install_step
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -38,7 +39,7 @@ def check_rrd(path: Path | str) -> None:
         raise InputError(
             "recordings need rerun, which is not installed",
             where="--rrd",
-            next_step="Install it with: pip install 'pkmcal[rerun]'",
+            next_step=install_step("rerun"),
         )
 
 

@@ -176,10 +176,23 @@ def session_folder(subject: str) -> Path | None:
 
 
 def load_session(folder: Path | str, model: str | None = None, *, measured: bool = True) -> Session:
-    """Read and check the session in `folder` (session.yaml itself may be named instead).
+    """Read and check a session.
 
-    model : one of the models that the mechanism file names. measured : whether there have to be
-    photographs, or poses, of two configurations at least; a plan is made before.
+    Parameters
+    ----------
+    folder :
+        The session's folder; its session.yaml may be named instead.
+    model :
+        One of the models that the mechanism file names.
+    measured :
+        Whether images, or poses, of at least two configurations are required; a plan is made
+        before there are any.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        A file is missing or wrong; the error names file, line and field.
+
     """
     folder, document = _read(Path(folder))
     schema = validated_document(document, SessionDocument)

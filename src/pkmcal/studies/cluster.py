@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.studies.tasks import Finished, Job, Runner, SolvedBatch, work
+from pkmcal.wording import install_step
 
 SCHEDULER_TIMEOUT = 20
 """Seconds for a scheduler to answer, and for its first worker to be there."""
@@ -52,7 +53,7 @@ def on_cluster(address: str) -> Runner:
         raise InputError(
             "a study on a cluster needs dask.distributed, which is not installed",
             where="--scheduler",
-            next_step="Install it with: pip install 'pkmcal[cluster]'",
+            next_step=install_step("cluster"),
         )
     if not _is_address(address):  # which Dask's client only tells after it has begun, and late
         raise InputError(

@@ -192,15 +192,35 @@ def study(
     scheduler: str | None = None,
     progress: StudyProgress | None = None,
 ) -> SweepResult:
-    """How accurate calibrations would be, by simulation; the same as the command.
+    """Accuracy of simulated calibrations; what ``pkmcal study`` computes.
 
-    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary : a
-    value or several by name, or texts ``NAME=V1,V2``; every combination is tried. runs : simulated
-    calibrations of each. out : a folder in which finished batches are kept, and from which a study
-    goes on. scheduler : the address of a Dask cluster. progress : called with what is done and the
-    share of it.
-    Raises InputError for what cannot be studied, where ``out`` holds another study, and while
-    another process works there.
+    Parameters
+    ----------
+    subject :
+        A session's folder, a mechanism file, a built-in machine, or ``a``: [A] 4.3.
+    vary :
+        One value or several by name, or texts ``NAME=V1,V2``; every combination is simulated.
+    runs :
+        Simulated calibrations of each combination, at least 2.
+    seed :
+        Seed for all random numbers.
+    out :
+        A folder in which finished batches are kept, and from which an interrupted study continues.
+    scheduler :
+        The address of a Dask cluster; the local cores are used without one.
+    progress :
+        Called with what is done and the share of it, 0 to 1.
+
+    Returns
+    -------
+    SweepResult
+        ``found``, one entry a combination; ``summary()``.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        The subject cannot be studied, ``out`` holds another study, or another process works there.
+
     """
     if isinstance(vary, Mapping):
         each = {name: np.atleast_1d(values) for name, values in vary.items()}
