@@ -44,9 +44,10 @@ LARGE_CAUSE_SHARE = 0.3
 WORTH_SAYING = 0.5
 """Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
 the whole larger by an eighth."""
-BED_LEFT = 0.5
-"""Part of what the drawing's tolerances let the bed bend that heights may leave: below a half the
-result is flatter than the drawing almost for sure; above, new values are not worth their risk."""
+NOMINAL_ERROR_LEFT = 0.5
+"""Part of the error that the nominal model's tolerances let expect which a result may leave: below
+a half the result is better than the nominal model almost for sure; above, new values are not worth
+their risk."""
 ENOUGH_TOUCHES = 15
 """Of a bed, where a wrong one moves it by little more than its deviation before it is noticed
 (benchmarks/heights.py)."""
@@ -89,10 +90,12 @@ def judge(
     """
     bed = findings.bed
     large, small = ((), ()) if bed else _left_open(estimate, findings)
-    left = [f"{s.text} {s.advice}" for s in large]
     if bed:
         left = _bed_unknown(bed)
         hints = (*_not_by_heights(bed, findings), *hints)
+    else:
+        left = [f"{s.text} {s.advice}" for s in large]
+        left = left or _platform_unknown(estimate, findings.by_drawing)
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
     matter = tuple(s for s in small if s.matters)
@@ -144,9 +147,31 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     )
 
 
+def no_gain(sigma: float, by_nominal: float) -> bool:
+    """Whether a result is no better than the nominal model, for data of any kind.
+
+    sigma : standard deviation of what the result is for (the platform at given readings, or the
+    tool's height above the bed), by_nominal : the same by the nominal model's tolerances alone, in
+    the same unit.
+    """
+    return not sigma <= NOMINAL_ERROR_LEFT * by_nominal
+
+
+def _platform_unknown(estimate: Estimate, by_nominal: float) -> list[str]:
+    """Why measurements of the platform are of no use, if they are not."""
+    sigma = _platform_sigma(estimate)
+    if not no_gain(sigma, by_nominal):
+        return []
+    return [
+        f"The platform's joints are known to {sigma * 1e3:.2g} mm at given readings, and by the"
+        f" drawing's tolerances alone to {by_nominal * 1e3:.2g} mm: that is no gain. Measure more"
+        " configurations, from further places, or with less noise.",
+    ]
+
+
 def _bed_unknown(bed: Bed) -> list[str]:
     """Why heights are of no use, if they are not."""
-    if bed.sigma <= BED_LEFT * bed.by_drawing:
+    if not no_gain(bed.sigma, bed.by_drawing):
         return []
     return [
         f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
@@ -159,7 +184,7 @@ def _touch_unnoticed(bed: Bed) -> list[str]:
     """What one wrong height could do that nothing shows, where that is much: no deviation holds it,
     for nobody knows how wrong a crumb is.
     """
-    if bed.unnoticed is not None and bed.unnoticed <= BED_LEFT * bed.by_drawing:
+    if bed.unnoticed is not None and not no_gain(bed.unnoticed, bed.by_drawing):
         return []
     bends = "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
     more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
