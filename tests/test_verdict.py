@@ -147,7 +147,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     open_ = (sentence(2 * LEFT_OPEN * findings.by_drawing),)
     findings = replace(findings, unidentified=open_)
     assert not judge(observation, estimate, findings).usable
-    unsure = replace(estimate, joint_covariance=1e4 * estimate.joint_covariance)
+    unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
     assert judge(observation, unsure, findings).usable
 
 

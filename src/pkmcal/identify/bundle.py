@@ -42,6 +42,7 @@ from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
 
 NEARLY_SOLVED_DISTANCE = 1e-3
@@ -527,8 +528,11 @@ def _statistics(
     n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
-    unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
-    unknowns += value.shape[1] * problem.layout.own_motion.shape[1]
+    # what is known beforehand of mounts is no measurement: unknowns that nothing else tells count
+    # as little as it does
+    prior_rows = problem.prior[~np.isin(kinds, ("gauge", "mount"))]
+    normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
+    unknowns = rank_of_normal(normal) + value.shape[1] * problem.layout.own_motion.shape[1]
     found = result.components
     freedom = found.freedom[0].tolist()
     return Statistics(

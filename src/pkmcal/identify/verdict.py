@@ -10,11 +10,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.confirmation import FAR_FROM_NOMINAL
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import decided_by
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import Sentence
-from pkmcal.identify.tool import platform_by_parameters
+from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
@@ -26,8 +27,6 @@ from pkmcal.wording import count, listed
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-FAR_FROM_DRAWING = 5.0
-"""Tolerances by which a value may leave the drawing before a person should look."""
 TOO_NOISY = 4.0
 """Factor on the edges' stated noise beyond which the model does not explain the photographs."""
 TOO_MANY_LOST = 0.4
@@ -100,7 +99,7 @@ def judge(
     # what is a small part of the deviation that was reached is in that, and in the report
     matter = tuple(s for s in small if s.matters)
     if matter:
-        least = WORTH_SAYING * _platform_sigma(estimate)
+        least = WORTH_SAYING * platform_sigma(estimate)
         matter = tuple(s for s in matter if s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate, held_out),
@@ -131,7 +130,7 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     """
     if not len(observation.edges):
         return (
-            f"Calibrated: the platform's joints to {_platform_sigma(estimate) * 1e3:.2g} mm at"
+            f"Calibrated: the platform's joints to {platform_sigma(estimate) * 1e3:.2g} mm at"
             " given readings (standard deviation)."
         )
     machine = estimate.machine
@@ -159,7 +158,7 @@ def no_gain(sigma: float, by_nominal: float) -> bool:
 
 def _platform_unknown(estimate: Estimate, by_nominal: float) -> list[str]:
     """Why measurements of the platform are of no use, if they are not."""
-    sigma = _platform_sigma(estimate)
+    sigma = platform_sigma(estimate)
     if not no_gain(sigma, by_nominal):
         return []
     return [
@@ -211,13 +210,6 @@ def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
     return told
 
 
-def _platform_sigma(estimate: Estimate) -> float:
-    """Deviation (m, root mean square) of the platform's joints at given readings."""
-    used = estimate.state.T_base_platform[estimate.configurations]
-    by = platform_by_parameters(estimate.machine, used)
-    return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
-
-
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
     out: list[str] = []
     lost = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
@@ -237,6 +229,12 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
         out.append(
             f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
             " can be trusted to be right."
+        )
+    if estimate.statistics.dof <= 0:
+        out.append(
+            "As many unknowns were estimated as there are measurements, the drawing's tolerances"
+            " counted: nothing is left over that could show a wrong one. Measure more"
+            " configurations."
         )
     if estimate.statistics.stopped == Stop.STEPS.value:
         out.append(
@@ -358,7 +356,7 @@ def _left_open(
     if total <= LEFT_OPEN * findings.by_drawing:
         return (), open_
     # where all else makes more of the deviation that was reached, that says enough
-    if total <= np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0)):
+    if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
     least = min(LARGE_CAUSE_SHARE * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
@@ -388,11 +386,11 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
-    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_DRAWING]
+    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
     if far:
         out.append(
             f"{listed(far, 4)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
-            f" {FAR_FROM_DRAWING:.0f} tolerances (up to {change.max():.0f}): check the drawing"
+            f" {FAR_FROM_NOMINAL:.0f} tolerances (up to {change.max():.0f}): check the drawing"
             f" and its frame."
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
