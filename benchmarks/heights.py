@@ -29,10 +29,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import printers
 from pkmcal.arrays import Array
-from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.source import MachineSource
 from pkmcal.export.contract import make_export
-from pkmcal.identify.bed import Bed, bed_of
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
 from pkmcal.printers.session import write_printer_session
@@ -131,24 +130,39 @@ def by_klipper(says: printers.Settings, readings: Array) -> printers.Settings:
     return settings(at)
 
 
-def by_us(
-    says: printers.Settings, readings: Array, noise: float, tolerance: str | None
-) -> tuple[printers.Settings, Bed, bool]:
-    """The firmware's values, what is said of the bed, and whether it is accepted."""
+def calibrated(
+    says: printers.Settings,
+    readings: Array,
+    noise: float | None = None,
+    tolerance: str = "",
+    centre_tolerance: float = 0.0,
+) -> Calibration:
+    """The calibration of a printer whose firmware says so, from its carriages (n, 3) mm on the bed.
+
+    noise : mm, of the probe, tolerance : of what no firmware holds, centre_tolerance : mm, of the
+    towers; in the place of those that the session is made with.
+    """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         (folder / "printer.cfg").write_text(printers.printer_cfg(says, readings))
         write_printer_session(folder / "kit", folder / "printer.cfg")
         text = (folder / "kit" / "session.yaml").read_text()
-        text = text.replace("position: 0.02 mm", f"position: {noise} mm")
+        if noise is not None:
+            text = text.replace("position: 0.02 mm", f"position: {noise} mm")
         (folder / "kit" / "session.yaml").write_text(text)
         text = (folder / "kit" / "mechanism.yaml").read_text()
-        if tolerance is not None:
+        if tolerance:
             text = re.sub("axis: .* deg, scale: .* %", tolerance, text)
+        if centre_tolerance:
+            text = re.sub("center: .* mm, offset", f"center: {centre_tolerance} mm, offset", text)
         (folder / "kit" / "mechanism.yaml").write_text(text)
-        found = calibrate_session(folder / "kit")
-    bed = bed_of(found.measurements, found.estimate)
-    source = MachineSource(found.machine, bed=bed.z)
+        return calibrate_session(folder / "kit")
+
+
+def exported(found: Calibration) -> printers.Settings:
+    """What is exported for the firmware."""
+    bed = found.findings.bed
+    source = MachineSource(found.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")
     each = {
@@ -156,8 +170,7 @@ def by_us(
         for name in ("angle", "arm_length", "position_endstop")
     }
     radius = float(values["printer"]["delta_radius"][0])
-    pasted = printers.Settings(radius, each["angle"], each["arm_length"], each["position_endstop"])
-    return pasted, bed, found.verdict.usable
+    return printers.Settings(radius, each["angle"], each["arm_length"], each["position_endstop"])
 
 
 def moved(
@@ -225,7 +238,9 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
             (truth.says.homed - readings) / printers.STEP
         )
         told_tolerance = KIT if of_a_kit else IDEAL
-        ours, bed, usable = by_us(truth.says, readings, noise, told_tolerance)
+        calibration = calibrated(truth.says, readings, noise, told_tolerance)
+        ours, usable = exported(calibration), calibration.verdict.usable
+        bed = calibration.findings.bed
         pasted = {
             "before": truth.says,
             "Klipper": by_klipper(truth.says, readings),

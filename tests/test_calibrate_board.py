@@ -18,6 +18,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.papers import methods
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.corners import board_corners
+from pkmcal.report.provenance import used_photographs
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from rendered import by_command
@@ -151,6 +152,9 @@ def test_a_photograph_of_another_configuration_is_let_go(folder):
     assert any(
         r.configuration == 5 and "board lies" in r.reason for r in result.observation.rejected
     )
+    warned = [text for text in result.verdict.warnings if f"images/station1/{names[5]}" in text]
+    assert any(f"1 of {len(lost)} boards" in text for text in warned)
+    assert used_photographs(result.session, result.observation, result.estimate) == (11,)
 
 
 def test_a_missing_board_file_and_another_camera(folder):

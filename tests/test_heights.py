@@ -192,6 +192,116 @@ def test_heights_that_are_no_gain_are_refused(true, tmp_path):
     assert refused.code == 1
 
 
+# ------------------------------------------------------------------ rejected heights
+
+SMALL = printers.Settings(radius=118.0, rod=(240.0,) * 3, endstop=(260.0,) * 3)
+
+
+def session_of(folder, off, n, *, wrong=(), bed=None, noise=0.008):
+    """A session of n heights of a printer whose radius is ``off`` mm larger than its firmware says.
+
+    wrong : (which, mm) heights that are too high. bed : mm, heights (n,) at places (n, 2).
+    """
+    true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
+    places = printers.bed(n, 75.0)
+    readings = printers.felt(true, places, noise, np.random.default_rng(0))
+    for which, height in wrong:
+        readings[which] += height
+    if bed is not None:
+        readings += bed(places)[:, None]
+    folder.mkdir(exist_ok=True)
+    (folder / "printer.cfg").write_text(printers.printer_cfg(SMALL, readings))
+    write_printer_session(folder / "kit", folder / "printer.cfg")
+    return folder / "kit"
+
+
+def with_tolerance(kit, centre):
+    """Another tolerance of the towers, mm."""
+    text = (kit / "mechanism.yaml").read_text()
+    other = re.sub(r"center: \S+ mm, offset", f"center: {centre} mm, offset", text)
+    assert other != text
+    (kit / "mechanism.yaml").write_text(other)
+
+
+BOWL = """\
+configuration,x [mm],y [mm],z [mm]
+p00,0.000,0.000,0.0003
+p01,73.505,14.900,-0.4719
+p02,23.849,71.107,-0.4684
+p03,-49.656,56.207,-0.4869
+p04,-73.505,-14.900,-0.4806
+p05,-23.849,-71.107,-0.4870
+p06,49.656,-56.207,-0.4737
+"""
+"""Heights of such a printer whose radius is 116.1 mm; least squares give 116.11 mm."""
+
+
+@pytest.mark.parametrize("centre", [None, 3.0])
+def test_what_one_parameter_explains_is_not_rejected(tmp_path, centre):
+    """Seven heights, the radius 1.9 mm wrong: where the ring fits, the centre is 26 standard
+    deviations off, and with the radius all fit.
+    """
+    said(tmp_path, printers.printer_cfg(SMALL), "printer.cfg")
+    write_printer_session(
+        tmp_path / "kit", tmp_path / "printer.cfg", said(tmp_path, BOWL, "probed.csv")
+    )
+    if centre:
+        with_tolerance(tmp_path / "kit", centre)
+    assert run("calibrate", tmp_path / "kit").code == 0
+    saved = load(tmp_path / "kit" / "calibration")
+    assert saved.document["rejected"] == []
+    (text,) = make_export(load_source(tmp_path / "kit" / "calibration"), "klipper").files.values()
+    assert pasted(text).radius == pytest.approx(116.1, abs=0.05)
+    # one of each height, less the bed's own: all else is known beforehand
+    assert saved.document["statistics"]["dof"] == 6
+
+
+def test_a_rejection_that_nothing_confirms_is_refused_and_named(tmp_path):
+    """Two millimetres under the probe: among seven heights any one may be the wrong one; among
+    nineteen it is this one for sure.
+    """
+    for n, usable in ((7, False), (19, True)):
+        kit = session_of(tmp_path / str(n), 0.3, n, wrong=[(3, 2.0)])
+        found = calibrate_session(kit)
+        assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [3]
+        assert found.verdict.usable == usable
+        (named,) = [text for text in found.verdict.warnings if " rejected" in text]
+        assert f"1 of {n} heights" in named
+        assert "004" in named
+        assert any("004" in text for text in found.verdict.reasons) != usable
+    done = run("calibrate", tmp_path / "7" / "kit")
+    assert done.code == 1
+    assert "6 of 7 heights" in done.out
+    assert run("export", tmp_path / "7" / "kit" / "calibration", "--to", "klipper").code == 1
+
+
+def test_an_uneven_bed_is_no_population_of_outliers(tmp_path):
+    """A bed that waves by a tenth of a millimetre: its heights stay, their noise is enlarged, and
+    where it is enlarged too far the result is refused.
+    """
+    kit = session_of(
+        tmp_path,
+        -1.0,
+        49,
+        bed=lambda xy: 0.1 * np.sin(xy[:, 0] / 20) * np.cos(xy[:, 1] / 17),
+    )
+    found = calibrate_session(kit)
+    assert np.mean(found.estimate.pose_weights < 0.5) < 0.05
+    assert found.estimate.statistics.pose_scale > 2
+    bent = np.std(flat_of_small(-1.0, found))
+    assert not found.verdict.usable or bent < 3e3 * found.findings.bed.sigma
+
+
+def flat_of_small(off, found):
+    """Heights (n,) mm over the bed of such a printer with what is exported of a result."""
+    true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
+    (text,) = Klipper().files(MachineSource(found.machine, bed=found.findings.bed.z)).values()
+    points = np.column_stack([printers.bed(60, 75.0), np.zeros(60)])
+    told = pasted(text)
+    readings = SMALL.homed - (told.homed - told.carriages(points))
+    return 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
+
+
 def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
     """A crumb under one of seven touches bends the bed more than the drawing did, and nothing in
     the residuals shows it; of thirteen it is given up.

@@ -191,6 +191,10 @@ def test_outliers_are_let_go_and_named(folder):
     assert np.flatnonzero(result.estimate.pose_weights < 0.5).tolist() == [7, 20]
     told = [r for r in result.observation.rejected if r.configuration in (7, 20)]
     assert all("standard deviations from where all others put it" in r.reason for r in told)
+    # thirty poses of six numbers confirm that these two are wrong
+    assert result.verdict.usable
+    (named,) = [text for text in result.verdict.warnings if text.startswith("2 of 30 poses")]
+    assert all(result.session.configurations[k] in named for k in (7, 20))
     assert tool_error(result.machine, made) < 6e-5
 
 

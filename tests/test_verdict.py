@@ -12,8 +12,9 @@ from pkmcal.files import json_text
 from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, seen_legs
-from pkmcal.identify.verdict import LEFT_OPEN, judge
+from pkmcal.identify.verdict import LEFT_OPEN, NOMINAL_ERROR_LEFT, judge, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
@@ -147,8 +148,29 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     open_ = (sentence(2 * LEFT_OPEN * findings.by_drawing),)
     findings = replace(findings, unidentified=open_)
     assert not judge(observation, estimate, findings).usable
-    unsure = replace(estimate, joint_covariance=1e4 * estimate.joint_covariance)
+    unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
     assert judge(observation, unsure, findings).usable
+
+
+def test_a_result_that_is_no_gain_is_refused(whole):
+    """Legs are judged as heights are: half of what the tolerances let expect is too much."""
+    observation, estimate, findings, _ = whole
+    sigma = platform_sigma(estimate)
+    for share, usable in ((0.9, True), (1.1, False)):
+        factor = share * NOMINAL_ERROR_LEFT * findings.by_drawing / sigma
+        unsure = replace(estimate, joint_covariance=factor**2 * estimate.joint_covariance)
+        found = judge(observation, unsure, findings)
+        assert found.usable == usable
+        assert len(found.reasons) == (not usable)
+    assert no_gain(np.nan, 1.0)
+    assert not no_gain(0.0, 0.0)
+
+
+def test_without_a_degree_of_freedom_it_is_refused(whole):
+    observation, estimate, findings, _ = whole
+    for dof in (0.0, -4.0, 1.0):
+        other = replace(estimate, statistics=replace(estimate.statistics, dof=dof))
+        assert judge(observation, other, findings).usable == (dof > 0)
 
 
 def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):

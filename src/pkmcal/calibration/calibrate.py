@@ -40,6 +40,7 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
+from pkmcal.calibration.rejected import rejections_in_words
 from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
@@ -332,6 +333,13 @@ def _judge(
         departed = unmodelled_departures(
             session, turns.observation, turns.measurements, found.estimate, ended
         )
+    rejections = rejections_in_words(
+        session,
+        found.turns.measurements,
+        found.estimate,
+        findings,
+        at_minimum=method == "bundle",
+    )
     verdict = judge(
         found.turns.observation,
         found.estimate,
@@ -344,9 +352,11 @@ def _judge(
             *noise_doubt(session, found.estimate),
             *found.turns.doubts,
             *chance_doubt(found.turns),
+            *rejections.reasons,
             *(one.sentence for one in departed if one.against),
         ),
         cautions=(
+            *rejections.warnings,
             *(one.sentence for one in departed if not one.against),
             *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed)),

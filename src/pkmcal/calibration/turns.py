@@ -26,6 +26,7 @@ from pkmcal.calibration.responses import ResponseTold, overruled, told_by_edges
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.assembly import state_of
 from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.confirmation import rejected_units
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
@@ -95,6 +96,7 @@ _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
     " machine, moved, or the readings are another configuration's"
 )
+_IMAGE_OFF = "most of its edges disagree with all other images: its name, or its place, is wrong"
 _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"
 
 
@@ -629,12 +631,22 @@ def observation_of(
         rejected=seen.rejected
         + boards.rejected
         + tuple(seen.edges.rejection(k, _OUTLIER) for k in given_up)
+        + _images_given_up(measurements, estimate)
         + _poses_given_up(session, measurements, estimate),
         points=seen.points,
         point_edge=seen.point_edge,
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
         binning=binning,
+    )
+
+
+def _images_given_up(measurements: Measurements, estimate: Estimate) -> tuple[Rejection, ...]:
+    """Images of which most edges were rejected, as wholes."""
+    return tuple(
+        Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
+        for unit in rejected_units(measurements, estimate)
+        if unit.pose < 0
     )
 
 

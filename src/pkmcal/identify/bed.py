@@ -56,8 +56,18 @@ class Bed:
     unnoticed: float | None
 
 
-def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
-    """The bed of an estimate from heights alone."""
+def bed_by_parameters(estimate: Estimate) -> Array:
+    """How the parameters bend the bed, (n, P): for a change v of them ``norm(out @ v)`` is that of
+    the tool's height over the disc (m, root mean square), the bed's height and tilt aside.
+    """
+    poses, _, height = _bent(estimate)
+    return height / np.sqrt(len(poses))
+
+
+def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
+    """Poses (n, 4, 4) over the disc, and by the parameters there the platform's place (n, 3, P) and
+    its height above the bed (n, P), this without the bed's own height and tilt.
+    """
     machine = estimate.machine
     poses = _over_the_disc(estimate.state.T_base_platform[estimate.configurations])
     joints = machine.inverse(poses)
@@ -65,10 +75,17 @@ def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
     joints, poses = joints[reached], poses[reached]
     by = pose_by_parameters(machine, joints, poses)[:, 3:]
     xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
-    ones, zeros = np.ones(len(xy)), np.zeros(len(xy))
-    plane = np.column_stack([ones, xy])
+    plane = np.column_stack([np.ones(len(xy)), xy])
     slope = np.linalg.lstsq(plane, poses[:, 2, 3], rcond=None)[0][1:]
-    height = _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
+    return poses, by, _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
+
+
+def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
+    """The bed of an estimate from heights alone."""
+    machine = estimate.machine
+    poses, by, height = _bent(estimate)
+    xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
+    ones, zeros = np.ones(len(xy)), np.zeros(len(xy))
     along = by[:, :2].reshape(-1, by.shape[-1])
     shifts = np.stack([ones, zeros], axis=1).ravel(), np.stack([zeros, ones], axis=1).ravel()
     turn = np.stack([-xy[:, 1], xy[:, 0]], axis=1).ravel()

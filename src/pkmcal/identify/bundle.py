@@ -35,19 +35,16 @@ from pkmcal.identify.noise import (
     counts,
 )
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.robust import anneal, norms, settled_weights
+from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
 
-LEAST_SCALE = 1.0
-"""The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
-What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
-smaller than errors are: scaling down by them would promise too much."""
 NEARLY_SOLVED_DISTANCE = 1e-3
 """Standard deviations, of all fitted values together, that a round's solution may have left to go,
 mostly after two steps: far less than the next round's weights and deviations change. Only where
@@ -145,7 +142,7 @@ def solve_batch(
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
-        found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
+        found = robust_start(problem, start, scaled=scale_noise)
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
@@ -531,8 +528,11 @@ def _statistics(
     n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
-    unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
-    unknowns += value.shape[1] * problem.layout.own_motion.shape[1]
+    # what is known beforehand of mounts is no measurement: unknowns that nothing else tells count
+    # as little as it does
+    prior_rows = problem.prior[~np.isin(kinds, ("gauge", "mount"))]
+    normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
+    unknowns = rank_of_normal(normal) + value.shape[1] * problem.layout.own_motion.shape[1]
     found = result.components
     freedom = found.freedom[0].tolist()
     return Statistics(

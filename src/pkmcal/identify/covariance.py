@@ -40,6 +40,7 @@ from pkmcal.solver.elimination import (
     rows_on_shared,
 )
 from pkmcal.solver.ranks import (
+    NORMAL_RANK_TOLERANCE,
     RANK_TOLERANCE,
     column_space,
     inverse_root,
@@ -50,8 +51,6 @@ from pkmcal.solver.search import take
 
 ROWS_RANK_TOLERANCE = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
-NORMAL_RANK_TOLERANCE = 1e-13
-"""Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,13 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     return moved / np.sqrt(len(poses) * machine.n_legs)
 
 
+def platform_sigma(estimate: Estimate) -> float:
+    """Standard deviation (m, root mean square) of the platform's joints at given readings."""
+    used = estimate.state.T_base_platform[estimate.configurations]
+    by = platform_by_parameters(estimate.machine, used)
+    return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
+
+
 def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     """Readings and poses of the session and of samples about it that the machine can take."""
     rng = np.random.default_rng(POSES_AROUND_SEED)

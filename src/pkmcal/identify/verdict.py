@@ -10,11 +10,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.confirmation import FAR_FROM_NOMINAL
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import decided_by
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import Sentence
-from pkmcal.identify.tool import platform_by_parameters
+from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
@@ -26,8 +27,6 @@ from pkmcal.wording import count, listed
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-FAR_FROM_DRAWING = 5.0
-"""Tolerances by which a value may leave the drawing before a person should look."""
 TOO_NOISY = 4.0
 """Factor on the edges' stated noise beyond which the model does not explain the photographs."""
 TOO_MANY_LOST = 0.4
@@ -44,9 +43,10 @@ LARGE_CAUSE_SHARE = 0.3
 WORTH_SAYING = 0.5
 """Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
 the whole larger by an eighth."""
-BED_LEFT = 0.5
-"""Part of what the drawing's tolerances let the bed bend that heights may leave: below a half the
-result is flatter than the drawing almost for sure; above, new values are not worth their risk."""
+NOMINAL_ERROR_LEFT = 0.5
+"""Part of the error that the nominal model's tolerances let expect which a result may leave: below
+a half the result is better than the nominal model almost for sure; above, new values are not worth
+their risk."""
 ENOUGH_TOUCHES = 15
 """Of a bed, where a wrong one moves it by little more than its deviation before it is noticed
 (benchmarks/heights.py)."""
@@ -89,15 +89,17 @@ def judge(
     """
     bed = findings.bed
     large, small = ((), ()) if bed else _left_open(estimate, findings)
-    left = [f"{s.text} {s.advice}" for s in large]
     if bed:
         left = _bed_unknown(bed)
         hints = (*_not_by_heights(bed, findings), *hints)
+    else:
+        left = [f"{s.text} {s.advice}" for s in large]
+        left = left or _platform_unknown(estimate, findings.by_drawing)
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
     matter = tuple(s for s in small if s.matters)
     if matter:
-        least = WORTH_SAYING * _platform_sigma(estimate)
+        least = WORTH_SAYING * platform_sigma(estimate)
         matter = tuple(s for s in matter if s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate, held_out),
@@ -128,7 +130,7 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     """
     if not len(observation.edges):
         return (
-            f"Calibrated: the platform's joints to {_platform_sigma(estimate) * 1e3:.2g} mm at"
+            f"Calibrated: the platform's joints to {platform_sigma(estimate) * 1e3:.2g} mm at"
             " given readings (standard deviation)."
         )
     machine = estimate.machine
@@ -144,9 +146,31 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     )
 
 
+def no_gain(sigma: float, by_nominal: float) -> bool:
+    """Whether a result is no better than the nominal model, for data of any kind.
+
+    sigma : standard deviation of what the result is for (the platform at given readings, or the
+    tool's height above the bed), by_nominal : the same by the nominal model's tolerances alone, in
+    the same unit.
+    """
+    return not sigma <= NOMINAL_ERROR_LEFT * by_nominal
+
+
+def _platform_unknown(estimate: Estimate, by_nominal: float) -> list[str]:
+    """Why measurements of the platform are of no use, if they are not."""
+    sigma = platform_sigma(estimate)
+    if not no_gain(sigma, by_nominal):
+        return []
+    return [
+        f"The platform's joints are known to {sigma * 1e3:.2g} mm at given readings, and by the"
+        f" drawing's tolerances alone to {by_nominal * 1e3:.2g} mm: that is no gain. Measure more"
+        " configurations, from further places, or with less noise.",
+    ]
+
+
 def _bed_unknown(bed: Bed) -> list[str]:
     """Why heights are of no use, if they are not."""
-    if bed.sigma <= BED_LEFT * bed.by_drawing:
+    if not no_gain(bed.sigma, bed.by_drawing):
         return []
     return [
         f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
@@ -159,7 +183,7 @@ def _touch_unnoticed(bed: Bed) -> list[str]:
     """What one wrong height could do that nothing shows, where that is much: no deviation holds it,
     for nobody knows how wrong a crumb is.
     """
-    if bed.unnoticed is not None and bed.unnoticed <= BED_LEFT * bed.by_drawing:
+    if bed.unnoticed is not None and not no_gain(bed.unnoticed, bed.by_drawing):
         return []
     bends = "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
     more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
@@ -186,13 +210,6 @@ def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
     return told
 
 
-def _platform_sigma(estimate: Estimate) -> float:
-    """Deviation (m, root mean square) of the platform's joints at given readings."""
-    used = estimate.state.T_base_platform[estimate.configurations]
-    by = platform_by_parameters(estimate.machine, used)
-    return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
-
-
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
     out: list[str] = []
     lost = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
@@ -212,6 +229,12 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
         out.append(
             f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
             " can be trusted to be right."
+        )
+    if estimate.statistics.dof <= 0:
+        out.append(
+            "As many unknowns were estimated as there are measurements, the drawing's tolerances"
+            " counted: nothing is left over that could show a wrong one. Measure more"
+            " configurations."
         )
     if estimate.statistics.stopped == Stop.STEPS.value:
         out.append(
@@ -333,7 +356,7 @@ def _left_open(
     if total <= LEFT_OPEN * findings.by_drawing:
         return (), open_
     # where all else makes more of the deviation that was reached, that says enough
-    if total <= np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0)):
+    if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
     least = min(LARGE_CAUSE_SHARE * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
@@ -363,11 +386,11 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
-    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_DRAWING]
+    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
     if far:
         out.append(
             f"{listed(far, 4)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
-            f" {FAR_FROM_DRAWING:.0f} tolerances (up to {change.max():.0f}): check the drawing"
+            f" {FAR_FROM_NOMINAL:.0f} tolerances (up to {change.max():.0f}): check the drawing"
             f" and its frame."
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)

@@ -25,10 +25,10 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.assembly import SHIFT_SIGMA
-from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE
+from pkmcal.identify.bundle import SHADING_CHANGE
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.line_shading import common_shading
-from pkmcal.identify.robust import CLEAN_TAIL_SHARE, clean_norm
+from pkmcal.identify.robust import CLEAN_TAIL_SHARE, LEAST_SCALE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.mechanisms import Machine

@@ -277,7 +277,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     """Photographs and edges, used and not; of a session without any, the trackers' poses, or the
     readings alone.
     """
-    taken = sum(len(station.photographs) for station in session.stations)
+    taken = session.images_taken
     if not session.station_names:
         return Figure(
             "What is it based on?",
@@ -294,7 +294,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
             f"measured without a camera; {quiet} of them given less than half their weight",
         )
-    used = sum(provenance.used_photographs(session, observation))
+    used = sum(provenance.used_photographs(session, observation, estimate))
     coarse = int(observation.edges.coarse.sum())
     beside = f" and {coarse} told by silhouettes" if coarse else ""
     parts = [

@@ -16,7 +16,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
-from pkmcal.pages.drawn import EDGE_SIDE_NAMES
+from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
@@ -36,15 +36,22 @@ MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def used_photographs(session: Session, observation: Observation) -> tuple[int, ...]:
-    """How many of each station's photographs show something that is in use; those that were held
-    out do not.
+def used_photographs(
+    session: Session, observation: Observation, estimate: Estimate
+) -> tuple[int, ...]:
+    """How many of each station's photographs show something that is in use: a board that was not
+    rejected, or edges of which most were not. Those that were held out do not.
     """
-    seen = {
-        pair
-        for found in (observation.edges, observation.poses)
-        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
-    }
+    seen = set[tuple[int, int]]()
+    for found, weights in (
+        (observation.edges, estimate.edge_weights),
+        (observation.poses, estimate.pose_weights),
+    ):
+        pairs = np.stack([found.station, found.configuration], axis=1)
+        pairs, own = np.unique(pairs, axis=0, return_inverse=True)
+        kept = np.bincount(own.ravel(), weights >= KEPT_EDGE_WEIGHT, len(pairs))
+        most = 2 * kept >= np.bincount(own.ravel(), minlength=len(pairs))
+        seen |= {(s, c) for s, c in pairs[most].tolist()}
     return tuple(
         sum((s, photo.configuration) in seen for photo in station.photographs)
         for s, station in enumerate(session.stations)
@@ -60,7 +67,7 @@ def stations(
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
-    used = used_photographs(session, observation)
+    used = used_photographs(session, observation, estimate)
     for s, station in enumerate(session.stations):
         taken = len(station.photographs)
         photographs = count(taken, "photograph")
@@ -247,7 +254,8 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
                 f"{stations[i.station]} / {configurations[i.configuration]}",
                 _what(i) if same else f"{_what(i)}: {i.reason}",
             )
-            for i in items[:MOST_CASES]
+            for number, i in enumerate(items)
+            if number < MOST_CASES or i.leg < 0  # whole images and boards are all named
         ),
     )
 

@@ -101,6 +101,7 @@ class Session:
     model : the machine's model by its name in the mechanism file, None for the file's own.
     mechanism : where the machine came from, for other models of it.
     workspace : where the tool is to be right, None where the file does not say.
+    images_left_out : images of stations that are in the session's files, and not in ``stations``.
     """
 
     folder: Path
@@ -117,15 +118,21 @@ class Session:
     model: str | None = None
     mechanism: Path | str = ""
     workspace: Region | None = None
+    images_left_out: int = 0
 
     def __repr__(self) -> str:
-        taken = sum(len(station.photographs) for station in self.stations)
         parts = (
             count(len(self.configurations), "configuration"),
             count(len(self.station_names), "station"),
-            count(taken, "photograph"),
+            count(self.images_taken, "photograph"),
         )
         return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
+
+    @property
+    def images_taken(self) -> int:
+        """Number of the images of all stations, those that were left out among them."""
+        kept = sum(len(station.photographs) for station in self.stations)
+        return kept + self.images_left_out
 
     @property
     def called(self) -> str:
@@ -157,7 +164,13 @@ class Session:
         the others.
         """
         stations = tuple(self.stations[k] for k in numbers)
-        return replace(self, stations=stations, warnings=self.warnings + warnings)
+        kept = sum(len(station.photographs) for station in stations)
+        return replace(
+            self,
+            stations=stations,
+            warnings=self.warnings + warnings,
+            images_left_out=self.images_taken - kept,
+        )
 
     def other_model(self, name: str | None) -> Machine:
         """Another model of the same machine."""

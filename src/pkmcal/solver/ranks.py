@@ -14,6 +14,8 @@ DOUBLE_EPSILON = float(np.finfo(float).eps)
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
 there with exact derivatives, and real directions are many orders above."""
+NORMAL_RANK_TOLERANCE = 1e-13
+"""Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
 def column_space(columns: Array) -> Array:
@@ -46,6 +48,12 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
     limit = least * s[..., :1]
     inverse = 1 / np.maximum(s, limit + SINGULAR_VALUE_FLOOR) if loose else _of_known(s, limit)
     return vt.mT * inverse[..., None, :] / scale[..., None]
+
+
+def rank_of_normal(normal: Array) -> int:
+    """Number of directions that a normal matrix (m, m) knows."""
+    values = np.linalg.eigvalsh(unit_diagonal(normal)[0])
+    return int(np.sum(values > NORMAL_RANK_TOLERANCE * values.max(initial=0.0)))
 
 
 def normal_root(normal: Array, least: float, *, loose: bool) -> Array:

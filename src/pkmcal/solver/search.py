@@ -440,3 +440,17 @@ def final_weights(distance: Array) -> Array:
         (distance - FULL_WEIGHT_DISTANCE) / (NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE), 0, 1
     )
     return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
+
+
+def final_loss(distance: Array) -> Array:
+    """The robust loss of distances whose weights are :func:`final_weights`, in the place of their
+    squares: ``2 int_0^d w(t) t dt``. It ends at a constant, the loss of a measurement that is
+    rejected; so much where nothing can be predicted.
+    """
+    width = NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE
+    x = np.minimum(np.where(np.isfinite(distance), distance, np.inf), NO_WEIGHT_DISTANCE)
+    angle = np.pi * (x - FULL_WEIGHT_DISTANCE) / width
+    beyond = (x**2 + FULL_WEIGHT_DISTANCE**2) / 2 + width / np.pi * (
+        x * np.sin(angle) + width / np.pi * (np.cos(angle) - 1)
+    )
+    return np.where(x < FULL_WEIGHT_DISTANCE, x**2, beyond)

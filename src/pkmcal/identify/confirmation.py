@@ -1,0 +1,264 @@
+"""Whether the other measurements confirm what an estimate has rejected.
+
+An estimate with rejected measurements is one hypothesis, "these are wrong". Others are that a
+rejected one is right, and the parameters differ; that all are; or that it is right and one that
+was kept is wrong. With the cost of a hypothesis a
+
+    Q_a = (sum of squares of what counts, at its own best values) + (loss of each that does not)
+
+as in the estimate's robust loss, its probability is p_a ~ exp(-Q_a / 2). What the hypotheses
+differ by moves the tool, by s_a from where the estimate has it; so to the tool's stated variance
+belongs ``sum p_a s_a^2``. Where that is more than the stated variance itself, the data do not tell
+which measurement is wrong: the one that was rejected among seven with seven unknowns is as likely
+right as any other; one of thirty that lies twenty standard deviations off is surely wrong.
+
+A rejection has to be confirmed by measurements, not by the nominal model, which is what a
+calibration doubts. So here its tolerances are ``FAR_FROM_NOMINAL`` times as wide.
+
+Hypotheses are solved to first order about the estimate, each configuration's own unknowns
+eliminated: its change of the normal matrix is that of one configuration or two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.identify.assembly import Assembled
+from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.robust import as_pairs
+from pkmcal.identify.rows import Kinds
+from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements import Measurements
+from pkmcal.solver.elimination import divisions
+from pkmcal.solver.search import NO_WEIGHT_DISTANCE, final_loss
+
+FAR_FROM_NOMINAL = 5.0
+"""Tolerances by which a value may leave the nominal model before a person should look."""
+NORMAL_RIDGE = 1e-12
+"""Of a normal matrix with a unit diagonal: what fixes a direction that nothing else does."""
+MOST_REJECTED_UNITS = 50
+"""Units, from the first on, that are looked at: where more are rejected, the share is the reason
+not to use the result."""
+
+
+@dataclass(frozen=True)
+class RejectedUnit:
+    """What a user measured at once, and the estimate rejected: a height, a board, an image.
+
+    pose : its number among the measured poses, -1 for the edges of an image. station, configuration
+    : where. right : probability that it is right after all. shift : m, root mean square, by which
+    the hypotheses in which it is let the tool be elsewhere.
+    """
+
+    pose: int
+    station: int
+    configuration: int
+    right: float = 0.0
+    shift: float = 0.0
+
+
+@dataclass(frozen=True)
+class Rejections:
+    """What an estimate has rejected, and by how much (m, root mean square) the tool may be
+    elsewhere because of it, beside its stated deviation.
+    """
+
+    units: tuple[RejectedUnit, ...] = ()
+    shift: float = 0.0
+
+
+class _Normal(NamedTuple):
+    """Reduced normal equations of n configurations or hypotheses: matrix (n, na, na), gradient
+    (n, na) and sum of squares (n,).
+    """
+
+    matrix: Array
+    gradient: Array
+    squares: Array
+
+    def plus(self, other: _Normal, times: float = 1.0) -> _Normal:
+        """The sum with a multiple of others."""
+        return _Normal(*(a + times * b for a, b in zip(self, other, strict=True)))
+
+    def at(self, which: Integers | slice) -> _Normal:
+        """Those of some."""
+        return _Normal(*(part[which] for part in self))
+
+    def solved(self) -> tuple[Array, Array]:
+        """The least sums of squares (n,), and the steps (n, na) to where they are."""
+        scale = np.sqrt(np.einsum("...ii->...i", self.matrix))
+        scale = np.where(scale > 0, scale, 1.0)
+        unit = self.matrix / scale[..., None] / scale[..., None, :]
+        unit = unit + NORMAL_RIDGE * np.eye(unit.shape[-1])
+        step = -np.linalg.solve(unit, (self.gradient / scale)[..., None])[..., 0] / scale
+        return self.squares + np.sum(step * self.gradient, axis=-1), step
+
+
+def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[RejectedUnit, ...]:
+    """Measured poses without half of their weight, and images of which most edges are."""
+    poses, edges = measurements.poses, measurements.edges
+    lost = np.flatnonzero(estimate.pose_weights < 0.5).tolist()
+    out = [RejectedUnit(k, int(poses.station[k]), int(poses.configuration[k])) for k in lost]
+    image = np.stack([edges.station, edges.configuration], axis=1)
+    image, own = np.unique(image, axis=0, return_inverse=True)
+    rejected = np.bincount(own.ravel(), estimate.edge_weights < 0.5, len(image))
+    every = np.bincount(own.ravel(), minlength=len(image))
+    out += [RejectedUnit(-1, int(s), int(c)) for s, c in image[2 * rejected > every]]
+    return tuple(out)
+
+
+def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -> Rejections:
+    """The rejected units of an estimate, each with how sure the others are of its rejection.
+
+    tool : (n, P) rows with ``norm(tool @ v)`` how far a change v of the parameters moves the tool
+    (m, root mean square).
+    """
+    units = rejected_units(measurements, estimate)
+    if not units:
+        return Rejections()
+    assembled, info = as_ended(measurements, estimate)
+    drawn = np.array(assembled.priors) == "drawing"
+    wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
+    problem, state = info.problem, info.state
+    problem = replace(
+        problem, prior=wider[:, None] * problem.prior, prior_target=wider * problem.prior_target
+    )
+    cases = _Cases.of(assembled, problem, state, measurements, estimate, units)
+    least, step = cases.base.solved()
+    rows = tool @ problem.free
+    cost, shift, member = list[Array](), list[Array](), list[Integers]()
+
+    def add(case: _Normal, loss: Array, of: Integers) -> None:
+        """Hypotheses with the change of what is lost (n,), and of which unit each is."""
+        found, to = case.solved()
+        away = (to - step)[:, problem.unknowns.machine] @ rows.T
+        cost.append(found - least + loss)
+        shift.append(np.sqrt(np.sum(away**2, axis=1)))
+        member.append(of)
+
+    each = np.arange(len(cases.readmitted.squares))
+    single = cases.base.plus(cases.readmitted)
+    add(single, -cases.loss, each)
+    if len(each) > 1:
+        whole = cases.readmitted.at(slice(None))
+        total = _Normal(*(part.sum(axis=0, keepdims=True) for part in whole))
+        add(cases.base.plus(total), -cases.loss.sum(keepdims=True), np.array([-1]))
+    for dropped, loss, row in cases.drops(state):
+        for k in each:
+            other = row != cases.row[k]
+            case = single.at(slice(k, k + 1)).plus(dropped.at(other))
+            add(case, loss[other] - cases.loss[k], np.full(int(other.sum()), k))
+    costs, shifts, of = (np.concatenate(part) for part in (cost, shift, member))
+    best = min(float(costs.min(initial=0.0)), 0.0)
+    weight = np.exp(-(costs - best) / 2)
+    share = weight / (weight.sum() + np.exp(best / 2))
+    out: list[RejectedUnit] = []
+    for k in each:
+        mine = (of == k) | (of < 0)
+        moved = float(np.sqrt(np.sum(share[mine] * shifts[mine] ** 2)))
+        out.append(replace(units[k], right=float(share[mine].sum()), shift=moved))
+    shift = float(np.sqrt(np.sum(share * shifts**2)))
+    return Rejections((*out, *units[len(out) :]), shift)
+
+
+class _Cases(NamedTuple):
+    """What hypotheses are made of.
+
+    base : of the estimate (1). readmitted : by how much each rejected unit changes it (n); loss :
+    (n,) what these cost as they are. row : (n,) the configuration of each in the problem, for
+    poses; -1 for images.
+    """
+
+    problem: Problem
+    base: _Normal
+    readmitted: _Normal
+    loss: Array
+    row: Integers
+    kept: Booleans
+    pose_loss: Array
+
+    @classmethod
+    def of(
+        cls,
+        assembled: Assembled,
+        problem: Problem,
+        state: BatchState,
+        measurements: Measurements,
+        estimate: Estimate,
+        units: tuple[RejectedUnit, ...],
+    ) -> _Cases:
+        """Those of an estimate's problem."""
+        base = _prior(problem, state)
+        for cut in divisions(*problem.extent):
+            part = _reduced(problem.among(cut), problem.state_among(state, cut))
+            base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
+        pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
+        full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
+        pose_loss = full / np.maximum(as_pairs(problem.kinds.poses), 1e-9) ** 2
+        edges = measurements.edges
+        changes, loss, rows = list[_Normal](), list[float](), list[int]()
+        for unit in units[:MOST_REJECTED_UNITS]:
+            weight = Kinds(edge_weight.copy(), pose_weight.copy())
+            if unit.pose >= 0:
+                places = assembled.places.poses
+                row, place = int(places.row[unit.pose]), int(places.place[unit.pose])
+                weight.poses[row, place] = 1 / estimate.statistics.pose_scale**2
+                loss.append(float(pose_loss[row, place]))
+                rows.append(row)
+            else:
+                own = (edges.station == unit.station) & (edges.configuration == unit.configuration)
+                own = np.flatnonzero(own & (estimate.edge_weights < 0.5))
+                places = assembled.places.edges
+                row = int(places.row[own[0]])
+                weight.edges[places.row[own], places.place[own]] = 1.0
+                loss.append(full * len(own))
+                rows.append(-1)
+            cut = slice(row, row + 1)
+            there = problem.state_among(state, cut)
+            new = problem.weighted(Kinds(weight.edges[None], weight.poses[None])).among(cut)
+            changes.append(_reduced(new, there).plus(_reduced(problem.among(cut), there), -1.0))
+        readmitted = _Normal(*(np.concatenate(x) for x in zip(*changes, strict=True)))
+        kept = problem.kinds.poses.present & (pose_weight > 0)
+        return cls(problem, base, readmitted, np.array(loss), np.array(rows), kept, pose_loss)
+
+    def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
+        """Without one more pose each: the change of the normal equations, what it then costs, and
+        its configuration in the problem, some at a time.
+        """
+        if not (self.row >= 0).any():
+            return
+        for cut in divisions(*self.problem.extent):
+            part, there = self.problem.among(cut), self.problem.state_among(state, cut)
+            before = _reduced(part, there)
+            for place in range(self.kept.shape[1]):
+                kept = np.flatnonzero(self.kept[cut, place])
+                if not kept.size:
+                    continue
+                weight = part.pose_data.weight.copy()
+                weight[:, :, place] = 0.0
+                without = part.weighted(Kinds(part.data.weight, weight))
+                change = _reduced(without, there).plus(before, -1.0)
+                row = np.arange(len(self.kept))[cut][kept]
+                yield change.at(kept), self.pose_loss[row, place], row
+
+
+def _reduced(problem: Problem, state: BatchState) -> _Normal:
+    """Of each configuration, its own unknowns eliminated."""
+    reduced = Information(problem, state).reduced
+    rows, value = reduced.rows[0], reduced.value[0]
+    return _Normal(rows.mT @ rows, (rows.mT @ value[..., None])[..., 0], np.sum(value**2, axis=-1))
+
+
+def _prior(problem: Problem, state: BatchState) -> _Normal:
+    """Of what is known beforehand."""
+    value = problem.prior_values(state)[0] - problem.prior_target
+    rows = problem.prior
+    return _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])
