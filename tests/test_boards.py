@@ -8,7 +8,8 @@ import pytest
 
 from pkmcal.boards.board import chessboard, load_board
 from pkmcal.boards.detect import detect_boards
-from pkmcal.boards.find import detect_board
+from pkmcal.boards.find import Markers, detect_board, detect_markers, dictionary
+from pkmcal.boards.layout import another_grid, marker_layout
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, rotation
@@ -224,10 +225,10 @@ def photographs(folder, board, count=3, size=None, start=0):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Three photographs of either board."""
+    """Three photographs of each board."""
     folder = tmp_path_factory.mktemp("boards")
     boards = {}
-    for kind in ("charuco", "chessboard"):
+    for kind in FILES:
         (folder / kind).mkdir()
         board = board_of(folder / kind, FILES[kind])
         boards[kind] = board, photographs(folder / kind, board)
@@ -259,6 +260,10 @@ def test_every_photograph_has_a_result(pictures):
                      marks=pytest.mark.slow),
         ("charuco", (("[9, 7]", "[9, 6]"),), "9x7 squares", "9x6 squares"),
         ("charuco", (("5X5_100", "4X4_100"),), "markers of DICT_5X5_50", "9x7 squares"),
+        ("aruco_grid", (("[5, 4]", "[4, 5]"),), "a grid of 5x4 markers", "4x5 markers"),
+        ("aruco_grid", (("[5, 4]", "[5, 3]"),), "markers 15, 16, 17, 18 beyond", "5x3 markers"),
+        ("aruco_grid", (("[5, 4]", "[5, 4]\nfirst_id: 1"),), "first_id: 0", "first_id: 1"),
+        ("aruco_grid", (("[5, 4]", "[5, 4]\nfirst_id: 5"),), "first_id: 0", "first_id: 5"),
     ],
 )  # fmt: skip
 def test_a_wrong_board_file_says_what_fits(pictures, tmp_path, kind, pairs, shows, says):
@@ -268,6 +273,37 @@ def test_a_wrong_board_file_says_what_fits(pictures, tmp_path, kind, pairs, show
     assert "another board than the one described" in str(caught.value)
     assert shows in caught.value.found
     assert says in caught.value.expected
+
+
+@pytest.mark.parametrize(("gap", "advice"), [("0.3", "gap: 0.012;"), ("0.024", "a ruler")])
+def test_gaps_that_are_not_as_described(pictures, tmp_path, gap, advice):
+    """As a part of a marker's side, as other programs write it, or simply wrong."""
+    board = described(tmp_path, "aruco_grid", ("0.012", gap))
+    with pytest.raises(InputError) as caught:
+        detect_boards(pictures["aruco_grid"][1], board)
+    assert "which is 0.012 m" in caught.value.found
+    assert advice in caught.value.next_step
+
+
+def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
+    """Of a part of the board, by a fisheye: steps along rows and columns, the gap, and the ids that
+    may be the first; ids in one row are not put into two."""
+    board = board_of(tmp_path, FILES["aruco_grid"])
+    words = dictionary(board.document["dictionary"])
+    turns = (0.3, -0.3, 0.1), (-0.4, 0.2, 0.0)
+    images = [render(CAMERAS["fisheye"], view(board, t, (0.0, 0.0), 0.28), board) for t in turns]
+    found = [detect_markers(image, words) for image in images]
+    layout = marker_layout(found)
+    assert (layout.along, layout.down) == (1, 5)
+    assert layout.gap == pytest.approx(0.3, abs=0.03)
+    assert layout.first_ids() == [0]
+    assert another_grid(layout, board) is None
+    right = [  # without the first column: the board may begin with 1, if it is no wider
+        Markers(ids[ids % 5 > 0], corners[ids % 5 > 0]) for ids, corners in found
+    ]
+    assert marker_layout(right).first_ids() == [1, 0]
+    assert another_grid(marker_layout(right), board) is None
+    assert marker_layout([Markers(ids[:2], corners[:2]) for ids, corners in found]) is None
 
 
 def test_two_boards_mixed(pictures):

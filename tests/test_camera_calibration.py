@@ -22,8 +22,10 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.boards.selection import (
     _tries,
+    best_of,
     camera_candidates,
     first_fit,
+    is_worse,
     line_offsets,
     positions,
     thinned,
@@ -198,6 +200,62 @@ def test_opencv_agrees():
     k, d = np.asarray(k), np.asarray(d).ravel()
     np.testing.assert_allclose(ours[:4], [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rtol=2e-4)
     np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
+
+
+def misnumbered(found, columns=8):
+    """Detections whose corners of the first column bear the numbers of the row above."""
+    out = []
+    for one in found:
+        ids = one.ids.copy()
+        first = ids % columns == 0
+        ids[first] -= columns
+        kept = ids >= 0
+        out.append(replace(one, ids=ids[kept], pixels=one.pixels[kept], sigma=one.sigma[kept]))
+    return out
+
+
+def test_corners_with_wrong_numbers_are_no_lens(monkeypatch):
+    """All fit but those of one column: the board is another, however well the rest fits."""
+    alone(monkeypatch, "pinhole")
+    true = TRUE["pinhole"]
+    found = detections(true, poses_for(true, 10, 1), 2)
+    with pytest.raises(InputError, match="do not lie as its file numbers them") as caught:
+        calibrate_camera(misnumbered(found), BOARD, "pinhole")
+    assert caught.value.found.startswith(f"{BOARD.counts[1] - 1} of {len(BOARD.points)} corners")
+
+
+def test_corners_at_others_places_in_one_view_are_outliers(monkeypatch):
+    """A detection that failed once says nothing of the board."""
+    alone(monkeypatch, "pinhole")
+    true = TRUE["pinhole"]
+    found = detections(true, poses_for(true, 10, 1), 2)
+    found = calibrate_camera([*misnumbered(found[:1]), *found[1:]], BOARD, "pinhole")
+    assert np.all(found.weight[1:] > 0)
+
+
+def test_too_many_corners_off_are_refused(monkeypatch):
+    """Fourteen of forty-eight some 5 px off: what is left of a board would be its own witness."""
+    alone(monkeypatch, "pinhole")
+    true = TRUE["pinhole"]
+    found, rng = detections(true, poses_for(true, 10, 1), 2), np.random.default_rng(3)
+    for one in found:
+        one.pixels[rng.permutation(48)[:14]] += rng.normal(0, 5, (14, 2))
+    with pytest.raises(ResultError, match="too many of the board's corners") as caught:
+        calibrate_camera(found, BOARD, "pinhole")
+    assert float(caught.value.found.partition("%")[0]) == pytest.approx(100 * 14 / 48, abs=2)
+
+
+def test_no_model_wins_by_giving_up_more():
+    """A fit without a quarter of the corners, whose rest fits better, against one that has all."""
+    true = TRUE["pinhole"]
+    views = views_of(detections(true, poses_for(true, 10, 1), 2), BOARD)
+    pool = camera_candidates(views, SIZE, ("pinhole",))
+    best = best_of(pool)
+    by_view = best.by_view
+    assert best.robust == pytest.approx(best.left_out, rel=0.02)  # none is given up
+    aside = replace(best, left_out=best.left_out / 2, robust=2 * best.robust, by_view=4 * by_view)
+    assert best_of((aside, best)) is best
+    assert is_worse(aside, best)
 
 
 @ONE_MODEL

@@ -12,7 +12,13 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import detect_boards
-from pkmcal.boards.fit import CameraFit, Views, covariance_of, views_of
+from pkmcal.boards.fit import (
+    CameraFit,
+    Views,
+    check_numbering,
+    covariance_of,
+    views_of,
+)
 from pkmcal.boards.selection import (
     DISTORTION_CANDIDATES,
     Candidate,
@@ -40,6 +46,9 @@ LEAST_SURE = 0.02
 2 cm off."""
 HELD_OUT_ERROR_LIMIT = 0.004
 """Held-out error as a share of the image's width from which no model explains the photographs."""
+MOST_CORNERS_LOST = 0.25
+"""Share of the corners that may be left out: their noise is judged by the better half of all, which
+says nothing of the rest where that is another kind."""
 ODD_VIEW_RMS_FACTOR = 2.5
 FACING_CAMERA_TILT = 15.0
 """degrees; boards tilted by less all say the same about the focal length."""
@@ -173,6 +182,7 @@ def calibrate_camera(
     chosen = best_of(mine)
     doubt = check_model(model, chosen, best_of(pool))
     fit = fitted_to_all(chosen, views)
+    check_corners(fit, views, board)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
     spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
@@ -275,6 +285,24 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
         next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
+    )
+
+
+def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
+    """Raise `InputError` where the board's corners do not lie as its file has them, and
+    `ResultError` where too many fit no camera.
+    """
+    check_numbering(fit.residuals, views.pixels, board, "the board file")
+    seen = views.seen
+    lost = 1 - float((seen & (fit.weight >= 0.5)).sum()) / max(int(seen.sum()), 1)
+    if lost <= MOST_CORNERS_LOST:
+        return
+    raise ResultError(
+        "too many of the board's corners do not fit the rest",
+        found=f"{lost:.0%} of them ({fit.camera.model} fits best)",
+        expected=f"{MOST_CORNERS_LOST:.0%} at most",
+        next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
+        " moved",
     )
 
 

@@ -21,6 +21,7 @@ from pkmcal.boards.find import (
     dictionary,
     find_chessboard,
 )
+from pkmcal.boards.layout import LEAST_MARKER_SIDE, another_grid, marker_layout
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
@@ -40,8 +41,6 @@ LARGEST_FAMILY_DICTIONARY = 1000
 OTHER_MARKER = 0.1
 """Part by which markers must differ from their description: their corners are found to half a
 pixel or so, which is a twentieth of the smallest that are looked at."""
-LEAST_MARKER = 10.0
-"""px; the side of such a marker."""
 LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
@@ -102,6 +101,8 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
     shown = [path for path, _ in seen]
     size = found[0].image_size
     other: str | None = None
+    if board.type == "aruco_grid":
+        _check_grid([path for path, _ in seen[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
     for path, detection in seen[:BOARD_PHOTOGRAPHS_EXAMINED]:
         # One photograph alone may show something beside the board that looks like more of it.
         image = decode(path, size, path.name)
@@ -144,12 +145,41 @@ def check_any(found: Sequence[Detection], board: Board) -> None:
 
 
 def _another(path: Path, other: str, board: Board) -> InputError:
+    grid = board.type == "aruco_grid"
+    first = f" with first_id: {board.document.get('first_id', 0)}" if grid else ""
     return InputError(
         "the photographs show another board than the one described",
         where=path.name,
         found=other,
-        expected=f"{board.described}, as the board file says",
+        expected=f"{board.described}{first}, as the board file says",
         next_step="Write what the board has into the board file",
+    )
+
+
+def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> None:
+    """Raise `InputError` where a grid's markers do not lie to each other as its file says."""
+    words = dictionary(board.document["dictionary"])
+    layout = marker_layout([detect_markers(decode(p, size, p.name), words) for p in paths])
+    if layout is None:
+        return
+    other = another_grid(layout, board)
+    if other is not None:
+        raise _another(paths[0], other, board)
+    marker, gap = board.document["marker"], board.document["gap"]
+    if abs((1 + layout.gap) * marker / (marker + gap) - 1) <= OTHER_MARKER:
+        return
+    # programs that write the gap as a part of the marker's side
+    ratio = abs((1 + layout.gap) / (1 + gap) - 1) <= OTHER_MARKER
+    raise InputError(
+        "the gaps between the board's markers are not as its file says",
+        where=paths[0].name,
+        found=f"gaps of {layout.gap:.2g} times a marker's side, which is"
+        f" {layout.gap * marker:.2g} m beside marker: {marker:g}",
+        expected=f"{gap / marker:.2g} times, by gap: {gap:g}",
+        next_step=f"Write gap in metres, gap: {gap * marker:g}; {gap:g} is its part of a marker's"
+        " side, as other programs have it"
+        if ratio
+        else "Measure a marker and a gap with a ruler, the marker with its black border",
     )
 
 
@@ -180,7 +210,7 @@ def marker_share(markers: Markers, board: Board, detection: Detection) -> float 
 
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
-    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER
+    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER_SIDE
     corners, wide = corners[large], wide[large]
     if len(corners) < LEAST_MARKERS:
         return None

@@ -20,6 +20,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.cameras.contract import Camera
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
 from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import normal_root
@@ -29,6 +30,10 @@ LEAST_KNOWN = 1e-14
 """Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
+LEAST_VIEWS_ELSEWHERE = 2
+"""Views in which a corner has to lie at another one's place, before its number is wrong."""
+CORNERS_OF_A_MARKER = 4
+"""Corners that one wrong marker, such as another thing's, puts elsewhere in all views."""
 CAMERA_FIT_ROUNDS = 12
 CAMERA_FIT_STEPS = 20
 """Most steps of a round; a long valley, such as that of xi and f, is followed over several."""
@@ -263,6 +268,32 @@ def inverted(normal: Array) -> Array:
     """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
     half = normal_root(normal, LEAST_KNOWN, loose=True)
     return half @ half.mT
+
+
+def check_numbering(residuals: Array, pixels: Array, board: Board, where: str) -> None:
+    """Raise `InputError` where corners lie at other ones' places in most of the views that show
+    them, by residuals and pixels (V, N, 2), NaN where not seen.
+
+    In single views it is a detection that failed; in most of them the board is another. A robust
+    fit gives such corners up, whatever their share, and what is left of them may fit any lens.
+    """
+    gap = np.linalg.norm(pixels[:, :, None] - pixels[:, None], axis=-1)
+    each = np.arange(pixels.shape[1])
+    gap[:, each, each] = np.inf
+    nearest = np.where(np.isfinite(gap), gap, np.inf).min(axis=-1, initial=np.inf)
+    off = np.linalg.norm(residuals, axis=-1)
+    seen = np.isfinite(off) & np.isfinite(nearest)
+    elsewhere = np.sum(seen & (np.nan_to_num(off) > nearest / 2), axis=0)
+    wrong = (elsewhere >= LEAST_VIEWS_ELSEWHERE) & (2 * elsewhere > seen.sum(axis=0))
+    if wrong.sum() <= CORNERS_OF_A_MARKER or 2 * wrong.sum() > len(wrong):
+        return  # where most lie elsewhere there is no board to be numbered
+    raise InputError(
+        "the board's corners do not lie as its file numbers them",
+        where=where,
+        found=f"{int(wrong.sum())} of {len(wrong)} corners at other ones' places",
+        expected=board.described,
+        next_step="Check the numbers of rows and columns, the first marker's id and the dictionary",
+    )
 
 
 def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:

@@ -31,6 +31,7 @@ from pkmcal.boards.fit import (
     BoardPoses,
     Views,
     board_poses,
+    check_numbering,
     fit_board_poses,
     tilted_back,
     views_of,
@@ -220,6 +221,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
 
 def _check_explained(seen: BoardViews) -> None:
     """Raise `InputError` where the corners do not lie as board and camera files say."""
+    check_numbering(seen.poses.residuals, seen.views.pixels, seen.board, "board.yaml")
     limit = BOARD_RESIDUAL_LIMIT * seen.camera.image_size[0]
     if not len(seen.rms) or np.median(seen.rms) <= limit:
         return

@@ -26,6 +26,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.solver.elimination import eliminate
+from pkmcal.solver.search import NO_WEIGHT_DISTANCE
 
 FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of pixels a radian in the picture's middle, as a share of its width."""
@@ -48,6 +49,8 @@ DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
 """Candidates, from few terms to many; the model with the fewest first among equals."""
 LEAST_GAIN = 0.01
 """Share by which the error on left-out views must fall for a term to be worth having."""
+MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
+"""Median length of two normal numbers, in their standard deviations."""
 MOST_CORNERS = 1500
 """Corners in all that the choice looks at; the final fit takes every one."""
 LEAST_RAYS = 4
@@ -218,8 +221,10 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
 class Candidate:
     """One model with one set of terms.
 
-    parameters : number of free intrinsics. rms : px, length of the residual, root mean square.
-    left_out : the same on views left out of the fit, to first order. by_view : (V,) px^2.
+    parameters : number of free intrinsics. rms : px, length of the residual, root mean square over
+    the corners in use by the best candidate. left_out : the same on views left out of the fit, to
+    first order. robust : the same of all corners, each counting for no more than the best
+    candidate's noise allows; by_view : (V,) px^2, its squares by view.
     """
 
     model: str
@@ -227,6 +232,7 @@ class Candidate:
     parameters: int
     rms: float
     left_out: float
+    robust: float
     by_view: Array
     fit: CameraFit
 
@@ -252,15 +258,33 @@ def camera_candidates(
             start = fit if "k1" in terms else start
     if not fits:
         return ()
-    # Judged by the corners in use by the one that fits best.
-    judged = (min((fit for _, _, fit in fits), key=_level).weight > 0.5) & views.seen
-    pool = [_candidate(model, terms, fit, views, judged) for model, terms, fit in fits]
+    # All are compared by the same corners, those that a fit gave up too: each counts for as much as
+    # the one that fits best gives up, and no model wins by giving up more.
+    usual = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
+    most = NO_WEIGHT_DISTANCE**2 * (usual**2 + views.sigma**2)
+    off = [left_out_residuals(fit, views) for _, _, fit in fits]
+    bounded = [np.minimum(_squares(left, views.seen), most) for left in off]
+    best = int(np.argmin([np.sum(squares) for squares in bounded]))
+    used = (fits[best][2].weight > 0.5) & views.seen
+    pool = [
+        Candidate(
+            model=model,
+            terms=terms,
+            parameters=len(fit.free),
+            rms=_rms(fit.residuals, used),
+            left_out=_rms(left, used),
+            robust=float(np.sqrt(np.sum(squares) / max(int(views.seen.sum()), 1))),
+            by_view=np.sum(squares, axis=1) / np.maximum(views.seen.sum(axis=1), 1),
+            fit=fit,
+        )
+        for (model, terms, fit), left, squares in zip(fits, off, bounded, strict=True)
+    ]
     return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
 
 def best_of(pool: tuple[Candidate, ...]) -> Candidate:
     """The fewest parameters among candidates that cannot be told from the best."""
-    best = min(pool, key=lambda c: c.left_out)
+    best = min(pool, key=lambda c: c.robust)
     return min((c for c in pool if not is_worse(c, best)), key=lambda c: c.parameters)
 
 
@@ -268,7 +292,7 @@ def is_worse(candidate: Candidate, best: Candidate) -> bool:
     """True where left-out views tell the two apart: by a hundredth of the error, and by more
     than the standard error of the difference over the views.
     """
-    if candidate.left_out <= best.left_out * (1 + LEAST_GAIN):
+    if candidate.robust <= best.robust * (1 + LEAST_GAIN):
         return False
     gain = candidate.by_view - best.by_view
     error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
@@ -300,21 +324,11 @@ def _level(fit: CameraFit) -> float:
     return float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1)))
 
 
-def _candidate(
-    model: str, terms: tuple[str, ...], fit: CameraFit, views: Views, judged: Booleans
-) -> Candidate:
-    def squares(off: Array) -> Array:
-        return np.where(judged, np.sum(np.nan_to_num(off) ** 2, axis=-1), 0.0)
+def _squares(off: Array, counted: Booleans) -> Array:
+    """Squared lengths (V, N) of residuals (V, N, 2) of the corners that count."""
+    return np.where(counted, np.sum(np.nan_to_num(off) ** 2, axis=-1), 0.0)
 
-    left_out = squares(left_out_residuals(fit, views))
-    counts = np.maximum(judged.sum(axis=1), 1)
-    total = max(int(judged.sum()), 1)
-    return Candidate(
-        model=model,
-        terms=terms,
-        parameters=len(fit.free),
-        rms=float(np.sqrt(squares(fit.residuals).sum() / total)),
-        left_out=float(np.sqrt(left_out.sum() / total)),
-        by_view=left_out.sum(axis=1) / counts,
-        fit=fit,
-    )
+
+def _rms(off: Array, counted: Booleans) -> float:
+    """Root mean square of the lengths."""
+    return float(np.sqrt(_squares(off, counted).sum() / max(int(counted.sum()), 1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +32,7 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
     if board is None:
         return Boards()
     found: dict[int, StationBoard] = {}
-    by_hand: dict[str, list[Detection]] = {}
+    by_hand: dict[str, list[tuple[Path, Detection]]] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
@@ -40,11 +41,12 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
             continue
         # walking round a machine one does not see its board from everywhere
         one, seen = _board_by_hand(session, board, number, images[number])
-        by_hand.setdefault(station.entry, []).append(one)
+        by_hand.setdefault(station.entry, []).append((station.photographs[0].path, one))
         if seen is not None:
             found[number] = seen
-    for entry, detections in by_hand.items():
-        _check_shown(entry, board, detections)
+    for entry, photographs in by_hand.items():
+        _check_another(board, entry, *zip(*photographs, strict=True))
+        _check_shown(entry, board, [detection for _, detection in photographs])
     return Boards(found, session.board_body, board.tolerance)
 
 
@@ -64,7 +66,7 @@ def station_board(
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.found for detection in detections)
-    _check_another(session, board, number, detections)
+    _check_another(board, station.name, [p.path for p in station.photographs], detections)
     # A board that moves says something new in every photograph; a still one is seen enough.
     most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
     detections = detect_again(images, board, detections, most)
@@ -113,15 +115,13 @@ def _board_by_hand(
 
 
 def _check_another(
-    session: Session, board: Board, number: int, detections: Sequence[Detection]
+    board: Board, name: str, paths: Sequence[Path], detections: Sequence[Detection]
 ) -> None:
     """Raise `InputError` where photographs show another board, or more of it than is described."""
-    station = session.stations[number]
     shown = np.flatnonzero([detection.found for detection in detections])
     rows = shown if shown.size else np.arange(len(detections))
     few = rows[evenly(len(rows), OTHER_BOARD_TRIALS)]
-    paths = [station.photographs[k].path for k in few]
     try:
-        check_boards(paths, [detections[k] for k in few], board)
+        check_boards([paths[k] for k in few], [detections[k] for k in few], board)
     except InputError as error:
-        raise error.located(f"session.yaml, stations.{station.name}") from None
+        raise error.located(f"session.yaml, stations.{name}") from None

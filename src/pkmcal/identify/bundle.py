@@ -31,8 +31,10 @@ from pkmcal.identify.noise import (
     LARGEST_NOISE_STEP,
     LEAST_NOISE_FREEDOM,
     Components,
+    NoiseShares,
     components,
     counts,
+    noise_shares,
 )
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
@@ -90,8 +92,13 @@ class BatchResult:
 
     @cached_property
     def components(self) -> Components:
-        """How large the noise of each kind of rows shows itself."""
+        """What is left of each kind of rows, and how much of it is expected."""
         return components(self.info, self.weight)
+
+    @cached_property
+    def reading_noise(self) -> NoiseShares:
+        """How large the readings' noise shows itself."""
+        return noise_shares(self.info, READING_ROWS_KIND)
 
     @cached_property
     def covariance(self) -> Array:
@@ -230,7 +237,7 @@ def _readings_step(
     """
     if not by_data.any():
         return before, made
-    asked = np.log(fit.components.factor(READING_ROWS_KIND))
+    asked = np.log(fit.reading_noise.factor())
     # what is asked for at most is not all that is missing
     shrinks = (
         (asked * before > 0)
@@ -245,11 +252,9 @@ def _readings_speak(fit: BatchResult) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
-    found = fit.components
+    found = fit.reading_noise
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
-    return (found.contradicts(READING_ROWS_KIND) | alone) & (
-        found.told[:, READING_ROWS_KIND] > LEAST_NOISE_FREEDOM
-    )
+    return found.contradicts() | (alone & (found.freedom(found.best) > LEAST_NOISE_FREEDOM))
 
 
 def _settled(
@@ -554,14 +559,14 @@ def _statistics(
         dof_joints=freedom[READING_ROWS_KIND],
         dof_poses=freedom[POSE_ROWS_KIND],
         reading_scale=float(result.reading_scale[0]),
-        reading_range=_range(found, READING_ROWS_KIND, result.reading_scale),
-        pose_range=_range(found, POSE_ROWS_KIND, result.scale.poses),
+        reading_range=_range(result.reading_noise, result.reading_scale),
+        pose_range=_range(noise_shares(result.info, POSE_ROWS_KIND), result.scale.poses),
         shading=float(np.median(problem.data.shading[0])),
         look_scatter=float(np.sqrt(look_variance)),
     )
 
 
-def _range(found: Components, kind: int, scale: Array) -> tuple[float, float | None]:
+def _range(found: NoiseShares, scale: Array) -> tuple[float, float | None]:
     """Factors on a stated noise that the data allow, where ``scale`` (1,) is in use."""
-    low, high = (float((scale * end)[0]) for end in found.interval(kind))
+    low, high = (float((scale * end)[0]) for end in found.interval())
     return low, high if np.isfinite(high) else None

@@ -15,37 +15,43 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver.elimination import divisions, flat
-from pkmcal.solver.strips import Eliminated, eliminated
+from pkmcal.solver.strips import Compact, Eliminated, eliminated
 
 EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND = range(3)
 """Kinds of rows in the axes of :class:`KindSums`."""
 
 
 class KindSums(NamedTuple):
-    """Sums over the configurations c of B runs; kinds k, l of rows as :data:`EDGE_ROWS_KIND`.
+    """Sums over the configurations c of B runs; kinds k of rows as :data:`EDGE_ROWS_KIND`.
 
     With Q of the own Jacobian in a configuration and its reduced rows A, Q_k and A_k those of a
-    kind: own sum_c tr(Q_k^T Q_k Q_l^T Q_l) (B, 3, 3), trace sum_c tr Q_k^T Q_k (B, 3), cross
-    sum_c (Q_k^T A_k)^T Q_l^T A_l (B, 3, 3, na, na), normal sum_c A_k^T A_k (B, 3, na, na).
-    every : sum_c A^T A (B, na, na) of all rows, those that are of no kind, as of rods of constant
-    length, among them. chi2 : (B, 3). value : (B, K, r) residuals, zero where nothing can be
-    predicted or is there.
+    kind: trace sum_c tr Q_k^T Q_k (B, 3), normal sum_c A_k^T A_k (B, 3, na, na). every : sum_c A^T
+    A (B, na, na) of all rows, those that are of no kind, as of rods of constant length, among them.
+    chi2 : (B, 3). value : (B, K, r) residuals, zero where nothing can be predicted or is there.
     """
 
-    own: Array
     trace: Array
-    cross: Array
     normal: Array
     every: Array
     chi2: Array
     value: Array
 
 
+class KindRows(NamedTuple):
+    """Rows of one kind in K configurations of B runs, n of each: own (B, K, n, d) of the
+    orthonormal basis of the configuration's own Jacobian, shared (B, K, n, na) reduced, and their
+    residuals (B, K, n); zero where nothing can be predicted or is there.
+    """
+
+    own: Array
+    shared: Array
+    value: Array
+
+
 def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     """Those of a problem's rows at a state."""
     n_runs, na = len(state.z), problem.unknowns.count
-    own, trace = np.zeros((n_runs, 3, 3)), np.zeros((n_runs, 3))
-    cross, normal = np.zeros((n_runs, 3, 3, na, na)), np.zeros((n_runs, 3, na, na))
+    trace, normal = np.zeros((n_runs, 3)), np.zeros((n_runs, 3, na, na))
     every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3))
     values: list[Array] = []
     for cut in divisions(*problem.extent):
@@ -54,47 +60,42 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
         found = eliminated(rows, np.zeros(n_runs))
         values.append(rows.value)
         every += found.strips_normal + found.rows_normal
-        kinds = _of_kinds(part, found, by_reading)
-        for k, (squares, along, square) in kinds.items():
-            trace[:, k] += np.einsum("bcii->b", squares)
-            normal[:, k] += square
-            for m in (m for m in kinds if m >= k):  # the others are their transposes
-                others, beside, _ = kinds[m]
-                own[:, k, m] += np.sum(squares * others, axis=(1, 2, 3))
-                cross[:, k, m] += flat(along).mT @ flat(beside)
+        if part.kinds.edges.present.any():
+            trace[:, EDGE_ROWS_KIND] += np.einsum("bcii->b", found.own)
+            normal[:, EDGE_ROWS_KIND] += found.strips_normal
+        for kind in (POSE_ROWS_KIND, READING_ROWS_KIND):
+            own, shared, _ = _rows_of_kind(part, rows, found, by_reading, kind)
+            if shared.size:
+                trace[:, kind] += np.sum(own**2, axis=(1, 2, 3))
+                normal[:, kind] += flat(shared).mT @ flat(shared)
         chi2 += _chi2(part, rows.value, by_reading)
-    for k, m in (
-        (POSE_ROWS_KIND, EDGE_ROWS_KIND),
-        (READING_ROWS_KIND, EDGE_ROWS_KIND),
-        (READING_ROWS_KIND, POSE_ROWS_KIND),
-    ):
-        own[:, k, m], cross[:, k, m] = own[:, m, k], cross[:, m, k].mT
-    return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
+    return KindSums(trace, normal, every, chi2, np.concatenate(values, axis=1))
 
 
-def _of_kinds(
-    problem: Problem, found: Eliminated, by_reading: Array
-) -> dict[int, tuple[Array, Array, Array]]:
-    """Of each kind that there is in some configurations Q_k^T Q_k (B, K, d, d), Q_k^T A_k
-    (B, K, d, na) and the sum of A_k^T A_k (B, na, na); by_reading (B, K, E).
-    """
-    equations = problem.layout.n_equations
-    out = dict[int, tuple[Array, Array, Array]]()
-    if problem.kinds.edges.present.any():
-        along = found.along_strips - found.own @ found.along
-        out[EDGE_ROWS_KIND] = found.own, along, found.strips_normal
-    for kind, part, rows in (
-        (POSE_ROWS_KIND, found.q[:, :, equations:], found.rows[:, :, equations:]),
-        (
-            READING_ROWS_KIND,
-            _readings(problem, found.q[:, :, :equations], by_reading),
-            _readings(problem, found.rows[:, :, :equations], by_reading),
-        ),
-    ):
-        if rows.size:
-            every = flat(rows)
-            out[kind] = part.mT @ part, part.mT @ rows, every.mT @ every
-    return out
+def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
+    """The rows of poses or of readings at a state."""
+    parts: list[KindRows] = []
+    for cut in divisions(*problem.extent):
+        part, at = problem.among(cut), problem.state_among(state, cut)
+        rows, by_reading = part.compact(at), part.closure(at).by_reading
+        found = eliminated(rows, np.zeros(len(state.z)))
+        parts.append(_rows_of_kind(part, rows, found, by_reading, kind))
+    return KindRows(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+
+
+def _rows_of_kind(
+    problem: Problem, rows: Compact, found: Eliminated, by_reading: Array, kind: int
+) -> KindRows:
+    """The rows of poses or of readings in some configurations; by_reading (B, K, E)."""
+    equations, start = problem.layout.n_equations, problem.closure_rows.start
+    parts = found.q, found.rows, rows.value[:, :, start:, None]
+    if kind == POSE_ROWS_KIND:
+        own, shared, value = (part[:, :, equations:] for part in parts)
+    else:
+        own, shared, value = (
+            _readings(problem, part[:, :, :equations], by_reading) for part in parts
+        )
+    return KindRows(own, shared, value[..., 0])
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
