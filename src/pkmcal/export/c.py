@@ -84,9 +84,15 @@ class CSource(Exporter):
             self.trial,
         )
         return {
-            C_HEADER_FILE: _filled(C_HEADER_FILE, about, _sizes(source.machine, rods)),
-            C_SOURCE_FILE: _filled(C_SOURCE_FILE, (*about, *sigmas), _tables(source.machine, rods)),
-            C_SELFTEST_FILE: _filled(C_SELFTEST_FILE, (*source.header(), *test), _pairs(source)),
+            C_HEADER_FILE: filled(
+                C_SOURCE_FOLDER / C_HEADER_FILE, about, _sizes(source.machine, rods)
+            ),
+            C_SOURCE_FILE: filled(
+                C_SOURCE_FOLDER / C_SOURCE_FILE, (*about, *sigmas), _tables(source.machine, rods)
+            ),
+            C_SELFTEST_FILE: filled(
+                C_SOURCE_FOLDER / C_SELFTEST_FILE, (*source.header(), *test), _pairs(source)
+            ),
         }
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -152,9 +158,9 @@ def _bounds(machine: Machine) -> Array:
 # What is written into the files
 
 
-def _filled(name: str, about: Iterable[str], numbers: str) -> str:
-    """A file of the folder with another comment on top and another machine's numbers."""
-    text = (C_SOURCE_FOLDER / name).read_text(encoding="utf-8")
+def filled(path: Path, about: Iterable[str], numbers: str) -> str:
+    """A C file with another comment on top and another machine's numbers."""
+    text = path.read_text(encoding="utf-8")
     above, _, below = text.partition(MACHINE_NUMBERS_BEGIN)
     above = above[above.index("*/\n") + 3 :]
     after = below.partition(MACHINE_NUMBERS_END)[2]

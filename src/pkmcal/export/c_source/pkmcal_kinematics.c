@@ -832,7 +832,7 @@ static pkmcal_real allowed(const pkmcal_real step[UNKNOWNS])
 /* ---- the pose at readings ---- */
 
 /* Rounding: of a length it is some PKMCAL_EPSILON times the machine's size. */
-#define CLOSED (8 * PKMCAL_EPSILON * SIZE)   /* m, some units in the last place of a length */
+#define CLOSED (2 * PKMCAL_EPSILON * SIZE)   /* m, some units in the last place of a length */
 #define NEARLY (256 * PKMCAL_EPSILON * SIZE) /* m, good enough where no step makes it better */
 #define LEAST_SHARE REAL(0.1)   /* of Newton's step; where it still overshoots, it is damped */
 #define LEAST_PIVOT HALF_DIGITS /* below it not half of a step's digits would be right */
