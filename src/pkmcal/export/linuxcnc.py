@@ -137,7 +137,10 @@ def joint_sections(joints: Joints) -> list[str]:
     lines: list[str] = []
     for n, kind in enumerate(joints.kind):
         lines.append(f"\n[JOINT_{n}]\nTYPE = {kind}")
-        lines.append(f"# joint {n} = {exact(joints.rate[n])} * reading + {exact(joints.offset[n])}")
+        sign = "-" if joints.offset[n] < 0 else "+"
+        lines.append(
+            f"# joint {n} = {exact(joints.rate[n])} * reading {sign} {exact(abs(joints.offset[n]))}"
+        )
         if abs(joints.scale[n] - 1) > UNTOLD_SCALE_DIFFERENCE:
             lines.append(f"# {SCALE_CORRECTION_ADVICE.replace('that', exact(joints.scale[n]))}")
         words = {
@@ -168,7 +171,7 @@ def _ini(about: tuple[str, ...], module: str, letters: str, home: Array, joints:
         f"[KINS]\nKINEMATICS = {module}\nJOINTS = {len(joints.kind)}\n",
         f"[TRAJ]\nCOORDINATES = {letters}\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
         "# where forward kinematics begins",
-        f"HOME = {' '.join(f'{value:.6f}' for value in np.array(world_home) + 0.0)}",
+        f"HOME = {' '.join(f'{value:.6f}' for value in np.round(world_home, 6) + 0.0)}",
     ]
     return "\n".join([*lines, *joint_sections(joints)]) + "\n"
 
