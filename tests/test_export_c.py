@@ -22,66 +22,72 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
-FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-shared", "-fPIC"]
+CPP_COMPILER = shutil.which("g++") or shutil.which("c++")
+AVR_COMPILER, ARM_COMPILER = shutil.which("avr-gcc"), shutil.which("arm-none-eabi-gcc")
+WARNINGS = ["-Wall", "-Wextra", "-pedantic-errors", "-Wconversion", "-Wfloat-conversion", "-Werror"]
+FLAGS = ["-std=c99", "-O2", *WARNINGS, "-shared", "-fPIC"]
+REALS = {"double": ctypes.c_double, "float": ctypes.c_float}
+EPSILON = {"double": np.finfo(np.float64).eps, "float": np.finfo(np.float32).eps}
+SOURCES = ("pkmcal_kinematics.c", "pkmcal_selftest.c")
 OK, NOT_CONVERGED, SINGULAR, OUT_OF_REACH, BAD_INPUT = range(5)
 needs_compiler = pytest.mark.skipif(
     COMPILER is None, reason="NO C COMPILER (gcc or cc): the exported C source is not tested"
 )
 
 
-class Pose(ctypes.Structure):
-    _fields_ = (("R", ctypes.c_double * 9), ("t", ctypes.c_double * 3))
-
-    @classmethod
-    def of(cls, T):
-        return cls((ctypes.c_double * 9)(*T[:3, :3].ravel()), (ctypes.c_double * 3)(*T[:3, 3]))
-
-    def matrix(self):
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = np.reshape(self.R, (3, 3)), self.t
-        return out
+def structures(real):
+    """The header's pose and report, of one type of numbers."""
+    pose = type("Pose", (ctypes.Structure,), {"_fields_": [("R", real * 9), ("t", real * 3)]})
+    fields = [("steps", ctypes.c_int), ("error", real), ("pivot", real)]
+    return pose, type("Report", (ctypes.Structure,), {"_fields_": fields})
 
 
-class Report(ctypes.Structure):
-    _fields_ = (
-        ("steps", ctypes.c_int),
-        ("error", ctypes.c_double),
-        ("pivot", ctypes.c_double),
-    )
-
-
-def compiled(machine, folder, *flags):
+def compiled(machine, folder, *flags, real="double"):
     """A machine's source as a library, its functions on NumPy arrays."""
     made = make_export(source_of(machine), "c")
     for name, text in made.files.items():
         (folder / name).write_text(text)
-    sources = [str(folder / n) for n in ("pkmcal_kinematics.c", "pkmcal_selftest.c")]
-    path = folder / "machine.so"
+    sources = [str(folder / name) for name in SOURCES]
+    path = folder / f"{real}.so"
+    wide = ["-Wdouble-promotion", "-DPKMCAL_FLOAT"] if real == "float" else []
     done = subprocess.run(
-        [COMPILER, *FLAGS, *flags, *sources, "-o", str(path), "-lm"],
+        [COMPILER, *FLAGS, *wide, *flags, *sources, "-o", str(path), "-lm"],
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return SimpleNamespace(compiled=ctypes.CDLL(str(path)), machine=machine)
+    pose, report = structures(REALS[real])
+    return SimpleNamespace(
+        compiled=ctypes.CDLL(str(path)), machine=machine, real=REALS[real], Pose=pose, Report=report
+    )
 
 
-def doubles(values):
+def numbers(c, values):
     values = np.asarray(values, dtype=float).ravel()
-    return (ctypes.c_double * values.size)(*values)
+    return (c.real * values.size)(*values)
+
+
+def pose_of(c, T):
+    return c.Pose(numbers(c, T[:3, :3]), numbers(c, T[:3, 3]))
+
+
+def matrix(pose):
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = np.reshape(pose.R, (3, 3)), pose.t
+    return out
 
 
 def forward(c, joints, start):
     """Status, pose and report."""
-    pose, report = Pose.of(start), Report()
-    status = c.compiled.pkmcal_forward(doubles(joints), ctypes.byref(pose), ctypes.byref(report))
-    return status, pose.matrix(), report
+    pose, report = pose_of(c, start), c.Report(-1, -1.0, -1.0)
+    status = c.compiled.pkmcal_forward(numbers(c, joints), ctypes.byref(pose), ctypes.byref(report))
+    return status, matrix(pose), report
 
 
 def inverse(c, T):
-    out = doubles(np.zeros(c.machine.n_joints))
-    status = c.compiled.pkmcal_inverse(ctypes.byref(Pose.of(T)), out)
+    out = numbers(c, np.zeros(c.machine.n_joints))
+    status = c.compiled.pkmcal_inverse(ctypes.byref(pose_of(c, T)), out)
     return status, np.array(out)
 
 
@@ -126,7 +132,7 @@ def test_c_is_our_own_kinematics(name, library):
             here = np.abs(pose - T).max() < 1e-12
             assert here or begin is home
             elsewhere += not here
-        assert c.compiled.pkmcal_out_of_range(doubles(q)) == 0
+        assert c.compiled.pkmcal_out_of_range(numbers(c, q)) == 0
     assert elsewhere <= 1  # Newton's method from afar may find another way to assemble a machine
 
 
@@ -135,8 +141,8 @@ def test_c_is_our_own_kinematics(name, library):
 def test_c_jacobian_is_ours(name, library):
     c = library(name)
     for T in samples(c.machine, 5)[0]:
-        out = doubles(np.zeros(6 * c.machine.n_joints))
-        assert c.compiled.pkmcal_inverse_jacobian(ctypes.byref(Pose.of(T)), out) == OK
+        out = numbers(c, np.zeros(6 * c.machine.n_joints))
+        assert c.compiled.pkmcal_inverse_jacobian(ctypes.byref(pose_of(c, T)), out) == OK
         found = np.reshape(out, (-1, 6))
         np.testing.assert_allclose(found, c.machine.inverse_jacobian(T[None])[0], atol=1e-11)
 
@@ -147,6 +153,76 @@ def test_the_self_test_passes(name, library, capfd):
     assert library(name).compiled.main() == 0
     ctypes.CDLL(None).fflush(None)
     assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rps", "delta", "h4-rods"])
+def test_a_build_in_floats_is_right_to_the_last_digits_of_floats(name, tmp_path, capfd):
+    """A float has 24 bits: some of its last digits, over how well the platform is held."""
+    c = compiled(built(name), tmp_path, real="float")
+    assert c.compiled.main() == 0
+    ctypes.CDLL(None).fflush(None)
+    assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
+    poses, joints = samples(c.machine, 40, seed=5)
+    for T, q in zip(poses, joints, strict=True):
+        status, found = inverse(c, T)
+        assert status == OK
+        assert np.abs(found - q).max() < 100 * EPSILON["float"]
+        for start in (T, c.machine.home()):
+            status, pose, report = forward(c, q, start)
+            assert status == OK
+            assert report.steps < 20
+            if start is T:
+                off = np.abs(pose - T).max()
+                assert off * min(report.pivot, 1.0) < 100 * EPSILON["float"]
+        assert c.compiled.pkmcal_out_of_range(numbers(c, q)) == 0
+    low, high = c.machine.joint_ranges.T
+    for limit in (low, high):  # rounded to a float, a limit is still no reading beyond it
+        assert c.compiled.pkmcal_out_of_range(numbers(c, limit)) == 0
+    assert c.compiled.pkmcal_out_of_range(numbers(c, high + 1e-4)) == 1
+    far = c.machine.home()
+    far[:3, 3] += 5.0
+    expected = OK if name in ("gough-stewart", "3-rps") else OUT_OF_REACH
+    assert inverse(c, far)[0] == expected
+
+
+@pytest.mark.skipif(CPP_COMPILER is None, reason="NO C++ COMPILER (g++): C as C++ is not tested")
+@pytest.mark.parametrize("name", ["gough-stewart", "3-upu", "h4-rods"])
+def test_the_source_is_c_plus_plus_as_well(name, tmp_path):
+    """Arduino's .ino files are C++ 11 and newer; so is what some controllers are built of."""
+    for file, text in CSource().files(source_of(built(name))).items():
+        (tmp_path / file).write_text(text)
+    for flags in (["-std=c++17"], ["-std=c++11", "-DPKMCAL_FLOAT", "-Wdouble-promotion"]):
+        done = subprocess.run(
+            [CPP_COMPILER, "-x", "c++", *flags, *WARNINGS, "-fsyntax-only", *SOURCES],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    AVR_COMPILER is None or ARM_COMPILER is None,
+    reason="NO avr-gcc OR NO arm-none-eabi-gcc: the C source is not built for controllers",
+)
+@pytest.mark.parametrize("name", [n for n in sorted(catalogue()) if n != "four-belt"])
+def test_controllers_compilers_take_the_source(name, tmp_path):
+    for file, text in CSource().files(source_of(built(name))).items():
+        (tmp_path / file).write_text(text)
+    cortex = [ARM_COMPILER, "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
+    avr = [AVR_COMPILER, "-mmcu=atmega2560"]
+    for command in (cortex, [*cortex, "-DPKMCAL_FLOAT", "-Wdouble-promotion"], avr):
+        done = subprocess.run(
+            [*command, "-std=c99", "-Os", "-Wall", "-Wextra", "-Werror", "-c", SOURCES[0]],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
 
 
 @needs_compiler
@@ -174,7 +250,7 @@ def test_the_self_test_finds_another_machine(tmp_path, capfd):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     program = tmp_path / "selftest"
-    sources = [str(tmp_path / n) for n in ("pkmcal_kinematics.c", "pkmcal_selftest.c")]
+    sources = [str(tmp_path / name) for name in SOURCES]
     subprocess.run([COMPILER, "-std=c99", *sources, "-o", program, "-lm"], check=True)
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert done.returncode == 1
@@ -215,20 +291,27 @@ def test_statuses(library):
     c = library("gough-stewart")
     home = c.machine.home()
     q = c.machine.inverse(home[None])[0]
-    assert forward(c, np.full(6, np.nan), home)[0] == BAD_INPUT
-    assert forward(c, q, np.full((4, 4), np.inf))[0] == BAD_INPUT
-    assert forward(c, q, np.diag([1.0, 1.0, 1.01, 1.0]))[0] == BAD_INPUT
+    spoilt = (
+        (np.full(6, np.nan), home),
+        (q, np.full((4, 4), np.inf)),
+        (q, np.diag([1.0, 1.0, 1.01, 1.0])),
+    )
+    for joints, start in spoilt:
+        status, _, report = forward(c, joints, start)
+        assert status == BAD_INPUT
+        # the caller reads what this call wrote, not the last one's
+        assert (report.steps, report.error, report.pivot) == (0, np.inf, 0.0)
     assert inverse(c, np.full((4, 4), np.nan))[0] == BAD_INPUT
     status, pose, report = forward(c, [0.2, 0.8, 0.2, 0.8, 0.2, 0.8], home)
     assert status == OUT_OF_REACH
     assert report.error > 1e-3
     np.testing.assert_array_equal(pose, home)  # the start stays
-    assert c.compiled.pkmcal_out_of_range(doubles(q + np.eye(6)[3])) == 4
-    assert c.compiled.pkmcal_out_of_range(doubles(q - np.eye(6)[1])) == 2
-    assert c.compiled.pkmcal_out_of_range(doubles(np.full(6, np.nan))) == 1
+    assert c.compiled.pkmcal_out_of_range(numbers(c, q + np.eye(6)[3])) == 4
+    assert c.compiled.pkmcal_out_of_range(numbers(c, q - np.eye(6)[1])) == 2
+    assert c.compiled.pkmcal_out_of_range(numbers(c, np.full(6, np.nan))) == 1
     # a null report is none
-    pose = Pose.of(home)
-    assert c.compiled.pkmcal_forward(doubles(q), ctypes.byref(pose), None) == OK
+    pose = pose_of(c, home)
+    assert c.compiled.pkmcal_forward(numbers(c, q), ctypes.byref(pose), None) == OK
 
 
 @needs_compiler

@@ -10,12 +10,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "pkmcal"
 FACES = {"__init__", "__main__"}
-ASKED_ALIKE = {
-    *("outcome_of", "section"),  # of reports: what was found, and a part of the page
-    *("CONVENTIONS", "FILE", "PROGRAM"),  # of formats to export to
-    *("is_one", "printer"),  # of firmwares' files
-}
-"""Names that several files define alike, for one caller; a command and what it calls share one."""
 
 
 def rows() -> dict[str, int]:
@@ -55,20 +49,6 @@ def arrows() -> dict[Path, set[Path]]:
     return {path: imports(path) for path in SOURCE.rglob("*.py")}
 
 
-def defined(node: ast.stmt) -> set[str]:
-    """The names that a statement of a module defines; an import defines none."""
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return {node.name}
-    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-    return {
-        name.id
-        for target in targets
-        if target is not None
-        for name in ast.walk(target)
-        if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
-    }
-
-
 def package(path: Path) -> str:
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
 
@@ -96,21 +76,6 @@ def test_no_files_import_each_other_in_a_circle():
         for path in ends:
             del left[path]
     assert sorted(str(path.relative_to(SOURCE)) for path in left) == []
-
-
-def test_a_public_name_exists_once():
-    """So that it means one thing wherever it is read; but for what a caller asks of files alike."""
-    homes: dict[str, set[str]] = {}
-    for path in SOURCE.rglob("*.py"):
-        for node in parsed(path).body:
-            for name in defined(node):
-                if not name.startswith("_"):
-                    homes.setdefault(name, set()).add(str(path.relative_to(SOURCE)))
-    assert len(homes) > 2000
-    twice = {name: sorted(files) for name, files in homes.items() if len(files) > 1}
-    asked = {name for name, files in twice.items() if f"commands/{name}.py" in files}
-    assert {name: twice[name] for name in twice.keys() - asked - ASKED_ALIKE} == {}
-    assert twice.keys() >= ASKED_ALIKE
 
 
 def is_private(name: str) -> bool:

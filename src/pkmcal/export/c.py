@@ -6,6 +6,7 @@ top and the part between two marks are written anew; everything else goes out as
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -84,9 +85,15 @@ class CSource(Exporter):
             self.trial,
         )
         return {
-            C_HEADER_FILE: _filled(C_HEADER_FILE, about, _sizes(source.machine, rods)),
-            C_SOURCE_FILE: _filled(C_SOURCE_FILE, (*about, *sigmas), _tables(source.machine, rods)),
-            C_SELFTEST_FILE: _filled(C_SELFTEST_FILE, (*source.header(), *test), _pairs(source)),
+            C_HEADER_FILE: filled(
+                C_SOURCE_FOLDER / C_HEADER_FILE, about, _sizes(source.machine, rods)
+            ),
+            C_SOURCE_FILE: filled(
+                C_SOURCE_FOLDER / C_SOURCE_FILE, (*about, *sigmas), _tables(source.machine, rods)
+            ),
+            C_SELFTEST_FILE: filled(
+                C_SOURCE_FOLDER / C_SELFTEST_FILE, (*source.header(), *test), _pairs(source)
+            ),
         }
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -152,9 +159,9 @@ def _bounds(machine: Machine) -> Array:
 # What is written into the files
 
 
-def _filled(name: str, about: Iterable[str], numbers: str) -> str:
-    """A file of the folder with another comment on top and another machine's numbers."""
-    text = (C_SOURCE_FOLDER / name).read_text(encoding="utf-8")
+def filled(path: Path, about: Iterable[str], numbers: str) -> str:
+    """A C file with another comment on top and another machine's numbers."""
+    text = path.read_text(encoding="utf-8")
     above, _, below = text.partition(MACHINE_NUMBERS_BEGIN)
     above = above[above.index("*/\n") + 3 :]
     after = below.partition(MACHINE_NUMBERS_END)[2]
@@ -173,7 +180,7 @@ def _sizes(machine: Machine, rods: Limbs) -> str:
 
 
 def _tables(machine: Machine, rods: Limbs) -> str:
-    """The machine's numbers, 17 significant digits each."""
+    """The machine's numbers, each in the fewest digits that give it back."""
     layout, home = machine.layout, machine.home()
     free = np.argmax(layout.motion, axis=0).tolist()
     away = rods.ends - rods.ends.mean(axis=0)
@@ -205,7 +212,7 @@ def _tables(machine: Machine, rods: Limbs) -> str:
 
 
 def _rods(machine: Machine, rods: Limbs) -> str:
-    """RODS, of each rod the fields that are not zero."""
+    """RODS, the fields of each rod in the structure's order; C++ takes no names there."""
     foot, swing, rate, floating = np.zeros((4, len(rods), 3))
     for k, held in enumerate(rods.held):
         bar, w = rods.bar[k], rods.hinge_axis[k]
@@ -218,7 +225,10 @@ def _rods(machine: Machine, rods: Limbs) -> str:
     for k, leg in enumerate(rods.leg):
         driven = rods.drive[k] != CONSTANT_ROD
         middle = rods.scale[k] * machine.layout.middle[leg - 1]
-        numbers: dict[str, Any] = {
+        values: dict[str, Any] = {
+            "drive": rods.drive[k].upper(),
+            "joint": int(rods.joint[k]) if driven else 0,
+            "hinge": int(rods.hinge[k]) + 1,
             "scale": rods.scale[k] if driven else 0.0,
             "middle": middle if rods.drive[k] in (SLIDE_CARRIER, TURN_CARRIER) else 0.0,
             "length": rods.length[k],
@@ -226,41 +236,37 @@ def _rods(machine: Machine, rods: Limbs) -> str:
             "arm": rods.arm[k],
             "rate": rods.rate[k],
             "platform": rods.platform[k] + foot[k],
-            "hinge": int(rods.hinge[k]) + 1,
             "hinge_axis": rods.hinge_axis[k],
             "swing": swing[k],
             "swing_rate": rate[k],
             "floating": floating[k],
         }
-        fields = [f"        .drive = {rods.drive[k].upper()},"]
-        fields += [f"        .joint = {rods.joint[k]},"] * driven
-        fields += [
-            f"        .{name} = {value if isinstance(value, int) else c_value(value)},"
-            for name, value in numbers.items()
-            if np.any(value) or name in ("length", "base", "platform")
-        ]
-        body = "\n".join(fields)
-        out.append(f"    /* leg {leg} of the mechanism file */\n    {{\n{body}\n    }},\n")
+        body = "".join(
+            f"        {c_value(value)}, /* {name} */\n" for name, value in values.items()
+        )
+        out.append(f"    /* leg {leg} of the mechanism file */\n    {{\n{body}    }},\n")
     return f"static const rod_data RODS[PKMCAL_RODS] = {{\n{''.join(out)}}};\n"
 
 
 def _axes(machine: Machine, rods: Limbs) -> str:
-    """AXIS, of each equation the axes that take part in it."""
+    """AXIS, of each equation its rod, its kind, and the axes that take part in it."""
     angles = machine.layout.angles
     base, platform = machine.base_axes(), machine.platform_axes()
-    out: list[str] = []
+    none = np.zeros(3)
+    rows: list[tuple[Any, ...]] = []
     for leg, on_base, on_platform in zip(
         angles.leg, angles.on_base, angles.on_platform, strict=True
     ):
         kind = "TORSION" if on_base and on_platform else "ON_BASE" if on_base else "ON_PLATFORM"
-        fields = f".rod = {np.flatnonzero(rods.leg == leg + 1)[0]}, .kind = {kind}"
-        if on_base:
-            fields += f",\n     .base = {c_value(base[leg])}"
-        if on_platform:
-            fields += f",\n     .platform = {c_value(platform[leg])}"
-        out.append(f"    {{{fields}}},\n")
-    rows = "".join(out) or "    {.rod = 0},\n"
-    return f"/* one row at least */\nstatic const axis_data AXIS[AXES + 1] = {{\n{rows}}};\n"
+        rod = int(np.flatnonzero(rods.leg == leg + 1)[0])
+        rows.append(
+            (rod, kind, base[leg] if on_base else none, platform[leg] if on_platform else none)
+        )
+    lines = "".join(
+        f"    {{{', '.join(c_value(value) for value in row)}}},\n"
+        for row in rows or [(0, "ON_BASE", none, none)]
+    )
+    return f"/* one row at least */\nstatic const axis_data AXIS[AXES + 1] = {{\n{lines}}};\n"
 
 
 def _pairs(source: MachineSource) -> str:
@@ -280,8 +286,7 @@ def _pairs(source: MachineSource) -> str:
         for what, of in (("POSES", poses), ("STARTS", starts))
     )
     return (
-        f'#define MACHINE "{name}"\n#define TESTED "{identity}"\n#define PAIRS {len(poses)}\n'
-        "#define LIMIT 1e-10 /* m and rad; a few digits above the rounding of a double */\n\n"
+        f'#define MACHINE "{name}"\n#define TESTED "{identity}"\n#define PAIRS {len(poses)}\n\n'
         + c_array("READINGS", "[PAIRS][PKMCAL_JOINTS]", joints)
         + "\n"
         + lists
@@ -300,25 +305,27 @@ def _flat(T: Array) -> Array:
 
 
 def c_number(value: float) -> str:
-    """A C constant of type double."""
+    """A C constant of the type that the source counts in; whole numbers as they are."""
     if not np.isfinite(value):
-        return "HUGE_VAL" if value > 0 else "-HUGE_VAL"
+        return "INFINITY" if value > 0 else "-INFINITY"
     text = exact(value)
-    return text if any(mark in text for mark in ".e") else text + ".0"
+    return f"REAL({text})" if any(mark in text for mark in ".e") else text
 
 
 def c_value(value: Any) -> str:
-    """A number, or rows of numbers in braces."""
+    """A number, a name as it is, or rows of numbers in braces."""
+    if isinstance(value, str):
+        return value
     if np.ndim(value):
         return "{" + ", ".join(c_value(part) for part in value) + "}"
     return c_number(float(value))
 
 
 def c_array(name: str, shape: str, values: Array | Sequence[Array], note: str = "") -> str:
-    """A C constant array of doubles, a row a line, with a comment above."""
+    """A C constant array of numbers, a row a line, with a comment above."""
     above = f"/* {note} */\n" if note else ""
     body = ",\n    ".join(c_value(row) for row in values)
-    return f"{above}static const double {name}{shape} = {{\n    {body}\n}};\n"
+    return f"{above}static const pkmcal_real {name}{shape} = {{\n    {body}\n}};\n"
 
 
 def c_comment(lines: Iterable[str]) -> str:
@@ -335,34 +342,45 @@ def c_comment(lines: Iterable[str]) -> str:
 # What is read from the files again
 
 _CONSTANT = re.compile(r"static const \w+ (\w+)")
-_NUMBER = re.compile(r"-?HUGE_VAL|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_NUMBER = re.compile(r"-?INFINITY|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FIELD = re.compile(r"\.(\w+) = (\{[^{}]*\}|[^\s,{}]+)")
+_WRAPPED = re.compile(r"REAL\(([^()]*)\)")
+_WORD = re.compile(r"(?<![\w.])[A-Z_]+")
 
 
 def _body(text: str, name: str) -> str:
-    """What stands between the braces of a constant, without comments."""
-    code, *others = text.split("/*")
-    plain = "".join([code, *(other.partition("*/")[2] for other in others)])
+    """A constant's value, with its braces, without comments."""
+    plain = _without_comments(text)
     ends = (found.end() for found in _CONSTANT.finditer(plain) if found[1] == name)
     return next((plain[end:].partition("= ")[2].partition(";")[0] for end in ends), "")
 
 
+def _without_comments(text: str) -> str:
+    code, *others = text.split("/*")
+    return "".join([code, *(other.partition("*/")[2] for other in others)])
+
+
 def numbers_of(text: str, name: str) -> Array:
     """A constant's numbers, flat."""
-    huge = {"HUGE_VAL": np.inf, "-HUGE_VAL": -np.inf}
+    huge = {"INFINITY": np.inf, "-INFINITY": -np.inf}
     words = _NUMBER.findall(_body(text, name))
     return np.array([huge[word] if word in huge else float(word) for word in words])
 
 
-def _records(text: str, name: str, first: str) -> list[dict[str, Any]]:
-    """A constant's rows by field, each beginning with the field ``first``; words as they are."""
-    out: list[dict[str, Any]] = []
-    for field, value in _FIELD.findall(_body(text, name)):
-        if field == first:
-            out.append({})
-        numbers = np.array([float(word) for word in _NUMBER.findall(value)])
-        out[-1][field] = value if value.isupper() else numbers if value[0] == "{" else numbers[0]
-    return out
+def _records(text: str, name: str, structure: str) -> list[dict[str, Any]]:
+    """A constant's rows, by the fields of a structure in the order in which the text has them."""
+    plain = _without_comments(text)
+    end = plain.index(f"}} {structure};")
+    fields = re.findall(r"(\w+)(?:\[\d\])?;", plain[plain.rindex("{", 0, end) : end])
+    listed = _WRAPPED.sub(r"\1", _body(text, name)).translate(str.maketrans("{}", "[]"))
+    rows = json.loads(re.sub(r",\s*\]", "]", _WORD.sub(r'"\g<0>"', listed)))
+    return [
+        {
+            field: np.array(value) if isinstance(value, list) else value
+            for field, value in zip(fields, row, strict=True)
+        }
+        for row in rows
+    ]
 
 
 def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
@@ -371,12 +389,12 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
 
     poses (n, 4, 4), joints (n, m), hinges (n, h): as for the machine.
     """
-    none, rot = np.zeros(3), poses[:, :3, :3]
+    rot = poses[:, :3, :3]
     lines: list[Array] = []
     out: list[Array] = []
-    for rod in _records(text, "RODS", "drive"):
-        q = rod.get("scale", 0.0) * joints[:, int(rod.get("joint", 0)), None]
-        phi = hinges[:, int(rod["hinge"]) - 1, None] if "hinge" in rod else np.zeros(1)
+    for rod in _records(text, "RODS", "rod_data"):
+        q = rod["scale"] * joints[:, rod["joint"], None]
+        phi = hinges[:, rod["hinge"] - 1, None] if rod["hinge"] else np.zeros(1)
         a, longer = rod["base"], np.zeros(1)
         match rod["drive"]:
             case "TELESCOPE":
@@ -387,14 +405,17 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
                 a = a + np.cos(q) * rod["arm"] + np.sin(q) * rod["rate"]
             case _:
                 pass
-        swing, rate = (rod.get(name, none) for name in ("swing", "swing_rate"))
-        own = rod["platform"] + np.cos(phi) * swing + np.sin(phi) * rate
-        b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod.get("floating", none)
+        own = rod["platform"] + np.cos(phi) * rod["swing"] + np.sin(phi) * rod["swing_rate"]
+        b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod["floating"]
         lines.append(b - a)
         out.append(np.linalg.norm(b - a, axis=1) - rod["length"] - longer)
-    for axis in _records(text, "AXIS", "rod"):
-        if "kind" in axis:
-            base, turned = axis.get("base"), rot @ axis.get("platform", none)
-            w = turned if base is None else np.cross(base, turned) if turned.any() else base
-            out.append(np.sum(lines[int(axis["rod"])] * w, axis=1))
+    axes = int(re.findall(r"#define AXES (\d+)", text)[0])
+    for axis in _records(text, "AXIS", "axis_data")[:axes]:
+        turned = (rot @ axis["platform"][:, None])[..., 0]
+        w = {
+            "ON_BASE": lambda axis=axis: axis["base"],
+            "ON_PLATFORM": lambda turned=turned: turned,
+            "TORSION": lambda axis=axis, turned=turned: np.cross(axis["base"], turned),
+        }[axis["kind"]]()
+        out.append(np.sum(lines[axis["rod"]] * w, axis=1))
     return np.stack(out, axis=1)

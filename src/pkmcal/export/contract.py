@@ -145,8 +145,8 @@ def write_export(made: Export, folder: Path) -> None:
 
 
 def exact(value: float) -> str:
-    """Seventeen significant digits: a double comes back as it was."""
-    return f"{value:.17g}"
+    """The fewest digits that a double comes back from as it was; whole numbers without a point."""
+    return repr(float(value) + 0.0).removesuffix(".0")
 
 
 def commented(lines: Iterable[str], mark: str) -> str:

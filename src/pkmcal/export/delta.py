@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +53,12 @@ MOST_TOOL_ERROR = 5.0
 """mm at the tool beyond which the parameters describe another machine."""
 UNTOLD_SCALE_DIFFERENCE = 1e-9
 """Difference of a scale from 1 beyond which it is told: beyond the digits of the files."""
+SWITCH_READINGS = 11
+"""Of each motor, for which an end switch's value is compared, or told."""
+SWITCH_ROUNDING = 1e-3
+"""mm or degrees of a motor at its end switch, 2 µm of an arm: values have 0.1 µm, and a height
+belongs weakly to the angle of an arm that stands up.
+"""
 TOOL_ROUNDING = 2e-6
 """m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
@@ -208,23 +214,6 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     poses = poses[good]
     by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., joint]
     return poses, grid[good][:, joint], by_reading
-
-
-def reach(delta: Delta) -> float:
-    """Radius (m) about the z axis, at home's height, within which all readings are in range."""
-    machine, home = delta.machine, delta.machine.home()
-    radii = np.arange(1, 1001) * 1e-3
-    turns = np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    poses = np.tile(home, (radii.size, turns.size, 1, 1))
-    poses[..., 0, 3] = radii[:, None] * np.cos(turns)
-    poses[..., 1, 3] = radii[:, None] * np.sin(turns)
-    q = machine.inverse(poses.reshape(-1, 4, 4)).reshape(radii.size, turns.size, -1)
-    ends = machine.joint_ranges
-    with np.errstate(invalid="ignore"):
-        inside = ((q >= ends[:, 0]) & (q <= ends[:, 1])).all(axis=(1, 2))
-    outside = np.flatnonzero(~inside)
-    last = outside[0] if outside.size else inside.size
-    return float(radii[last - 1]) if last else 0.0
 
 
 # The fit
@@ -493,7 +482,7 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
     unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
     motors = [
         f"Motor {name} is leg {j + 1}, joint {delta.joint[j] + 1}:"
-        f" motor position ({unit}) = {rate:.9g} * reading ({word}) {zero + 0.0:+.6f}."
+        f" motor position ({unit}) = {rate:.9g} * reading ({word}) {round(zero, 6) + 0.0:+.6f}."
         for name, j, rate, zero in zip(names, fit.order, fit.rate, fit.zero, strict=True)
     ]
     rows = [
@@ -522,10 +511,67 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
         f"The firmware's frame: p_firmware = firmware_from_base p_base, mm. {tip}",
         *rows,
         f"{fit.sentence} Compared over {len(delta.poses)} poses of the workspace.",
-        "End switches are taken to be at the upper end of each motor's range in the mechanism"
-        f" file: readings {', '.join(f'{q:.6g}' for q in delta.ends[fit.order])} {word}."
-        " Where a switch is elsewhere, add the difference to that motor's value below.",
     ]
+
+
+def workspace_radius(source: MachineSource) -> str | None:
+    """The radius that the printer was configured for, mm, as firmwares read it; None where the
+    mechanism file has none. It is a limit, and no value of the machine's: no export makes one up.
+    """
+    radius = source.machine.document.workspace_radius
+    return None if radius is None else firmware_length(MM_A_METRE * radius)
+
+
+def end_switches(fit: Fit) -> str:
+    """Where the values put the end switches."""
+    word = "m" if fit.kind == "linear" else "rad"
+    ends = ", ".join(f"{q:.9g}" for q in fit.delta.ends[fit.order])
+    return (
+        "End switches are taken to be at the upper end of each motor's range in the mechanism file:"
+        f" readings {ends} {word}. Where a switch triggers at another reading, its value is:"
+    )
+
+
+def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list[str]:
+    """A line a motor: the value (3,) of its end switch for any reading, where it goes with the
+    motor's position. :func:`switch_values` reads them again.
+    """
+    ends = fit.delta.ends[fit.order]
+    return [
+        f"{name} = {_digits(value)} {_signed(rate)} * (reading - {end:.9g})"
+        for name, value, rate, end in zip(names, values, fit.rate, ends, strict=True)
+    ]
+
+
+_SWITCH = re.compile(r"(\S+) = (\S+) ([+-] \S+) \* \(reading - (\S+)\)")
+
+
+def switch_values(text: str, readings: Array) -> Array:
+    """The values (3,) that lines of :func:`proportional_switches` give at readings (3,)."""
+    found = [
+        [float(word.replace(" ", "")) for word in groups[1:]] for groups in _SWITCH.findall(text)
+    ]
+    value, rate, end = np.array(found).T
+    return value + rate * (readings - end)
+
+
+def readings_elsewhere(fit: Fit) -> Array:
+    """Readings (n, 3) of end switches that are not where they are taken to be: downwards from there
+    through the upper half of each range.
+    """
+    machine = fit.delta.machine
+    ranges = machine.joint_ranges[fit.delta.joint][fit.order]
+    ends = fit.delta.ends[fit.order]
+    shares = np.linspace(0.0, 0.5, SWITCH_READINGS)[:, None]
+    return ends + shares * (ranges.sum(axis=1) - 2 * ends)
+
+
+def _digits(value: float) -> str:
+    return f"{value:.6f}".rstrip("0").rstrip(".") if abs(value) > 5e-7 else "0"
+
+
+def _signed(value: float) -> str:
+    return f"{'-' if value < 0 else '+'} {abs(value):.9g}"
 
 
 def _in_mm(transform: Array) -> Array:
@@ -577,8 +623,14 @@ def redo(source: MachineSource) -> tuple[Finding, ...]:
     home = "the tool's tip and the bed are not in these values: set the Z offset, level the bed"
     if source.bed is not None:
         home = "its Z is 0 on the bed that was felt, to the probe's error: check the first layer"
+    radius = workspace_radius(source)
+    keep = (
+        "Keep the printer's own print radius"
+        if radius is None
+        else f"The print radius stays {radius} mm"
+    )
     text = (
-        f"Keep the printer's own print radius. Then home: {home}. Measure the bed's mesh anew: the"
+        f"{keep}. Then home: {home}. Measure the bed's mesh anew: the"
         " old one belongs to the old values."
     )
     return (Finding(Level.NOTE, text),)

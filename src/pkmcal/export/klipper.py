@@ -4,10 +4,12 @@ Meaning of the values: Klipper's configuration reference and its klippy/kinemati
 rotary_delta.py and chelper/kin_rotary_delta.c. A tower's carriage is at ``position_endstop +
 sqrt(arm_length^2 - delta_radius^2)`` where its switch triggers; an arm's switch is told by the
 height at which the nozzle would be in the middle if all arms were at that arm's angle.
+``print_radius``, beyond which Klipper accepts no position, is ``delta_radius`` where none stands.
 """
 
 from __future__ import annotations
 
+import re
 from configparser import ConfigParser
 from typing import ClassVar, final
 
@@ -16,18 +18,24 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter, commented
+from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.export.delta import (
     DEGREES_A_RADIAN,
+    SWITCH_ROUNDING,
     Fit,
     Freedoms,
     about,
+    end_switches,
     firmware_angle,
     firmware_length,
     firmware_tool_difference,
     fit_of,
     follows,
+    proportional_switches,
+    readings_elsewhere,
     redo,
+    switch_values,
+    workspace_radius,
 )
 from pkmcal.outcome import Finding, Level
 
@@ -41,6 +49,10 @@ SAVED_MARK_ADVICE = (
     " Klipper drops all that was saved."
 )
 """klippy/configfile.py, _find_autosave_data."""
+NO_PRINT_RADIUS = (
+    "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
+    " stands; then write the former delta_radius there."
+)
 
 
 def _fit(source: MachineSource) -> Fit:
@@ -61,7 +73,17 @@ class Klipper(Exporter):
         lines = about(source, fit, KLIPPER_STEPPERS, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
         lines.append(SAVED_MARK_ADVICE)
-        sections = _linear(fit) if fit.kind == "linear" else _rotary(fit)
+        lines.append(end_switches(fit))
+        if fit.kind == "linear":
+            names = [f"stepper_{s}.position_endstop" for s in KLIPPER_STEPPERS]
+            lines += proportional_switches(fit, names, _tower_endstops(fit))
+            radius = workspace_radius(source)
+            if radius is None:
+                lines.append(NO_PRINT_RADIUS)
+            sections = _linear(fit, radius)
+        else:
+            sections = _rotary(fit)
+            lines += _arm_endstop_lines(fit, sections)
         body = "".join(
             f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
             for name, values in sections.items()
@@ -76,21 +98,48 @@ class Klipper(Exporter):
         found.read_string(text)
         move = klipper_carriage_heights if fit.kind == "linear" else klipper_arm_angles
         zero = homed(found) - fit.rate * fit.delta.ends[fit.order]
-        return [firmware_tool_difference(text, fit, lambda points: move(found, points), zero)]
+        elsewhere = [
+            np.where(
+                np.isnan(readings),
+                0.0,
+                _homed_by(found, values) - (fit.rate * readings + fit.zero),
+            )
+            for readings, values in _endstops_elsewhere(text, fit)
+        ]
+        radius = workspace_radius(source) if fit.kind == "linear" else None
+        own = found.getfloat("printer", "print_radius", fallback=None)
+        same = own == (None if radius is None else float(radius))
+        return [
+            firmware_tool_difference(text, fit, lambda points: move(found, points), zero),
+            Difference(
+                f"motors at end switches elsewhere, {len(elsewhere)} readings",
+                largest(elsewhere) if elsewhere else np.inf,
+                SWITCH_ROUNDING,
+                "mm or degrees",
+            ),
+            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
+        ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
         return (follows(_fit(source)), Finding(Level.NOTE, SAVED_MARK_ADVICE), *redo(source))
 
 
-def _linear(fit: Fit) -> dict[str, dict[str, str]]:
-    endstops = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
+def _tower_endstops(fit: Fit) -> Array:
+    """Heights (3,) mm of the tool where the towers' switches trigger."""
+    return fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
+
+
+def _linear(fit: Fit, radius: str | None) -> dict[str, dict[str, str]]:
+    endstops = _tower_endstops(fit)
     sections = {
         "printer": {
             "kinematics": "delta",
             "delta_radius": firmware_length(fit.radius),
         }
     }
+    if radius is not None:
+        sections["printer"]["print_radius"] = radius
     for k, name in enumerate(KLIPPER_STEPPERS):
         sections[f"stepper_{name}"] = {
             "arm_length": firmware_length(fit.rod[k]),
@@ -100,17 +149,69 @@ def _linear(fit: Fit) -> dict[str, dict[str, str]]:
     return sections
 
 
+def _arm_endstops(fit: Fit, motors: Array) -> Array:
+    """Heights (..., 3) mm of the tool in the middle where all arms are at one's angle (..., 3)
+    degrees; NaN where no rod reaches the middle from there.
+    """
+    angle = motors / DEGREES_A_RADIAN
+    below = fit.rod**2 - (fit.radius + fit.arm * np.cos(angle)) ** 2
+    return fit.height + fit.arm * np.sin(angle) - np.sqrt(np.where(below > 0, below, np.nan))
+
+
+def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[str]:
+    """A line an arm: the heights that belong to readings of its switch, in no proportion to them,
+    where Klipper makes the arm's angle of the height again.
+    """
+    config = ConfigParser()
+    config.read_dict(sections)
+    readings = readings_elsewhere(fit)
+    motors = fit.rate * readings + fit.zero
+    heights = _arm_endstops(fit, motors)
+    back = np.array([_homed_by(config, row) for row in heights])
+    lines: list[str] = []
+    for k, name in enumerate(KLIPPER_STEPPERS):
+        known = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
+        pairs = [f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in known]
+        lines.append(f"stepper_{name}.position_endstop = {', '.join(pairs)}")
+    return lines
+
+
+def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
+    """Readings of switches elsewhere, and the values that the text has for them; one motor at a
+    time where values are in a table, NaN for the others.
+    """
+    if fit.kind == "linear":
+        return [(q, switch_values(text, q)) for q in readings_elsewhere(fit)]
+    out: list[tuple[Array, Array]] = []
+    for k, name in enumerate(KLIPPER_STEPPERS):
+        line = re.findall(rf"stepper_{name}\.position_endstop = (.*)", text)[0]
+        for height, reading in re.findall(r"(\S+) at (\S+) rad", line):
+            both = np.full((2, 3), np.nan)
+            both[:, k] = float(reading), float(height)
+            out.append((both[0], both[1]))
+    return out
+
+
+def _homed_by(found: ConfigParser, endstops: Array) -> Array:
+    """Motor positions (3,) by other end switches than those of a configuration; NaN where one's is
+    not given.
+    """
+    other = ConfigParser()
+    other.read_dict(found)
+    for name, value in zip(KLIPPER_STEPPERS, endstops, strict=True):
+        other[f"stepper_{name}"]["position_endstop"] = repr(float(value))
+    return homed(other)
+
+
 def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
-    angle = fit.end_motors / DEGREES_A_RADIAN
-    out = fit.radius + fit.arm * np.cos(angle)
-    below = fit.rod**2 - out**2
-    if np.any(below <= 0) or fit.radius <= 0:
+    endstops = _arm_endstops(fit, fit.end_motors)
+    if not np.isfinite(endstops).all() or fit.radius <= 0:
+        out = fit.radius + fit.arm * np.cos(fit.end_motors / DEGREES_A_RADIAN)
         raise InputError(
             "Klipper tells an arm's end switch by a height in the middle, and none belongs to it",
             found=f"an arm that reaches {out.max():.1f} mm out, a rod of {fit.rod.min():.1f} mm",
             next_step="Give the cranks a smaller range in the mechanism file",
         )
-    endstops = fit.height + fit.arm * np.sin(angle) - np.sqrt(below)
     sections = {
         "printer": {
             "kinematics": "rotary_delta",

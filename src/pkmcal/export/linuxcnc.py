@@ -1,9 +1,17 @@
-"""``linuxcnc``: HAL pins of genhexkins, lineardeltakins, rotarydeltakins, and words for the INI.
+"""``linuxcnc``: kinematics for LinuxCNC, and words for its INI file.
+
+Three kinds. Hexapods: pins of genhexkins, exactly. Deltas that lineardeltakins or rotarydeltakins
+follow to some hundredths of a millimetre: their pins, fitted. All others with as many joints as
+coordinates, leaning towers too: a module of one's own, exactly (:mod:`.linuxcnc_module`).
 
 Meaning of the pins: LinuxCNC's src/emc/kinematics. genhexkins' joint is the strut's length from
 ``base.N`` to ``platform.N``; A, B, C are roll, pitch and yaw in degrees, R = Rz(C) Ry(B) Rx(A).
-With HOME_ABSOLUTE_ENCODER a joint is at the encoder's position plus HOME_OFFSET (homing.c), so
-offsets stand there.
+
+Homing (src/emc/motion/homing.c): with HOME_ABSOLUTE_ENCODER = 2 a joint is at the encoder's
+position plus HOME_OFFSET, and nothing moves. Without it the place of the switch, or with both
+velocities 0 the present one, becomes HOME_OFFSET, and the joint then moves to HOME, without soft
+limits, at HOME_FINAL_VEL. A latch velocity without a search velocity is an error, by which nothing
+moves.
 
 Both delta modules know ideal deltas alone: one radius, one length of rods, towers 120 degrees
 apart; they are fitted. Joint 0 of lineardeltakins is the tower at (0, R), joints 1 and 2 are at 210
@@ -15,6 +23,7 @@ and 2).
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import ClassVar, final
 
 import numpy as np
@@ -22,22 +31,35 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
+from pkmcal.export.c import C_HEADER_FILE, C_SOURCE_FILE
 from pkmcal.export.contract import Difference, Exporter, commented, exact, largest
 from pkmcal.export.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
     UNTOLD_SCALE_DIFFERENCE,
+    UNWARNED_TOOL_ERROR,
     Fit,
     Freedoms,
     about,
-    firmware_angle,
     firmware_length,
     firmware_tool_difference,
     fit_of,
     follows,
+    scales_of,
 )
 from pkmcal.export.limbs import Limbs, rod_limbs
+from pkmcal.export.linuxcnc_module import (
+    MODULE_BUILD_COMMAND,
+    MODULE_CONVENTIONS,
+    MODULE_NAME,
+    MODULE_SOURCE_FILE,
+    coordinates,
+    joint_units,
+    module_differences,
+    module_files,
+)
 from pkmcal.export.samples import samples
+from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 
@@ -52,90 +74,226 @@ HEXAPOD_PARAMETERS = ("center", "offset", "scale")
 MAX_ERROR = 500.0
 """genhexkins' own limit on the sum of the struts' errors, beyond which it gives up."""
 LINUXCNC_READING_ROUNDING = 1e-12
-"""m: pins hold 17 digits; angles go through degrees and back."""
+"""m: pins hold all digits; angles go through degrees and back."""
 _STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
 _PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
-_OFFSET = re.compile(r"^HOME_OFFSET = (\S+)$", re.M)
+_WORD = re.compile(r"^([A-Z_]+) = (\S+)$", re.M)
 _RATE = re.compile(r"^# joint \d = (\S+) \* reading", re.M)
 SCALE_CORRECTION_ADVICE = "Divide its SCALE in the INI file, steps or counts per unit, by that."
+HOME_FINAL_VELOCITY = 5.0
+"""mm/s or degrees/s: LinuxCNC takes a joint's largest velocity where none stands."""
+UNSEARCHED_LATCH_VELOCITY = 1.0
+"""Any: without a search velocity LinuxCNC refuses to home a joint without an absolute encoder."""
+HOMING_CONVENTIONS = (
+    "Homing by these values is for absolute encoders: LinuxCNC sets joint = encoder + HOME_OFFSET"
+    " where the machine is, and moves nothing. The encoder counts as the comment in the joint's"
+    " section says.",
+    "With a home switch, in each joint's section: HOME_ABSOLUTE_ENCODER = 0; HOME_OFFSET = the"
+    " joint at the switch, by that comment; HOME_SEARCH_VEL and HOME_LATCH_VEL of your own. After"
+    " the switch LinuxCNC moves the joint to HOME, with soft limits off, each joint by itself, at"
+    " HOME_FINAL_VEL.",
+    "With neither, for a machine that is put into its home pose by hand: HOME_ABSOLUTE_ENCODER = 0,"
+    " HOME_LATCH_VEL = 0, HOME_OFFSET = HOME; nothing moves.",
+    "HOME_LATCH_VEL without HOME_SEARCH_VEL is an error without an absolute encoder: so LinuxCNC"
+    " does not take the present place for the switch's and move to HOME.",
+)
+
+
+@dataclass(frozen=True)
+class Joints:
+    """LinuxCNC's joints (J,), mm or degrees: rate * reading + offset.
+
+    kind : LINEAR or ANGULAR. home : at the machine's home pose. limits : (J, 2), not finite where
+    the mechanism file has no range. scale : of the readings, where a joint's SCALE is to be
+    corrected by it.
+    """
+
+    kind: tuple[str, ...]
+    rate: Array
+    offset: Array
+    home: Array
+    limits: Array
+    scale: Array
+
+
+def _joints(machine: Machine, columns: Array, rate: Array, offset: Array, scale: Array) -> Joints:
+    """Joints that follow the readings of some columns; InputError where home is beyond a limit."""
+    readings = machine.inverse(machine.home()[None])[0][columns]
+    home = rate * readings + offset
+    limits = np.sort(rate[:, None] * machine.joint_ranges[columns] + offset[:, None], axis=1)
+    if (home < limits[:, 0]).any() or (home > limits[:, 1]).any() or not np.isfinite(home).all():
+        raise InputError(
+            f"the home pose of mechanism {machine.name!r} is beyond a joint's range",
+            found=", ".join(f"{value:.6g}" for value in readings),
+            expected="readings within the ranges, which become LinuxCNC's limits",
+            next_step="Give home: {position: [x, y, z]} in the mechanism file, or wider ranges",
+        )
+    kind = tuple("LINEAR" if machine.joint_units[k] == "m" else "ANGULAR" for k in columns)
+    return Joints(kind, rate, offset, home, limits, scale)
+
+
+def joint_sections(joints: Joints) -> list[str]:
+    """A section of each joint, with what homing needs."""
+    lines: list[str] = []
+    for n, kind in enumerate(joints.kind):
+        lines.append(f"\n[JOINT_{n}]\nTYPE = {kind}")
+        sign = "-" if joints.offset[n] < 0 else "+"
+        lines.append(
+            f"# joint {n} = {exact(joints.rate[n])} * reading {sign} {exact(abs(joints.offset[n]))}"
+        )
+        if abs(joints.scale[n] - 1) > UNTOLD_SCALE_DIFFERENCE:
+            lines.append(f"# {SCALE_CORRECTION_ADVICE.replace('that', exact(joints.scale[n]))}")
+        words = {
+            "HOME_ABSOLUTE_ENCODER": 2,
+            "HOME_OFFSET": joints.offset[n],
+            "HOME": joints.home[n],
+            "HOME_SEQUENCE": 0,
+            "HOME_SEARCH_VEL": 0,
+            "HOME_LATCH_VEL": UNSEARCHED_LATCH_VELOCITY,
+            "HOME_FINAL_VEL": HOME_FINAL_VELOCITY,
+        }
+        low, high = joints.limits[n]
+        if np.isfinite(low) and np.isfinite(high):
+            words.update({"MIN_LIMIT": low, "MAX_LIMIT": high})
+        lines += [f"{word} = {exact(value)}" for word, value in words.items()]
+    return lines
+
+
+def _ini(about: tuple[str, ...], module: str, letters: str, home: Array, joints: Joints) -> str:
+    """The INI file; home : (6,) X, Y, Z mm, A, B, C degrees."""
+    # what is none of the machine's coordinates is 0, as forward kinematics leaves it
+    world_home = [
+        float(value) if letter in letters else 0.0
+        for letter, value in zip("XYZABC", home, strict=True)
+    ]
+    lines = [
+        commented((*about, *HOMING_CONVENTIONS), "#"),
+        f"[KINS]\nKINEMATICS = {module}\nJOINTS = {len(joints.kind)}\n",
+        f"[TRAJ]\nCOORDINATES = {letters}\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
+        "# where forward kinematics begins",
+        f"HOME = {' '.join(f'{value:.6f}' for value in np.round(world_home, 6) + 0.0)}",
+    ]
+    return "\n".join([*lines, *joint_sections(joints)]) + "\n"
+
+
+def ini_words(ini: str, word: str) -> Array:
+    """A word's values in the sections of the joints."""
+    own = ini[ini.index("[JOINT_0]") :]
+    return np.array([float(value) for name, value in _WORD.findall(own) if name == word])
+
+
+def homing_difference(ini: str, joints: Joints) -> Difference:
+    """Rates, offsets, home and limits read again; without end where home is beyond a limit."""
+    rates = np.array([float(word) for word in _RATE.findall(ini)])
+    offset, home = ini_words(ini, "HOME_OFFSET"), ini_words(ini, "HOME")
+    low, high = ini_words(ini, "MIN_LIMIT"), ini_words(ini, "MAX_LIMIT")
+    bounded = np.isfinite(joints.limits).all(axis=1)
+    off = max(
+        largest(rates, joints.rate),
+        largest(offset, joints.offset),
+        largest(home, joints.home),
+        largest(np.stack([low, high], axis=1), joints.limits[bounded]),
+    )
+    if (home[bounded] < low).any() or (home[bounded] > high).any():
+        off = np.inf
+    return Difference("joints' home, offsets and limits read again", off, 0.0, "mm or degrees")
+
+
+def _kind(source: MachineSource) -> Limbs | Fit | None:
+    """What of LinuxCNC's own follows the machine: struts of genhexkins, a delta's fit; or None."""
+    if source.machine.document.motion != "translation":
+        return _hexapod(source.machine)
+    try:
+        fit = _fit(source)
+    except InputError:  # no delta, or none that parameters follow
+        return None
+    return fit if fit.largest <= UNWARNED_TOOL_ERROR else None
 
 
 @final
 class LinuxCnc(Exporter):
-    """HAL and INI lines for hexapods and ideal deltas."""
+    """HAL and INI lines for hexapods and ideal deltas; for other machines a kinematics module."""
 
     name: ClassVar = "linuxcnc"
-    title: ClassVar = "LinuxCNC: kinematics' HAL pins and INI words"
+    title: ClassVar = "LinuxCNC: kinematics, and INI words"
+    leaves: ClassVar = (
+        *(LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE),
+        *(C_HEADER_FILE, C_SOURCE_FILE, MODULE_SOURCE_FILE, f"{MODULE_NAME}.so"),
+    )
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """A HAL file and words for the INI file."""
-        if source.machine.document.motion == "translation":
-            fit = _fit(source)
-            return {
-                LINUXCNC_HAL_FILE: _delta_hal(source, fit),
-                LINUXCNC_INI_FILE: _delta_ini(source, fit),
-            }
-        struts = _hexapod(source.machine)
-        return {LINUXCNC_HAL_FILE: _hal(source, struts), LINUXCNC_INI_FILE: _ini(source, struts)}
+        """A HAL file, or the source of a module, and words for the INI file."""
+        kind = _kind(source)
+        if kind is None:
+            return {**module_files(source), LINUXCNC_INI_FILE: _module_ini(source)}
+        hal, ini = (_delta_hal, _delta_ini) if isinstance(kind, Fit) else (_hal, _hexapod_ini)
+        return {LINUXCNC_HAL_FILE: hal(source, kind), LINUXCNC_INI_FILE: ini(source, kind)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Pins and words read again, moved by LinuxCNC's own formulas."""
-        hal, machine = files[LINUXCNC_HAL_FILE], source.machine
-        offsets = np.array([float(word) for word in _OFFSET.findall(files[LINUXCNC_INI_FILE])])
-        if machine.document.motion == "translation":
-            fit = _fit(source)
+        ini, machine, kind = files[LINUXCNC_INI_FILE], source.machine, _kind(source)
+        if kind is None:
+            homing = homing_difference(ini, _module_joints(machine))
+            return [*module_differences(files, source), homing]
+        hal, offsets = files[LINUXCNC_HAL_FILE], ini_words(ini, "HOME_OFFSET")
+        if isinstance(kind, Fit):
+            homing = homing_difference(ini, _delta_joints(kind))
             pins = {name: float(value) for name, value in _PIN.findall(hal)}
-            if fit.kind == "linear":
-                return [
-                    firmware_tool_difference(hal, fit, lambda p: linear_joints(pins, p), offsets)
-                ]
-            # motors count upwards, LinuxCNC's joints downwards
-            return [firmware_tool_difference(hal, fit, lambda p: -rotary_joints(pins, p), -offsets)]
+            if kind.kind == "linear":
+                move, zero = (lambda p: linear_joints(pins, p)), offsets
+            else:  # motors count upwards, LinuxCNC's joints downwards
+                move, zero = (lambda p: -rotary_joints(pins, p)), -offsets
+            return [firmware_tool_difference(hal, kind, move, zero), homing]
         poses, readings = samples(machine)
-        rates = np.array([float(word) for word in _RATE.findall(files[LINUXCNC_INI_FILE])])
+        rates = np.array([float(word) for word in _RATE.findall(ini)])
         off = largest((genhexkins(hal, world(poses)) - offsets) / rates, readings)
+        what = f"readings at {len(poses)} poses by genhexkins' formulas"
         return [
-            Difference(
-                f"readings at {len(poses)} poses by genhexkins' formulas",
-                off,
-                LINUXCNC_READING_ROUNDING,
-            )
+            Difference(what, off, LINUXCNC_READING_ROUNDING),
+            homing_difference(ini, _hexapod_joints(machine, kind)),
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Where offsets went, or how well the pins follow the machine."""
-        if source.machine.document.motion == "translation":
-            return (follows(_fit(source)),)
-        return (
-            Finding(
-                Level.NOTE,
-                "Offsets are HOME_OFFSET words: copy the INI file's sections into the machine's"
-                " own INI file, and source the HAL file after genhexkins is loaded.",
-            ),
-        )
+        """How to use the files, and how well the pins follow the machine."""
+        kind = _kind(source)
+        home = "Homing is set for absolute encoders; the INI file says what home switches need."
+        use = "source the HAL file after genhexkins is loaded"
+        if kind is None:
+            use = f"build the module by {MODULE_BUILD_COMMAND}, and load it by loadrt {MODULE_NAME}"
+        copy = f"Copy the INI file's sections into the machine's own INI file, and {use}. {home}"
+        first = follows(kind) if isinstance(kind, Fit) else Finding(Level.NOTE, copy)
+        return (first, Finding(Level.NOTE, home)) if isinstance(kind, Fit) else (first,)
+
+
+# Machines of no module of LinuxCNC's
+
+
+def _module_joints(machine: Machine) -> Joints:
+    columns, none = np.arange(machine.n_joints), np.zeros(machine.n_joints)
+    return _joints(machine, columns, joint_units(machine), none, none + 1)
+
+
+def _module_ini(source: MachineSource) -> str:
+    machine = source.machine
+    home = world(machine.home()[None])[0]
+    letters = coordinates(machine)
+    if "A" not in letters:
+        home[3:] = 0.0  # C counts from home
+    return _ini(
+        source.header(*MODULE_CONVENTIONS), MODULE_NAME, letters, home, _module_joints(machine)
+    )
 
 
 # Hexapods
 
 
-def _hexapod(machine: Machine) -> Limbs:
-    """The struts in the order of the joints where genhexkins can express the machine; else
-    InputError.
-    """
+def _hexapod(machine: Machine) -> Limbs | None:
+    """The struts in the order of the joints where genhexkins can express the machine; else None."""
     layout = machine.layout
     rods, axes = int(layout.closing.sum()), len(layout.angles)
     ok = machine.document.motion == "spatial" and rods == GENHEXKINS_STRUTS and not axes
     if not ok or not layout.rod_reads[layout.closing].all() or layout.n_internal:
-        joints = sorted({leg.base.joint for leg in machine.document.legs})
-        raise InputError(
-            f"LinuxCNC's genhexkins moves six telescopic legs on fixed joints, and mechanism"
-            f" {machine.name!r} is another machine",
-            found=f"motion {machine.document.motion}, {rods} rods on {', '.join(joints)}"
-            f" joints, {int(layout.rod_reads.sum())} of them telescopic"
-            + (f", {axes} equations of axes" if axes else ""),
-            expected="a hexapod; or a linear or rotary delta, for lineardeltakins, rotarydeltakins",
-            next_step="Export it with --to c, and build a kinematics module from that",
-        )
+        return None
     struts = rod_limbs(machine)
     return struts.of(np.argsort(struts.joint))
 
@@ -147,18 +305,18 @@ def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
         "XYZ is the platform frame's origin in the base frame; A, B, C are roll, pitch and yaw,"
         " R = Rz(C) Ry(B) Rx(A).",
         "Joint N is the strut's length = 1000 * (scale * reading + offset); 1000 * offset is"
-        " HOME_OFFSET, and the scale belongs to the joint's own SCALE, steps or counts a mm.",
+        " HOME_OFFSET, and the scale belongs to the joint's own SCALE, steps or counts a mm. An"
+        " absolute encoder then counts 1000 * scale * reading.",
     )
 
 
-def _limits(machine: Machine, struts: Limbs) -> Array:
-    """Smallest and largest strut lengths (6, 2) mm."""
-    ways = struts.scale[:, None] * machine.joint_ranges[struts.joint]
-    return MM_A_METRE * (ways + struts.length[:, None])
+def _hexapod_joints(machine: Machine, struts: Limbs) -> Joints:
+    rate, offset = MM_A_METRE * struts.scale, MM_A_METRE * struts.length
+    return _joints(machine, struts.joint, rate, offset, struts.scale)
 
 
 def _hal(source: MachineSource, struts: Limbs) -> str:
-    limits = _limits(source.machine, struts)
+    limits = _hexapod_joints(source.machine, struts).limits
     limit = max(MAX_ERROR, GENHEXKINS_STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
         commented((*_hexapod_header(source), "", *source.sigma_lines(HEXAPOD_PARAMETERS)), "#"),
@@ -185,33 +343,10 @@ def _hal(source: MachineSource, struts: Limbs) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _ini(source: MachineSource, struts: Limbs) -> str:
+def _hexapod_ini(source: MachineSource, struts: Limbs) -> str:
     home = world(source.machine.home()[None])[0]
-    lines = [
-        commented(
-            (
-                *_hexapod_header(source),
-                "HOME_OFFSET holds for absolute encoders that read 1000 * scale * reading. With a"
-                " home switch, set HOME_ABSOLUTE_ENCODER = 0 and add 1000 * scale * the reading at"
-                " the switch.",
-            ),
-            "#",
-        ),
-        "[KINS]\nKINEMATICS = genhexkins\nJOINTS = 6\n",
-        "[TRAJ]\nCOORDINATES = XYZABC\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
-        "# where forward kinematics begins",
-        f"HOME = {' '.join(f'{v:.6f}' for v in home + 0.0)}",
-    ]
-    for n, (low, high) in enumerate(_limits(source.machine, struts).tolist()):
-        scale = float(struts.scale[n])
-        lines.append(f"\n[JOINT_{n}]\nTYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2")
-        lines.append(f"# joint {n} = {exact(MM_A_METRE * scale)} * reading + HOME_OFFSET")
-        if abs(scale - 1) > UNTOLD_SCALE_DIFFERENCE:
-            lines.append(f"# {SCALE_CORRECTION_ADVICE.replace('that', exact(scale))}")
-        lines.append(f"HOME_OFFSET = {exact(float(MM_A_METRE * struts.length[n]))}")
-        if np.isfinite(low) and np.isfinite(high):
-            lines.append(f"MIN_LIMIT = {low:.4f}\nMAX_LIMIT = {high:.4f}")
-    return "\n".join(lines) + "\n"
+    joints = _hexapod_joints(source.machine, struts)
+    return _ini(_hexapod_header(source), "genhexkins", "XYZABC", home, joints)
 
 
 def world(poses: Array) -> Array:
@@ -250,7 +385,6 @@ def _fit(source: MachineSource) -> Fit:
 
 def _delta_hal(source: MachineSource, fit: Fit) -> str:
     lines = about(source, fit, "012", SCALE_CORRECTION_ADVICE)
-    lines = [line for line in lines if not line.startswith("End switches")]
     if fit.kind == "linear":
         pins = [
             f"setp lineardeltakins.R {firmware_length(fit.radius)}",
@@ -269,32 +403,18 @@ def _delta_hal(source: MachineSource, fit: Fit) -> str:
     return "\n".join([commented(lines, "#"), loaded, *pins]) + "\n"
 
 
+def _delta_joints(fit: Fit) -> Joints:
+    sign = 1.0 if fit.kind == "linear" else -1.0  # arms count downwards
+    columns = fit.delta.joint[fit.order]
+    zero = np.round(sign * fit.zero, 5 if sign < 0 else 4)
+    return _joints(fit.delta.machine, columns, sign * fit.rate, zero, scales_of(fit))
+
+
 def _delta_ini(source: MachineSource, fit: Fit) -> str:
-    linear = fit.kind == "linear"
-    sign = 1.0 if linear else -1.0  # arms count downwards
-    rate, zero = sign * fit.rate, sign * fit.zero
-    word, number = ("LINEAR", firmware_length) if linear else ("ANGULAR", firmware_angle)
-    ini = [
-        commented(
-            (
-                *source.header(),
-                f"Units: mm and degrees. Joint N = rate * reading + HOME_OFFSET; rates are"
-                f" {', '.join(f'{r:.9g}' for r in rate)}, the encoders' scales.",
-                "HOME_OFFSET holds for absolute encoders. With a home switch, set"
-                " HOME_ABSOLUTE_ENCODER = 0 and add rate * the reading at the switch.",
-            ),
-            "#",
-        ),
-        f"[KINS]\nKINEMATICS = {fit.kind}deltakins\nJOINTS = 3\n",
-        "[TRAJ]\nCOORDINATES = XYZ\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
-    ]
-    ranges = fit.delta.machine.joint_ranges[fit.delta.joint][fit.order]
-    for n in range(3):
-        ends = np.sort(rate[n] * ranges[n] + zero[n])
-        ini.append(f"\n[JOINT_{n}]\nTYPE = {word}\nHOME_ABSOLUTE_ENCODER = 2")
-        ini.append(f"HOME_OFFSET = {number(zero[n])}")
-        ini.append(f"MIN_LIMIT = {ends[0]:.4f}\nMAX_LIMIT = {ends[1]:.4f}")
-    return "\n".join(ini) + "\n"
+    about = source.header("Units: mm and degrees. An absolute encoder counts rate * reading.")
+    at = MM_A_METRE * apply(fit.T_firmware_base, source.machine.home()[:3, 3])
+    home = np.append(at, np.zeros(3))
+    return _ini(about, f"{fit.kind}deltakins", "XYZ", home, _delta_joints(fit))
 
 
 def linear_joints(pins: dict[str, float], points: Array) -> Array:

@@ -3,7 +3,8 @@
 Meaning of the values: Duet3D's G-code reference and the firmware's LinearDeltaKinematics and
 RotaryDeltaKinematics. Towers X, Y, Z stand at -150, -30 and 90 degrees, corrections anticlockwise;
 a homed carriage is at ``H + sqrt(L^2 - R^2)`` plus its endstop adjustment, a homed arm at the
-larger angle of A plus its own.
+larger angle of A plus its own. B is the print radius, beyond which the firmware accepts no
+position: without it, it stays as it is, 80 mm where nothing was set.
 """
 
 from __future__ import annotations
@@ -17,20 +18,25 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter, commented
+from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.export.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
+    SWITCH_ROUNDING,
     Fit,
     Freedoms,
     about,
+    end_switches,
     firmware_angle,
     firmware_length,
     firmware_tool_difference,
     fit_of,
     follows,
-    reach,
+    proportional_switches,
+    readings_elsewhere,
     redo,
+    switch_values,
+    workspace_radius,
 )
 from pkmcal.outcome import Finding
 
@@ -38,6 +44,9 @@ FILE = "pkmcal_delta.g"
 PROGRAM = "RepRapFirmware"
 REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
 STEEPEST_ARM_ANGLE = 90.0
+NO_PRINT_RADIUS = (
+    "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
+)
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
 
 
@@ -58,7 +67,12 @@ class RepRap(Exporter):
         way = "mm" if fit.kind == "linear" else "degree"
         correcting = f"Divide its steps per {way} (M92) by that."
         lines = about(source, fit, "XYZ", correcting)
-        commands = _linear(fit) if fit.kind == "linear" else _rotary(fit)
+        names = [f"M666 {letter}" for letter in "XYZ"]
+        lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
+        radius = workspace_radius(source)
+        if radius is None:
+            lines.append(NO_PRINT_RADIUS)
+        commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
@@ -68,10 +82,31 @@ class RepRap(Exporter):
         words = read_words(text)
         ends = fit.rate * fit.delta.ends[fit.order]
         linear = fit.kind == "linear"
-        homed = homed_carriages(words) if linear else words["669A"][1] + _xyz(words, "666")
+        homed = (homed_carriages if linear else homed_arms)(words)
         move = reprap_carriage_heights if linear else reprap_arm_angles
+        # switches elsewhere: homed by the value that the text gives for them
+        elsewhere = [
+            (homed_carriages if linear else homed_arms)(
+                {**words, **{f"666{c}": np.array([v]) for c, v in zip("XYZ", values, strict=True)}}
+            )
+            - (fit.rate * readings + fit.zero)
+            for readings in readings_elsewhere(fit)
+            for values in [switch_values(text, readings)]
+        ]
         return [
-            firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends)
+            firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
+            Difference(
+                "motors at end switches elsewhere",
+                largest(elsewhere),
+                SWITCH_ROUNDING,
+                "mm or degrees",
+            ),
+            Difference(
+                "print radius",
+                largest(words.get("665B", words.get("669B", [])), _radius(source)),
+                0.0,
+                "mm",
+            ),
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
@@ -79,30 +114,44 @@ class RepRap(Exporter):
         return (follows(_fit(source)), *redo(source))
 
 
-def _linear(fit: Fit) -> list[str]:
+def _radius(source: MachineSource) -> list[float]:
+    radius = workspace_radius(source)
+    return [] if radius is None else [float(radius)]
+
+
+def _adjustments(fit: Fit) -> Array:
+    """Endstop adjustments (3,), mm or degrees: what is not in H, or in A's larger angle."""
+    homed = fit.end_motors
+    if fit.kind == "linear":
+        homed = homed - np.sqrt(fit.rod**2 - fit.radius**2)
+    return homed - homed.mean()
+
+
+def _linear(fit: Fit, radius: str | None) -> list[str]:
     heights = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
     homed = float(heights.mean())
     corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
     return [
         "M669 K3 ; linear delta",
         f"M665 L{_three(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
-        f" B{firmware_length(MM_A_METRE * reach(fit.delta))}"
-        f" {_letters(corrections, firmware_angle)}"
-        " ; L rods, R radius, H homed height, B print radius",
-        f"M666 {_letters(heights - homed, firmware_length)} A0 B0"
+        + ("" if radius is None else f" B{radius}")
+        + f" {_letters(corrections, firmware_angle)}"
+        " ; L rods, R radius, H homed height"
+        + ("" if radius is None else ", B the printer's own print radius"),
+        f"M666 {_letters(_adjustments(fit), firmware_length)} A0 B0"
         " ; endstop adjustments, mm; no tilt",
     ]
 
 
-def _rotary(fit: Fit) -> list[str]:
-    delta, homed = fit.delta, fit.end_motors
-    largest = float(homed.mean())
+def _rotary(fit: Fit, radius: str | None) -> list[str]:
+    delta = fit.delta
+    homed = float(fit.end_motors.mean())
     ranges = delta.machine.joint_ranges[delta.joint][fit.order]
     lowest = float((fit.rate[:, None] * ranges + fit.zero[:, None]).min())
-    if lowest < -STEEPEST_ARM_ANGLE or largest > STEEPEST_ARM_ANGLE:
+    if lowest < -STEEPEST_ARM_ANGLE or homed > STEEPEST_ARM_ANGLE:
         raise InputError(
             "RepRapFirmware's rotary delta takes arms up to 90 degrees from the horizontal",
-            found=f"arms from {lowest:.1f} to {largest:.1f} degrees",
+            found=f"arms from {lowest:.1f} to {homed:.1f} degrees",
             next_step="Give the cranks a smaller range in the mechanism file",
         )
     corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
@@ -110,10 +159,11 @@ def _rotary(fit: Fit) -> list[str]:
     high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
     return [
         f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)}"
-        f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(largest)}"
-        f" B{firmware_length(MM_A_METRE * reach(delta))}"
-        f" {_letters(corrections, firmware_angle)} ; U arms, L rods, H bearings' heights, R radius",
-        f"M666 {_letters(homed - largest, firmware_angle)}"
+        f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(homed)}"
+        + ("" if radius is None else f" B{radius}")
+        + f" {_letters(corrections, firmware_angle)}"
+        " ; U arms, L rods, H bearings' heights, R radius",
+        f"M666 {_letters(_adjustments(fit), firmware_angle)}"
         " ; homed angles beyond A's larger one, degrees",
         f"; M208 Z{firmware_length(max(low, 0.0))}:{firmware_length(high)}"
         " ; Z of the workspace at most; set your own",
@@ -141,6 +191,11 @@ def read_words(text: str) -> dict[str, Array]:
 
 def _xyz(words: dict[str, Array], command: str) -> Array:
     return np.array([words[command + letter][0] for letter in "XYZ"])
+
+
+def homed_arms(words: dict[str, Array]) -> Array:
+    """Arms' angles (3,) degrees at the end switches."""
+    return words["669A"][1] + _xyz(words, "666")
 
 
 def homed_carriages(words: dict[str, Array]) -> Array:

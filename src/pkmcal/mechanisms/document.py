@@ -227,6 +227,13 @@ class MechanismDocument(Schema):
     legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
     tolerance: DrawingTolerance = DrawingTolerance()
     home: Home | None = None
+    workspace_radius: (
+        Annotated[
+            Metres,
+            Field(gt=0, description="the radius about z that a controller keeps to, such as 90 mm"),
+        ]
+        | None
+    ) = None
     fixed: tuple[str, ...] = ()
     tied: Ties = ()
     models: dict[str, DocumentModel] = Field(default_factory=dict)

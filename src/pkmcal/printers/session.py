@@ -35,8 +35,11 @@ motion: translation
 legs:
 {legs}
 home: {{position: [0, 0, {home} mm]}}
+# The printer's own print radius, by the same file; it calibrates nothing, and exports keep it.
+workspace_radius: {reach} mm
 # Standard deviations of the firmware's values: of radius and towers (a radius that was measured
-# from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured to 0.1 mm, hole to hole, tell the more of sizes along x and y.
+# from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured
+# to 0.1 mm, hole to hole, tell the more of sizes along x and y.
 tolerance: {{center: 2 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
 """
 PRINTER_LEG_TEXT = """\
@@ -232,6 +235,7 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
         label=legible(printer.label),
         legs="\n".join(legs),
         home=_mm(top / 2),
+        reach=_mm(printer.reach),
     )
 
 

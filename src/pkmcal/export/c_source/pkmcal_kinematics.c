@@ -79,6 +79,17 @@
 
 #include <math.h>
 
+/* sqrt or sqrtf, 0.5 or 0.5F: by the type of numbers that the header names. */
+#ifdef PKMCAL_FLOAT
+#define MATH(name) name##f
+#else
+#define MATH(name) name
+#endif
+#define REAL(number) PKMCAL_NUMBER(number)
+
+/* The square root of the type's epsilon: what is left of numbers that lost half of their digits. */
+#define HALF_DIGITS MATH(sqrt)(PKMCAL_EPSILON)
+
 /* What a reading moves: a rod's length; its end on the base, along an axis or about one; nothing,
  * where the rod has none. */
 enum { CONSTANT, TELESCOPE, SLIDE, TURN };
@@ -88,22 +99,22 @@ enum { CONSTANT, TELESCOPE, SLIDE, TURN };
  *   a = base, base + q rate (SLIDE), or base + cos(q) arm + sin(q) rate (TURN), base frame;
  *   b = t + R (platform + cos(phi) swing + sin(phi) swing_rate) + floating;
  *   |b - a| = length, or length + q (TELESCOPE).
- * Fields that are not written are zero. */
+ * What a rod has not is zero. */
 typedef struct {
     int drive;
-    int joint;            /* column of the reading */
-    double scale;         /* of the reading */
-    double middle;        /* m or rad, q at mid-range, of a SLIDE or TURN */
-    double length;        /* m */
-    double base[3];       /* m, joint centre, its place at reading 0, or the foot of its arm */
-    double arm[3];        /* m, from the foot to the end at reading 0, square to the axis */
-    double rate[3];       /* m/m or m/rad, how the end moves at reading 0 */
-    double platform[3];   /* m, platform frame: joint centre, or the foot of its arm on the hinge */
-    int hinge;            /* of the bar that turns, from 1; 0 without */
-    double hinge_axis[3]; /* unit, platform frame */
-    double swing[3];      /* m, platform frame: from the foot to the end at phi = 0 */
-    double swing_rate[3]; /* m/rad */
-    double floating[3];   /* m, base frame: on a bar that keeps its direction */
+    int joint;                 /* column of the reading */
+    int hinge;                 /* of the bar that turns, from 1; 0 without */
+    pkmcal_real scale;         /* of the reading */
+    pkmcal_real middle;        /* m or rad, q at mid-range, of a SLIDE or TURN */
+    pkmcal_real length;        /* m */
+    pkmcal_real base[3];       /* m, joint centre, its place at reading 0, or its arm's foot */
+    pkmcal_real arm[3];        /* m, from the foot to the end at reading 0, square to the axis */
+    pkmcal_real rate[3];       /* m/m or m/rad, how the end moves at reading 0 */
+    pkmcal_real platform[3];   /* m, platform frame: joint centre, or the bar's foot on its hinge */
+    pkmcal_real hinge_axis[3]; /* unit, platform frame */
+    pkmcal_real swing[3];      /* m, platform frame: from the foot to the end at phi = 0 */
+    pkmcal_real swing_rate[3]; /* m/rad */
+    pkmcal_real floating[3];   /* m, base frame: on a bar that keeps its direction */
 } rod_data;
 
 /* An equation of a joint's axis: the rod has no part along w, which is the base's axis, the
@@ -113,8 +124,8 @@ enum { ON_BASE, ON_PLATFORM, TORSION };
 typedef struct {
     int rod; /* from 0 */
     int kind;
-    double base[3];     /* unit, base frame */
-    double platform[3]; /* unit, platform frame */
+    pkmcal_real base[3];     /* unit, base frame */
+    pkmcal_real platform[3]; /* unit, platform frame */
 } axis_data;
 
 /* ---- the machine ---- */
@@ -122,8 +133,8 @@ typedef struct {
 #define FREEDOMS 6
 #define HINGES 0
 #define AXES 0
-#define SIZE 0.35941207075412851 /* m, the machine's size */
-#define RADIUS 0.19500824483994403 /* m, the platform's: makes turns lengths */
+#define SIZE REAL(0.3594120707541285) /* m, the machine's size */
+#define RADIUS REAL(0.19500824483994403) /* m, the platform's: makes turns lengths */
 
 /* of omega_x, omega_y, omega_z, tau_x, tau_y, tau_z those that the platform has */
 static const int FREE[FREEDOMS] = {0, 1, 2, 3, 4, 5};
@@ -131,78 +142,126 @@ static const int FREE[FREEDOMS] = {0, 1, 2, 3, 4, 5};
 static const rod_data RODS[PKMCAL_RODS] = {
     /* leg 1 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 0,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {0.26929999999999998, 0.02, 0.0},
-        .platform = {0.1143, 0.158, 0.0},
+        TELESCOPE, /* drive */
+        0, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(0.2693), REAL(0.02), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(0.1143), REAL(0.158), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
     /* leg 2 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 1,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {0.26929999999999998, -0.02, 0.0},
-        .platform = {0.1143, -0.158, 0.0},
+        TELESCOPE, /* drive */
+        1, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(0.2693), REAL(-0.02), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(0.1143), REAL(-0.158), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
     /* leg 3 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 2,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {-0.152, 0.22320000000000001, 0.0},
-        .platform = {-0.19400000000000001, 0.02, 0.0},
+        TELESCOPE, /* drive */
+        2, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(-0.152), REAL(0.2232), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(-0.194), REAL(0.02), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
     /* leg 4 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 3,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {-0.1173, 0.2432, 0.0},
-        .platform = {0.079600000000000004, 0.17799999999999999, 0.0},
+        TELESCOPE, /* drive */
+        3, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(-0.1173), REAL(0.2432), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(0.0796), REAL(0.178), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
     /* leg 5 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 4,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {-0.1173, -0.2432, 0.0},
-        .platform = {0.079600000000000004, -0.17799999999999999, 0.0},
+        TELESCOPE, /* drive */
+        4, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(-0.1173), REAL(-0.2432), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(0.0796), REAL(-0.178), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
     /* leg 6 of the mechanism file */
     {
-        .drive = TELESCOPE,
-        .joint = 5,
-        .scale = 1.0,
-        .length = 0.0,
-        .base = {-0.152, -0.22320000000000001, 0.0},
-        .platform = {-0.19400000000000001, -0.02, 0.0},
+        TELESCOPE, /* drive */
+        5, /* joint */
+        0, /* hinge */
+        1, /* scale */
+        0, /* middle */
+        0, /* length */
+        {REAL(-0.152), REAL(-0.2232), 0}, /* base */
+        {0, 0, 0}, /* arm */
+        {0, 0, 0}, /* rate */
+        {REAL(-0.194), REAL(-0.02), 0}, /* platform */
+        {0, 0, 0}, /* hinge_axis */
+        {0, 0, 0}, /* swing */
+        {0, 0, 0}, /* swing_rate */
+        {0, 0, 0}, /* floating */
     },
 };
 
 /* one row at least */
 static const axis_data AXIS[AXES + 1] = {
-    {.rod = 0},
+    {0, ON_BASE, {0, 0, 0}, {0, 0, 0}},
 };
 
-static const pkmcal_pose HOME = {{{0.99999999999357247, -9.5387380270257459e-17, -3.5854207794893586e-06},
-    {9.5387300296976377e-17, 1.0, -2.2305302258447904e-17},
-    {3.5854207794893586e-06, 2.2304960254695947e-17, 0.99999999999357247}},
-    {6.8825564613636151e-05, -3.0638190610927038e-17, 0.35941207075412851}};
+static const pkmcal_pose HOME = {{{REAL(0.9999999999935725), REAL(-9.538738027025746e-17), REAL(-3.5854207794893586e-06)},
+    {REAL(9.538730029697638e-17), 1, REAL(-2.2305302258447904e-17)},
+    {REAL(3.5854207794893586e-06), REAL(2.2304960254695947e-17), REAL(0.9999999999935725)}},
+    {REAL(6.882556461363615e-05), REAL(-3.063819061092704e-17), REAL(0.3594120707541285)}};
 
 /* m or rad, by the mechanism file */
-static const double RANGE[PKMCAL_JOINTS][2] = {
-    {0.34499999999999997, 0.48499999999999999},
-    {0.34499999999999997, 0.48499999999999999},
-    {0.34499999999999997, 0.48499999999999999},
-    {0.34499999999999997, 0.48499999999999999},
-    {0.34499999999999997, 0.48499999999999999},
-    {0.34499999999999997, 0.48499999999999999}
+static const pkmcal_real RANGE[PKMCAL_JOINTS][2] = {
+    {REAL(0.345), REAL(0.485)},
+    {REAL(0.345), REAL(0.485)},
+    {REAL(0.345), REAL(0.485)},
+    {REAL(0.345), REAL(0.485)},
+    {REAL(0.345), REAL(0.485)},
+    {REAL(0.345), REAL(0.485)}
 };
 
 /* ---- what follows is the same for every machine ---- */
@@ -215,24 +274,24 @@ static const double RANGE[PKMCAL_JOINTS][2] = {
 /* Where the platform is, and its bars. */
 typedef struct {
     pkmcal_pose pose;
-    double hinges[HINGES + 1]; /* rad; C has no arrays of none */
+    pkmcal_real hinges[HINGES + 1]; /* rad; C has no arrays of none */
 } state;
 
 /* ---- vectors and linear equations ---- */
 
-static double dot(const double a[3], const double b[3])
+static pkmcal_real dot(const pkmcal_real a[3], const pkmcal_real b[3])
 {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-static void cross(const double a[3], const double b[3], double out[3])
+static void cross(const pkmcal_real a[3], const pkmcal_real b[3], pkmcal_real out[3])
 {
     out[0] = a[1] * b[2] - a[2] * b[1];
     out[1] = a[2] * b[0] - a[0] * b[2];
     out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-static void turned(const pkmcal_pose *pose, const double v[3], double out[3])
+static void turned(const pkmcal_pose *pose, const pkmcal_real v[3], pkmcal_real out[3])
 {
     int i;
     for (i = 0; i < 3; ++i) {
@@ -241,21 +300,21 @@ static void turned(const pkmcal_pose *pose, const double v[3], double out[3])
 }
 
 /* Unit direction from a to b; returns their distance, m. */
-static double direction(const double a[3], const double b[3], double u[3])
+static pkmcal_real direction(const pkmcal_real a[3], const pkmcal_real b[3], pkmcal_real u[3])
 {
-    double size;
+    pkmcal_real size;
     int i;
     for (i = 0; i < 3; ++i) {
         u[i] = b[i] - a[i];
     }
-    size = sqrt(dot(u, u));
+    size = MATH(sqrt)(dot(u, u));
     for (i = 0; i < 3; ++i) {
         u[i] /= size;
     }
     return size;
 }
 
-static int all_finite(const double *values, int count)
+static int all_finite(const pkmcal_real *values, int count)
 {
     int k;
     for (k = 0; k < count; ++k) {
@@ -268,33 +327,33 @@ static int all_finite(const double *values, int count)
 
 /* Solves m x = v, n of them, x in v's place, with partial pivoting; m is lost. Returns the smallest
  * pivot. */
-static double solve(int n, double m[][MOST_UNKNOWNS], double v[])
+static pkmcal_real solve(int n, pkmcal_real m[][MOST_UNKNOWNS], pkmcal_real v[])
 {
-    double least = HUGE_VAL;
+    pkmcal_real least = INFINITY;
     int i, j, k;
     for (k = 0; k < n; ++k) {
         int best = k;
         for (i = k + 1; i < n; ++i) {
-            if (fabs(m[i][k]) > fabs(m[best][k])) {
+            if (MATH(fabs)(m[i][k]) > MATH(fabs)(m[best][k])) {
                 best = i;
             }
         }
         if (best != k) {
-            const double held = v[k];
+            const pkmcal_real held = v[k];
             v[k] = v[best];
             v[best] = held;
             for (j = k; j < n; ++j) {
-                const double moved = m[k][j];
+                const pkmcal_real moved = m[k][j];
                 m[k][j] = m[best][j];
                 m[best][j] = moved;
             }
         }
-        if (!(fabs(m[k][k]) > 0.0)) {
-            return 0.0;
+        if (!(MATH(fabs)(m[k][k]) > 0)) {
+            return 0;
         }
-        least = fmin(least, fabs(m[k][k]));
+        least = MATH(fmin)(least, MATH(fabs)(m[k][k]));
         for (i = k + 1; i < n; ++i) {
-            const double factor = m[i][k] / m[k][k];
+            const pkmcal_real factor = m[i][k] / m[k][k];
             for (j = k + 1; j < n; ++j) {
                 m[i][j] -= factor * m[k][j];
             }
@@ -313,21 +372,21 @@ static double solve(int n, double m[][MOST_UNKNOWNS], double v[])
 /* ---- a rod's ends and length ---- */
 
 /* What the rod's motor has moved, m or rad. */
-static double joint_value(const rod_data *rod, const double joints[PKMCAL_JOINTS])
+static pkmcal_real joint_value(const rod_data *rod, const pkmcal_real joints[PKMCAL_JOINTS])
 {
     return rod->scale * joints[rod->joint];
 }
 
 /* The rod's end on the base, m, base frame. */
-static void base_end(const rod_data *rod, const double joints[PKMCAL_JOINTS], double a[3])
+static void base_end(const rod_data *rod, const pkmcal_real joints[PKMCAL_JOINTS], pkmcal_real a[3])
 {
-    double by_arm = 0.0, by_rate = 0.0;
+    pkmcal_real by_arm = 0, by_rate = 0;
     int i;
     if (rod->drive == SLIDE) {
         by_rate = joint_value(rod, joints);
     } else if (rod->drive == TURN) {
-        by_arm = cos(joint_value(rod, joints));
-        by_rate = sin(joint_value(rod, joints));
+        by_arm = MATH(cos)(joint_value(rod, joints));
+        by_rate = MATH(sin)(joint_value(rod, joints));
     }
     for (i = 0; i < 3; ++i) {
         a[i] = rod->base[i] + by_arm * rod->arm[i] + by_rate * rod->rate[i];
@@ -335,18 +394,18 @@ static void base_end(const rod_data *rod, const double joints[PKMCAL_JOINTS], do
 }
 
 /* The rod's length, m. */
-static double rod_length(const rod_data *rod, const double joints[PKMCAL_JOINTS])
+static pkmcal_real rod_length(const rod_data *rod, const pkmcal_real joints[PKMCAL_JOINTS])
 {
     return rod->drive == TELESCOPE ? rod->length + joint_value(rod, joints) : rod->length;
 }
 
 /* The rod's end on the platform: b the point, arm what turns with the platform, m, base frame. */
-static void platform_end(const rod_data *rod, const state *at, double arm[3], double b[3])
+static void platform_end(const rod_data *rod, const state *at, pkmcal_real arm[3], pkmcal_real b[3])
 {
     int i;
     if (HINGES > 0 && rod->hinge > 0) {
-        const double c = cos(at->hinges[rod->hinge - 1]), s = sin(at->hinges[rod->hinge - 1]);
-        double own[3];
+        const pkmcal_real phi = at->hinges[rod->hinge - 1], c = MATH(cos)(phi), s = MATH(sin)(phi);
+        pkmcal_real own[3];
         for (i = 0; i < 3; ++i) {
             own[i] = rod->platform[i] + c * rod->swing[i] + s * rod->swing_rate[i];
         }
@@ -360,10 +419,10 @@ static void platform_end(const rod_data *rod, const state *at, double arm[3], do
 }
 
 /* How fast the rod's end on the platform goes along u with the turn of its bar, m/rad. */
-static double hinge_gain(const rod_data *rod, const state *at, const double u[3])
+static pkmcal_real hinge_gain(const rod_data *rod, const state *at, const pkmcal_real u[3])
 {
-    const double c = cos(at->hinges[rod->hinge - 1]), s = sin(at->hinges[rod->hinge - 1]);
-    double own[3], rate[3];
+    const pkmcal_real phi = at->hinges[rod->hinge - 1], c = MATH(cos)(phi), s = MATH(sin)(phi);
+    pkmcal_real own[3], rate[3];
     int i;
     for (i = 0; i < 3; ++i) {
         own[i] = c * rod->swing_rate[i] - s * rod->swing[i];
@@ -373,8 +432,8 @@ static double hinge_gain(const rod_data *rod, const state *at, const double u[3]
 }
 
 /* How fast the rod's end on the platform goes along u with the reading, m/m or m/rad. */
-static double reading_gain(const rod_data *rod, const double joints[PKMCAL_JOINTS],
-                           const double u[3])
+static pkmcal_real reading_gain(const rod_data *rod, const pkmcal_real joints[PKMCAL_JOINTS],
+                                const pkmcal_real u[3])
 {
     switch (rod->drive) {
     case TELESCOPE:
@@ -383,10 +442,10 @@ static double reading_gain(const rod_data *rod, const double joints[PKMCAL_JOINT
         return rod->scale * dot(u, rod->rate);
     case TURN:
         return rod->scale
-               * (cos(joint_value(rod, joints)) * dot(u, rod->rate)
-                  - sin(joint_value(rod, joints)) * dot(u, rod->arm));
+               * (MATH(cos)(joint_value(rod, joints)) * dot(u, rod->rate)
+                  - MATH(sin)(joint_value(rod, joints)) * dot(u, rod->arm));
     default:
-        return 0.0;
+        return 0;
     }
 }
 
@@ -395,13 +454,14 @@ static double reading_gain(const rod_data *rod, const double joints[PKMCAL_JOINT
 static void upright(state *at)
 {
     const pkmcal_pose *p = &at->pose;
-    const double axial[3] = {p->R[2][1] - p->R[1][2], p->R[0][2] - p->R[2][0],
+    const pkmcal_real axial[3] = {p->R[2][1] - p->R[1][2], p->R[0][2] - p->R[2][0],
                              p->R[1][0] - p->R[0][1]};
-    const double real = 1.0 + p->R[0][0] + p->R[1][1] + p->R[2][2];
+    const pkmcal_real real = 1 + p->R[0][0] + p->R[1][1] + p->R[2][2];
     int k;
     for (k = 0; k < PKMCAL_RODS; ++k) {
         if (HINGES > 0 && RODS[k].hinge > 0) {
-            at->hinges[RODS[k].hinge - 1] = -2.0 * atan2(dot(axial, RODS[k].hinge_axis), real);
+            at->hinges[RODS[k].hinge - 1] =
+                -2 * MATH(atan2)(dot(axial, RODS[k].hinge_axis), real);
         }
     }
 }
@@ -409,57 +469,57 @@ static void upright(state *at)
 /* ---- readings at a pose ---- */
 
 /* The angle, of those that differ by whole turns, nearest to another one, rad. */
-static double nearest(double angle, double near)
+static pkmcal_real nearest(pkmcal_real angle, pkmcal_real near)
 {
-    const double turn = 6.283185307179586476925;
-    return angle - turn * floor((angle - near) / turn + 0.5);
+    const pkmcal_real turn = REAL(6.283185307179586);
+    return angle - turn * MATH(floor)((angle - near) / turn + REAL(0.5));
 }
 
 /* The reading at which the rod ends in b: [B] eq. 4; [C] eq. 2 as the errata's Model 31. */
-static pkmcal_status rod_reading(const rod_data *rod, const double b[3], double *reading)
+static pkmcal_status rod_reading(const rod_data *rod, const pkmcal_real b[3], pkmcal_real *reading)
 {
-    double d[3], along, across, square, half, straight, first, second, q;
+    pkmcal_real d[3], along, across, square, half, straight, first, second, q;
     int i;
     for (i = 0; i < 3; ++i) {
         d[i] = b[i] - rod->base[i];
     }
     along = dot(d, rod->rate);
     if (rod->drive == TELESCOPE) {
-        q = sqrt(dot(d, d)) - rod->length;
+        q = MATH(sqrt)(dot(d, d)) - rod->length;
     } else if (rod->drive == SLIDE) {
         square = rod->length * rod->length - dot(d, d) + along * along;
-        if (!(square >= 0.0)) {
+        if (!(square >= 0)) {
             return PKMCAL_OUT_OF_REACH;
         }
-        half = sqrt(square);
+        half = MATH(sqrt)(square);
         q = along >= rod->middle ? along - half : along + half;
     } else {
         across = dot(d, rod->arm);
         square = dot(d, d) + dot(rod->arm, rod->arm) - rod->length * rod->length;
-        half = 0.5 * square / sqrt(across * across + along * along);
-        if (!(fabs(half) <= 1.0)) {
+        half = REAL(0.5) * square / MATH(sqrt)(across * across + along * along);
+        if (!(MATH(fabs)(half) <= 1)) {
             return PKMCAL_OUT_OF_REACH;
         }
-        half = acos(half);
-        straight = atan2(along, across);
+        half = MATH(acos)(half);
+        straight = MATH(atan2)(along, across);
         first = nearest(straight + half, rod->middle);
         second = nearest(straight - half, rod->middle);
-        q = fabs(first - rod->middle) <= fabs(second - rod->middle) ? first : second;
+        q = MATH(fabs)(first - rod->middle) <= MATH(fabs)(second - rod->middle) ? first : second;
     }
     *reading = q / rod->scale;
     return PKMCAL_OK;
 }
 
 /* Each motor's mean of what its rods would read by themselves. */
-static pkmcal_status own_readings(const state *at, double joints[PKMCAL_JOINTS])
+static pkmcal_status own_readings(const state *at, pkmcal_real joints[PKMCAL_JOINTS])
 {
     int count[PKMCAL_JOINTS] = {0}, k;
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
-        joints[k] = 0.0;
+        joints[k] = 0;
     }
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        double arm[3], b[3], reading = 0.0;
+        pkmcal_real arm[3], b[3], reading = 0;
         if (rod->drive == CONSTANT) {
             continue;
         }
@@ -471,25 +531,26 @@ static pkmcal_status own_readings(const state *at, double joints[PKMCAL_JOINTS])
         ++count[rod->joint];
     }
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
-        joints[k] = count[k] > 1 ? joints[k] / count[k] : joints[k];
+        joints[k] = count[k] > 1 ? joints[k] / (pkmcal_real)count[k] : joints[k];
     }
     return PKMCAL_OK;
 }
 
 /* Normal equations of the rods for readings and hinges at a pose. */
-static void normal_equations(const double joints[PKMCAL_JOINTS], const state *at,
-                             double normal[][MOST_UNKNOWNS], double gradient[INVERSE_UNKNOWNS])
+static void normal_equations(const pkmcal_real joints[PKMCAL_JOINTS], const state *at,
+                             pkmcal_real normal[][MOST_UNKNOWNS],
+                             pkmcal_real gradient[INVERSE_UNKNOWNS])
 {
     int i, j, k;
     for (i = 0; i < INVERSE_UNKNOWNS; ++i) {
-        gradient[i] = 0.0;
+        gradient[i] = 0;
         for (j = 0; j < INVERSE_UNKNOWNS; ++j) {
-            normal[i][j] = 0.0;
+            normal[i][j] = 0;
         }
     }
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        double a[3], b[3], u[3], arm[3], row[INVERSE_UNKNOWNS] = {0.0}, value;
+        pkmcal_real a[3], b[3], u[3], arm[3], row[INVERSE_UNKNOWNS] = {0}, value;
         base_end(rod, joints, a);
         platform_end(rod, at, arm, b);
         value = direction(a, b, u) - rod_length(rod, joints);
@@ -509,19 +570,19 @@ static void normal_equations(const double joints[PKMCAL_JOINTS], const state *at
 }
 
 /* Several rods a motor or a bar: readings and hinges that fit all rods best, by Gauss-Newton. */
-static pkmcal_status common_readings(state *at, double joints[PKMCAL_JOINTS])
+static pkmcal_status common_readings(state *at, pkmcal_real joints[PKMCAL_JOINTS])
 {
-    double normal[INVERSE_UNKNOWNS][MOST_UNKNOWNS], step[INVERSE_UNKNOWNS], largest = 1.0;
+    pkmcal_real normal[INVERSE_UNKNOWNS][MOST_UNKNOWNS], step[INVERSE_UNKNOWNS], largest = 1;
     int k, steps;
-    for (steps = 0; steps < 15 && largest > 1e-15; ++steps) {
+    for (steps = 0; steps < 15 && largest > 4 * PKMCAL_EPSILON; ++steps) {
         normal_equations(joints, at, normal, step);
-        if (!(solve(INVERSE_UNKNOWNS, normal, step) > 0.0)
+        if (!(solve(INVERSE_UNKNOWNS, normal, step) > 0)
             || !all_finite(step, INVERSE_UNKNOWNS)) {
             return PKMCAL_SINGULAR;
         }
-        largest = 0.0;
+        largest = 0;
         for (k = 0; k < INVERSE_UNKNOWNS; ++k) {
-            largest = fmax(largest, fabs(step[k]));
+            largest = MATH(fmax)(largest, MATH(fabs)(step[k]));
         }
         for (k = 0; k < PKMCAL_JOINTS; ++k) {
             joints[k] -= step[k];
@@ -533,9 +594,9 @@ static pkmcal_status common_readings(state *at, double joints[PKMCAL_JOINTS])
     return PKMCAL_OK;
 }
 
-pkmcal_status pkmcal_inverse(const pkmcal_pose *pose, double joints[PKMCAL_JOINTS])
+pkmcal_status pkmcal_inverse(const pkmcal_pose *pose, pkmcal_real joints[PKMCAL_JOINTS])
 {
-    double found[PKMCAL_JOINTS];
+    pkmcal_real found[PKMCAL_JOINTS];
     state at;
     int k;
     pkmcal_status status;
@@ -556,9 +617,9 @@ pkmcal_status pkmcal_inverse(const pkmcal_pose *pose, double joints[PKMCAL_JOINT
 
 #if !PKMCAL_COUPLED
 pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
-                                      double jacobian[PKMCAL_JOINTS][6])
+                                      pkmcal_real jacobian[PKMCAL_JOINTS][6])
 {
-    double joints[PKMCAL_JOINTS];
+    pkmcal_real joints[PKMCAL_JOINTS];
     state at;
     int i, k;
     const pkmcal_status status = pkmcal_inverse(pose, joints);
@@ -568,7 +629,7 @@ pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
     at.pose = *pose;
     for (k = 0; k < PKMCAL_RODS; ++k) {
         const rod_data *rod = &RODS[k];
-        double a[3], b[3], u[3], arm[3], moment[3], size, gain;
+        pkmcal_real a[3], b[3], u[3], arm[3], moment[3], size, gain;
         if (rod->drive == CONSTANT) {
             continue;
         }
@@ -576,7 +637,7 @@ pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
         platform_end(rod, &at, arm, b);
         size = direction(a, b, u);
         gain = reading_gain(rod, joints, u);
-        if (!(size > 0.0) || fabs(gain) < 1e-9) {
+        if (!(size > 0) || MATH(fabs)(gain) < HALF_DIGITS) {
             return PKMCAL_SINGULAR; /* the twist tells the rate of no reading */
         }
         cross(arm, u, moment);
@@ -593,14 +654,14 @@ pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
 
 /* What the readings alone decide: the rods' ends on the base, and their lengths, m. */
 typedef struct {
-    double a[PKMCAL_RODS][3];
-    double length[PKMCAL_RODS];
+    pkmcal_real a[PKMCAL_RODS][3];
+    pkmcal_real length[PKMCAL_RODS];
 } anchors;
 
 /* A row of the closure, that a point moves along w: by the platform's freedoms, turns in RADIUS. */
-static void set_row(const double moment[3], const double w[3], double row[UNKNOWNS])
+static void set_row(const pkmcal_real moment[3], const pkmcal_real w[3], pkmcal_real row[UNKNOWNS])
 {
-    double by_twist[6];
+    pkmcal_real by_twist[6];
     int k;
     for (k = 0; k < 3; ++k) {
         by_twist[k] = moment[k] / RADIUS;
@@ -610,20 +671,20 @@ static void set_row(const double moment[3], const double w[3], double row[UNKNOW
         row[k] = by_twist[FREE[k]];
     }
     for (k = FREEDOMS; k < UNKNOWNS; ++k) {
-        row[k] = 0.0;
+        row[k] = 0;
     }
 }
 
 /* The equation of an axis, m: line . w, with line the rod from a to b ([A] eq. 7; errata, 3-UPU). */
-static double axis_row(const axis_data *axis, const double line[3], const double arm[3],
-                       const state *at, double row[UNKNOWNS])
+static pkmcal_real axis_row(const axis_data *axis, const pkmcal_real line[3],
+                            const pkmcal_real arm[3], const state *at, pkmcal_real row[UNKNOWNS])
 {
-    double n[3], w[3], moment[3], more[3], around[3];
+    pkmcal_real n[3], w[3], moment[3], more[3], around[3];
     int i;
     turned(&at->pose, axis->platform, n);
     for (i = 0; i < 3; ++i) {
         w[i] = axis->kind == ON_BASE ? axis->base[i] : n[i];
-        more[i] = 0.0;
+        more[i] = 0;
     }
     if (axis->kind == ON_PLATFORM) {
         cross(n, line, more);
@@ -642,13 +703,13 @@ static double axis_row(const axis_data *axis, const double line[3], const double
 
 /* The closure, m: |b - a| - length of each rod, then the axes' equations, with derivatives.
  * Returns the sum of squares, and the largest in *error. */
-static double closure(const anchors *base, const state *at, double value[EQUATIONS],
-                      double rows[EQUATIONS][MOST_UNKNOWNS], double *error)
+static pkmcal_real closure(const anchors *base, const state *at, pkmcal_real value[EQUATIONS],
+                           pkmcal_real rows[EQUATIONS][MOST_UNKNOWNS], pkmcal_real *error)
 {
-    double arm[PKMCAL_RODS][3], b[PKMCAL_RODS][3], cost = 0.0;
+    pkmcal_real arm[PKMCAL_RODS][3], b[PKMCAL_RODS][3], cost = 0;
     int i, k;
     for (k = 0; k < PKMCAL_RODS; ++k) {
-        double u[3], moment[3];
+        pkmcal_real u[3], moment[3];
         platform_end(&RODS[k], at, arm[k], b[k]);
         value[k] = direction(base->a[k], b[k], u) - base->length[k];
         cross(arm[k], u, moment);
@@ -659,40 +720,43 @@ static double closure(const anchors *base, const state *at, double value[EQUATIO
     }
     for (k = 0; k < AXES; ++k) {
         const int rod = AXIS[k].rod;
-        double line[3];
+        pkmcal_real line[3];
         for (i = 0; i < 3; ++i) {
             line[i] = b[rod][i] - base->a[rod][i];
         }
         value[PKMCAL_RODS + k] = axis_row(&AXIS[k], line, arm[rod], at, rows[PKMCAL_RODS + k]);
     }
-    *error = 0.0;
+    *error = 0;
     for (k = 0; k < EQUATIONS; ++k) {
         cost += value[k] * value[k];
-        *error = fmax(*error, fabs(value[k]));
+        *error = MATH(fmax)(*error, MATH(fabs)(value[k]));
     }
     return cost;
 }
 
 /* ---- steps of the platform ---- */
 
+/* Largest element of R'R - I that passes for rounding: of R in six digits, or in floats. */
+#define ROTATION_SLACK (REAL(1e-6) + 64 * PKMCAL_EPSILON)
+
 /* Makes R a rotation to the last digit, which it must be but for rounding. */
-static int tidy(double R[3][3])
+static int tidy(pkmcal_real R[3][3])
 {
-    double gram[3][3], out[3][3];
+    pkmcal_real gram[3][3], out[3][3];
     int i, j, k;
     for (i = 0; i < 3; ++i) {
         for (j = 0; j < 3; ++j) {
             gram[i][j] = R[0][i] * R[0][j] + R[1][i] * R[1][j] + R[2][i] * R[2][j];
-            if (!(fabs(gram[i][j] - (i == j ? 1.0 : 0.0)) < 1e-6)) {
+            if (!(MATH(fabs)(gram[i][j] - (i == j ? 1 : 0)) < ROTATION_SLACK)) {
                 return 0;
             }
         }
     }
     for (i = 0; i < 3; ++i) {
         for (j = 0; j < 3; ++j) {
-            double sum = 0.0;
+            pkmcal_real sum = 0;
             for (k = 0; k < 3; ++k) {
-                sum += R[i][k] * ((k == j ? 1.5 : 0.0) - 0.5 * gram[k][j]);
+                sum += R[i][k] * ((k == j ? REAL(1.5) : 0) - REAL(0.5) * gram[k][j]);
             }
             out[i][j] = sum;
         }
@@ -706,22 +770,22 @@ static int tidy(double R[3][3])
 }
 
 /* Turns the platform's axes by the rotation vector w, rad, about the base's (Rodrigues). */
-static void rotate(double R[3][3], const double w[3])
+static void rotate(pkmcal_real R[3][3], const pkmcal_real w[3])
 {
-    const double angle2 = dot(w, w);
-    double s, c;
+    const pkmcal_real angle2 = dot(w, w);
+    pkmcal_real s, c;
     int i, j;
-    if (angle2 < 1e-8) {
-        s = 1.0 - angle2 / 6.0;
-        c = 0.5 - angle2 / 24.0;
+    if (angle2 < REAL(1e-8)) {
+        s = 1 - angle2 / 6;
+        c = REAL(0.5) - angle2 / 24;
     } else {
-        const double angle = sqrt(angle2), half = sin(0.5 * angle) / angle;
-        s = sin(angle) / angle;
-        c = 2.0 * half * half;
+        const pkmcal_real angle = MATH(sqrt)(angle2), half = MATH(sin)(REAL(0.5) * angle) / angle;
+        s = MATH(sin)(angle) / angle;
+        c = 2 * half * half;
     }
     for (j = 0; j < 3; ++j) {
-        const double v[3] = {R[0][j], R[1][j], R[2][j]};
-        double once[3], twice[3];
+        const pkmcal_real v[3] = {R[0][j], R[1][j], R[2][j]};
+        pkmcal_real once[3], twice[3];
         cross(w, v, once);
         cross(w, once, twice);
         for (i = 0; i < 3; ++i) {
@@ -731,9 +795,9 @@ static void rotate(double R[3][3], const double w[3])
 }
 
 /* The state moved back by a share of Newton's step. */
-static void move(const state *from, const double step[UNKNOWNS], double share, state *to)
+static void move(const state *from, const pkmcal_real step[UNKNOWNS], pkmcal_real share, state *to)
 {
-    double twist[6] = {0.0};
+    pkmcal_real twist[6] = {0};
     int k;
     *to = *from;
     for (k = 0; k < FREEDOMS; ++k) {
@@ -753,38 +817,41 @@ static void move(const state *from, const double step[UNKNOWNS], double share, s
 
 /* The largest share, up to 1, of a step that turns by less than half a radian and shifts by less
  * than the machine's size. */
-static double allowed(const double step[UNKNOWNS])
+static pkmcal_real allowed(const pkmcal_real step[UNKNOWNS])
 {
-    double largest = 0.0;
+    pkmcal_real largest = 0;
     int k;
     for (k = 0; k < UNKNOWNS; ++k) {
-        const double limit = k >= FREEDOMS ? 0.5 : FREE[k] < 3 ? 0.5 * RADIUS : SIZE;
-        largest = fmax(largest, fabs(step[k]) / limit);
+        const pkmcal_real half = REAL(0.5);
+        const pkmcal_real limit = k >= FREEDOMS ? half : FREE[k] < 3 ? half * RADIUS : SIZE;
+        largest = MATH(fmax)(largest, MATH(fabs)(step[k]) / limit);
     }
-    return largest > 1.0 ? 1.0 / largest : 1.0;
+    return largest > 1 ? 1 / largest : 1;
 }
 
 /* ---- the pose at readings ---- */
 
-#define CLOSED (1e-14 * SIZE) /* m, some units in the last place of a length */
-#define NEARLY (1e-12 * SIZE) /* m, good enough where no step makes it better */
-#define LEAST_SHARE 0.1       /* of Newton's step; where it still overshoots, it is damped */
-#define LEAST_PIVOT 1e-9      /* below it not six digits of a step would be right */
-#define FIRST_DAMPING 1e-4
-#define LAST_DAMPING 1e6 /* shifts of less than a thousandth of what is missing */
-#define AT_REST 1e-6     /* share of the squares: a step that saves less leads nowhere */
+/* Rounding: of a length it is some PKMCAL_EPSILON times the machine's size. */
+#define CLOSED (2 * PKMCAL_EPSILON * SIZE)   /* m, some units in the last place of a length */
+#define NEARLY (256 * PKMCAL_EPSILON * SIZE) /* m, good enough where no step makes it better */
+#define LEAST_SHARE REAL(0.1)   /* of Newton's step; where it still overshoots, it is damped */
+#define LEAST_PIVOT HALF_DIGITS /* below it not half of a step's digits would be right */
+#define FIRST_DAMPING REAL(1e-4)
+#define LAST_DAMPING REAL(1e6)  /* shifts of less than a thousandth of what is missing */
+#define AT_REST REAL(1e-6)      /* share of the squares: a step that saves less leads nowhere */
 
 /* Where the iteration is: the state, and the closure there. */
 typedef struct {
     state at;
-    double value[EQUATIONS];
-    double rows[EQUATIONS][MOST_UNKNOWNS];
-    double cost;  /* m^2, sum of squares of value */
-    double error; /* m, largest of value */
+    pkmcal_real value[EQUATIONS];
+    pkmcal_real rows[EQUATIONS][MOST_UNKNOWNS];
+    pkmcal_real cost;  /* m^2, sum of squares of value */
+    pkmcal_real error; /* m, largest of value */
 } iterate;
 
 /* Goes on by a share of a step, where that makes the closure better; else returns 0. */
-static int improved(const anchors *base, const double step[UNKNOWNS], double share, iterate *now)
+static int improved(const anchors *base, const pkmcal_real step[UNKNOWNS], pkmcal_real share,
+                    iterate *now)
 {
     iterate trial;
     move(&now->at, step, share, &trial.at);
@@ -797,9 +864,9 @@ static int improved(const anchors *base, const double step[UNKNOWNS], double sha
 }
 
 /* One step of Newton's method, or half of it, and so on; returns 0 where none is better. */
-static int newton(const anchors *base, iterate *now, double *pivot)
+static int newton(const anchors *base, iterate *now, pkmcal_real *pivot)
 {
-    double rows[EQUATIONS][MOST_UNKNOWNS], step[UNKNOWNS], share;
+    pkmcal_real rows[EQUATIONS][MOST_UNKNOWNS], step[UNKNOWNS], share;
     int i, k;
     for (i = 0; i < UNKNOWNS; ++i) {
         step[i] = now->value[i];
@@ -811,7 +878,7 @@ static int newton(const anchors *base, iterate *now, double *pivot)
     if (!(*pivot > LEAST_PIVOT)) {
         return 0;
     }
-    for (share = allowed(step); share > LEAST_SHARE; share *= 0.5) {
+    for (share = allowed(step); share > LEAST_SHARE; share *= REAL(0.5)) {
         if (improved(base, step, share, now)) {
             return 1;
         }
@@ -822,38 +889,43 @@ static int newton(const anchors *base, iterate *now, double *pivot)
 /* One step of Levenberg's and Marquardt's method, for starts from which Newton's leads nowhere. */
 static int damped(const anchors *base, iterate *now)
 {
-    double lambda;
+    pkmcal_real lambda;
     int i, j, k;
-    for (lambda = FIRST_DAMPING; lambda < LAST_DAMPING; lambda *= 10.0) {
-        double normal[UNKNOWNS][MOST_UNKNOWNS], step[UNKNOWNS];
+    for (lambda = FIRST_DAMPING; lambda < LAST_DAMPING; lambda *= 10) {
+        pkmcal_real normal[UNKNOWNS][MOST_UNKNOWNS], step[UNKNOWNS];
         for (i = 0; i < UNKNOWNS; ++i) {
-            step[i] = 0.0;
+            step[i] = 0;
             for (k = 0; k < EQUATIONS; ++k) {
                 step[i] += now->rows[k][i] * now->value[k];
             }
             for (j = 0; j < UNKNOWNS; ++j) {
-                normal[i][j] = 0.0;
+                normal[i][j] = 0;
                 for (k = 0; k < EQUATIONS; ++k) {
                     normal[i][j] += now->rows[k][i] * now->rows[k][j];
                 }
             }
-            normal[i][i] *= 1.0 + lambda;
+            normal[i][i] *= 1 + lambda;
         }
-        if (solve(UNKNOWNS, normal, step) > 0.0 && improved(base, step, allowed(step), now)) {
+        if (solve(UNKNOWNS, normal, step) > 0 && improved(base, step, allowed(step), now)) {
             return 1;
         }
     }
     return 0;
 }
 
-pkmcal_status pkmcal_forward(const double joints[PKMCAL_JOINTS], pkmcal_pose *pose,
+pkmcal_status pkmcal_forward(const pkmcal_real joints[PKMCAL_JOINTS], pkmcal_pose *pose,
                              pkmcal_report *report)
 {
     iterate now;
     anchors base;
-    double pivot = 0.0, before;
+    pkmcal_real pivot = 0, before;
     int k, steps = 0, moved = 1;
     pkmcal_status status = PKMCAL_NOT_CONVERGED;
+    if (report) {
+        report->steps = 0;
+        report->error = INFINITY;
+        report->pivot = 0;
+    }
     now.at.pose = *pose;
     if (!all_finite(joints, PKMCAL_JOINTS) || !all_finite(pose->t, 3)
         || !tidy(now.at.pose.R)) {
@@ -872,7 +944,7 @@ pkmcal_status pkmcal_forward(const double joints[PKMCAL_JOINTS], pkmcal_pose *po
         if (!moved && now.error > NEARLY) {
             moved = damped(&base, &now);
         }
-        if (now.error > NEARLY && now.cost > (1.0 - AT_REST) * before) {
+        if (now.error > NEARLY && now.cost > (1 - AT_REST) * before) {
             moved = 0;
         }
     } while (moved && now.error > CLOSED && steps < PKMCAL_MOST_STEPS);
@@ -899,12 +971,15 @@ void pkmcal_home(pkmcal_pose *pose)
     *pose = HOME;
 }
 
-int pkmcal_out_of_range(const double joints[PKMCAL_JOINTS])
+int pkmcal_out_of_range(const pkmcal_real joints[PKMCAL_JOINTS])
 {
-    const double slack = 1e-12; /* a reading on its limit is within, by its last digits */
     int k;
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
-        if (!(joints[k] >= RANGE[k][0] - slack && joints[k] <= RANGE[k][1] + slack)) {
+        /* a reading on its limit is within, by its last digits */
+        const pkmcal_real slack = 64 * PKMCAL_EPSILON;
+        const pkmcal_real low = RANGE[k][0] - slack * (MATH(fabs)(RANGE[k][0]) + SIZE);
+        const pkmcal_real high = RANGE[k][1] + slack * (MATH(fabs)(RANGE[k][1]) + SIZE);
+        if (!(joints[k] >= low && joints[k] <= high)) {
             return k + 1;
         }
     }

@@ -1,0 +1,89 @@
+"""A LinuxCNC kinematics module made of the C export, for machines that its own modules have not.
+
+Coordinates are the platform's freedoms: X, Y, Z in mm, A, B, C in degrees. A joint is a reading as
+it was calibrated, in mm or degrees. ``halcompile`` builds it; ``linuxcnc_source/pkmcal_kins.c`` is
+the text around the C source, with the built-in hexapod's numbers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.export.c import C_HEADER_FILE, C_SELFTEST_FILE, CSource, c_value, filled, numbers_of
+from pkmcal.export.contract import Difference, largest
+from pkmcal.export.delta import DEGREES_A_RADIAN, MM_A_METRE
+from pkmcal.mechanisms import Machine
+
+MODULE_NAME = "pkmcal_kins"
+MODULE_SOURCE_FOLDER = Path(__file__).parent / "linuxcnc_source"
+MODULE_SOURCE_FILE = f"{MODULE_NAME}.c"
+MODULE_BUILD_COMMAND = f"sudo halcompile --install {MODULE_SOURCE_FILE}"
+MODULE_CONVENTIONS = (
+    "LinuxCNC's units: mm and degrees. X, Y, Z are the platform frame's origin in the base frame;"
+    " A, B, C are roll, pitch and yaw, R = Rz(C) Ry(B) Rx(A); where the platform turns about z"
+    " alone, C counts from its orientation at home.",
+    "Joint N is reading N + 1 of the machine, as it was calibrated: mm, or degrees of a crank."
+    " Scales and offsets are in the kinematics.",
+    f"Build it with: {MODULE_BUILD_COMMAND}",
+)
+COORDINATE_LETTERS = "ABCXYZ"
+"""Of the freedoms omega_x, omega_y, omega_z, tau_x, tau_y, tau_z."""
+
+
+def joint_units(machine: Machine) -> Array:
+    """LinuxCNC's joint over the reading (m,), mm/m or degrees/rad."""
+    return np.array(
+        [MM_A_METRE if unit == "m" else DEGREES_A_RADIAN for unit in machine.joint_units]
+    )
+
+
+def coordinates(machine: Machine) -> str:
+    """LinuxCNC's letters of the platform's freedoms, X first; InputError where joints are not as
+    many, so that not every command of coordinates is a pose.
+    """
+    free = np.argmax(machine.layout.motion, axis=0).tolist()
+    if len(free) != machine.n_joints:
+        raise InputError(
+            "LinuxCNC moves as many joints as coordinates, and mechanism"
+            f" {machine.name!r} is another machine",
+            found=f"{machine.n_joints} readings, motion {machine.document.motion} with"
+            f" {len(free)} freedoms",
+            expected="as many of both",
+            next_step="Export it with --to c, and choose coordinates of your own",
+        )
+    return "".join(sorted((COORDINATE_LETTERS[k] for k in free), key="XYZABC".index))
+
+
+def module_files(source: MachineSource) -> dict[str, str]:
+    """The C source and header, and the module around them."""
+    coordinates(source.machine)
+    files = CSource().files(source)
+    del files[C_SELFTEST_FILE]
+    units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {_plain(source.machine)};\n"
+    numbers = f"/* LinuxCNC's joint is the reading times this: mm/m or degrees/rad */\n{units}"
+    about = source.header(*MODULE_CONVENTIONS)
+    files[MODULE_SOURCE_FILE] = filled(MODULE_SOURCE_FOLDER / MODULE_SOURCE_FILE, about, numbers)
+    return files
+
+
+def _plain(machine: Machine) -> str:
+    """The joints' units in braces, of type double."""
+    return c_value(joint_units(machine)).replace("REAL(", "").replace(")", "")
+
+
+def module_differences(files: dict[str, str], source: MachineSource) -> list[Difference]:
+    """The C source read again, as the C export does, and the joints' units."""
+    own = CSource().files(source)
+    units = numbers_of(files[MODULE_SOURCE_FILE], "JOINT_UNITS")
+    again = {C_SELFTEST_FILE: own[C_SELFTEST_FILE], **files}
+    off = largest(units, joint_units(source.machine))
+    return [
+        *CSource().check(again, source),
+        Difference("the header's sizes", float(files[C_HEADER_FILE] != own[C_HEADER_FILE]), 0.0),
+        Difference("joints' units read again", off, 0.0, "mm/m or degrees/rad"),
+    ]
