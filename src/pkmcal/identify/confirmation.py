@@ -165,8 +165,8 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
         mine = (of == k) | (of < 0)
         moved = float(np.sqrt(np.sum(share[mine] * shifts[mine] ** 2)))
         out.append(replace(units[k], right=float(share[mine].sum()), shift=moved))
-    shift = float(np.sqrt(np.sum(share * shifts**2)))
-    return Rejections((*out, *units[len(out) :]), shift)
+    elsewhere = float(np.sqrt(np.sum(share * shifts**2)))
+    return Rejections((*out, *units[len(out) :]), elsewhere)
 
 
 class _Cases(NamedTuple):

@@ -36,7 +36,8 @@ legs:
 {legs}
 home: {{position: [0, 0, {home} mm]}}
 # Standard deviations of the firmware's values: of radius and towers (a radius that was measured
-# from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured to 0.1 mm, hole to hole, tell the more of sizes along x and y.
+# from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured
+# to 0.1 mm, hole to hole, tell the more of sizes along x and y.
 tolerance: {{center: 2 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
 """
 PRINTER_LEG_TEXT = """\
