@@ -45,7 +45,7 @@ def rejections_in_words(
     units = rejected_units(measurements, estimate)
     if not units:
         return RejectionWords((), ())
-    warnings = tuple(_named(session, measurements, units))
+    warnings = tuple(_naming_sentences(session, measurements, units))
     if not at_minimum:
         return RejectionWords((), warnings)
     if findings.bed:
@@ -57,10 +57,10 @@ def rejections_in_words(
     found = rejections_of(measurements, estimate, tool)
     if found.shift <= sigma:
         return RejectionWords((), warnings)
-    return RejectionWords((_unconfirmed(session, found, sigma, what),), warnings)
+    return RejectionWords((_doubt_sentence(session, found, sigma, what),), warnings)
 
 
-def _named(
+def _naming_sentences(
     session: Session, measurements: Measurements, units: Sequence[RejectedUnit]
 ) -> list[str]:
     """A sentence for each kind of unit: how many of how many were rejected, and which."""
@@ -81,7 +81,7 @@ def _named(
     return out
 
 
-def _unconfirmed(session: Session, found: Rejections, sigma: float, what: str) -> str:
+def _doubt_sentence(session: Session, found: Rejections, sigma: float, what: str) -> str:
     """Why a result is not to be used that rests on a rejection."""
     worst = sorted(found.units, key=lambda unit: -unit.shift)
     share = [unit for unit in worst if unit.shift**2 * len(worst) >= found.shift**2]

@@ -92,7 +92,7 @@ class _Normal(NamedTuple):
         """Those of some."""
         return _Normal(*(part[which] for part in self))
 
-    def solved(self) -> tuple[Array, Array]:
+    def solution(self) -> tuple[Array, Array]:
         """The least sums of squares (n,), and the steps (n, na) to where they are."""
         scale = np.sqrt(np.einsum("...ii->...i", self.matrix))
         scale = np.where(scale > 0, scale, 1.0)
@@ -132,23 +132,23 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
         problem, prior=wider[:, None] * problem.prior, prior_target=wider * problem.prior_target
     )
     cases = _Cases.of(assembled, problem, state, measurements, estimate, units)
-    least, step = cases.base.solved()
+    least, step = cases.base.solution()
     rows = tool @ problem.free
     cost, shift, member = list[Array](), list[Array](), list[Integers]()
 
     def add(case: _Normal, loss: Array, of: Integers) -> None:
         """Hypotheses with the change of what is lost (n,), and of which unit each is."""
-        found, to = case.solved()
+        found, to = case.solution()
         away = (to - step)[:, problem.unknowns.machine] @ rows.T
         cost.append(found - least + loss)
         shift.append(np.sqrt(np.sum(away**2, axis=1)))
         member.append(of)
 
-    each = np.arange(len(cases.readmitted.squares))
-    single = cases.base.plus(cases.readmitted)
+    each = np.arange(len(cases.readmission.squares))
+    single = cases.base.plus(cases.readmission)
     add(single, -cases.loss, each)
     if len(each) > 1:
-        whole = cases.readmitted.at(slice(None))
+        whole = cases.readmission.at(slice(None))
         total = _Normal(*(part.sum(axis=0, keepdims=True) for part in whole))
         add(cases.base.plus(total), -cases.loss.sum(keepdims=True), np.array([-1]))
     for dropped, loss, row in cases.drops(state):
@@ -165,24 +165,24 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
         mine = (of == k) | (of < 0)
         moved = float(np.sqrt(np.sum(share[mine] * shifts[mine] ** 2)))
         out.append(replace(units[k], right=float(share[mine].sum()), shift=moved))
-    shift = float(np.sqrt(np.sum(share * shifts**2)))
-    return Rejections((*out, *units[len(out) :]), shift)
+    elsewhere = float(np.sqrt(np.sum(share * shifts**2)))
+    return Rejections((*out, *units[len(out) :]), elsewhere)
 
 
 class _Cases(NamedTuple):
     """What hypotheses are made of.
 
-    base : of the estimate (1). readmitted : by how much each rejected unit changes it (n); loss :
+    base : of the estimate (1). readmission : by how much each rejected unit changes it (n); loss :
     (n,) what these cost as they are. row : (n,) the configuration of each in the problem, for
     poses; -1 for images.
     """
 
     problem: Problem
     base: _Normal
-    readmitted: _Normal
+    readmission: _Normal
     loss: Array
     row: Integers
-    kept: Booleans
+    in_use: Booleans
     pose_loss: Array
 
     @classmethod
@@ -198,7 +198,7 @@ class _Cases(NamedTuple):
         """Those of an estimate's problem."""
         base = _prior(problem, state)
         for cut in divisions(*problem.extent):
-            part = _reduced(problem.among(cut), problem.state_among(state, cut))
+            part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
@@ -224,10 +224,14 @@ class _Cases(NamedTuple):
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
             new = problem.weighted(Kinds(weight.edges[None], weight.poses[None])).among(cut)
-            changes.append(_reduced(new, there).plus(_reduced(problem.among(cut), there), -1.0))
-        readmitted = _Normal(*(np.concatenate(x) for x in zip(*changes, strict=True)))
-        kept = problem.kinds.poses.present & (pose_weight > 0)
-        return cls(problem, base, readmitted, np.array(loss), np.array(rows), kept, pose_loss)
+            changes.append(
+                _normal_equations(new, there).plus(
+                    _normal_equations(problem.among(cut), there), -1.0
+                )
+            )
+        readmission = _Normal(*(np.concatenate(x) for x in zip(*changes, strict=True)))
+        in_use = problem.kinds.poses.present & (pose_weight > 0)
+        return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, pose_loss)
 
     def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
         """Without one more pose each: the change of the normal equations, what it then costs, and
@@ -237,20 +241,20 @@ class _Cases(NamedTuple):
             return
         for cut in divisions(*self.problem.extent):
             part, there = self.problem.among(cut), self.problem.state_among(state, cut)
-            before = _reduced(part, there)
-            for place in range(self.kept.shape[1]):
-                kept = np.flatnonzero(self.kept[cut, place])
-                if not kept.size:
+            before = _normal_equations(part, there)
+            for place in range(self.in_use.shape[1]):
+                in_use = np.flatnonzero(self.in_use[cut, place])
+                if not in_use.size:
                     continue
                 weight = part.pose_data.weight.copy()
                 weight[:, :, place] = 0.0
                 without = part.weighted(Kinds(part.data.weight, weight))
-                change = _reduced(without, there).plus(before, -1.0)
-                row = np.arange(len(self.kept))[cut][kept]
-                yield change.at(kept), self.pose_loss[row, place], row
+                change = _normal_equations(without, there).plus(before, -1.0)
+                row = np.arange(len(self.in_use))[cut][in_use]
+                yield change.at(in_use), self.pose_loss[row, place], row
 
 
-def _reduced(problem: Problem, state: BatchState) -> _Normal:
+def _normal_equations(problem: Problem, state: BatchState) -> _Normal:
     """Of each configuration, its own unknowns eliminated."""
     reduced = Information(problem, state).reduced
     rows, value = reduced.rows[0], reduced.value[0]

@@ -167,30 +167,30 @@ def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple
         return loss + 2 * numbers * np.log(scale), np.maximum(np.sqrt(expected), LEAST_SCALE)
 
     best, at = np.full(len(d), np.inf), np.full(len(d), LEAST_SCALE)
-    asked = at
+    next_scale = at
     for number in range(len(SCALES_TRIED) + SCALE_STEPS if scaled else 1):
         step = number >= len(SCALES_TRIED)
-        scale = asked if step else np.full(len(d), LEAST_SCALE * SCALES_TRIED[number])
+        scale = next_scale if step else np.full(len(d), LEAST_SCALE * SCALES_TRIED[number])
         found, expected = cost_at(scale)
         better = found < best
         best, at = np.where(better, found, best), np.where(better, scale, at)
-        asked = expected if step else np.where(better, expected, asked)
+        next_scale = expected if step else np.where(better, expected, next_scale)
     return best, at
 
 
 def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) -> RobustStart:
-    """A state near the answer although measurements are wrong, or parameters far from the start:
-    where the annealing ends or, where that rejects what least squares of all measurements lead to
-    an explanation of, at a smaller robust cost, there.
+    """A start near the solution although measurements are wrong, or parameters far from nominal:
+    the end of the annealing; or, where that rejects measurements and least squares of all of them
+    lead to a smaller robust cost, the end of these.
 
     scaled : whether noise may be larger than stated.
     """
     annealed = anneal(problem, start)
-    lost = [
+    rejects = [
         np.any(kind.present & (weight < 0.5), axis=(1, 2))
         for kind, weight in zip(problem.kinds, annealed.weight, strict=True)
     ]
-    runs = np.flatnonzero(np.any(lost, axis=0))
+    runs = np.flatnonzero(np.any(rejects, axis=0))
     if not runs.size:
         return annealed  # both starts lead to the same solution
     part, state = problem.select(runs), take(annealed.state, runs)
@@ -206,7 +206,8 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
         found = minimise(searched, other.state, tolerance=ROUGHLY_SOLVED_DISTANCE)
         cost, weight, scale = robust_cost(part, found.state, scaled=scaled)
         other = RobustStart(found.state, weight, scale, other.steps + int(found.steps.max()))
-        # of thousands of edges the few that another thing's are cost as much as they do at once
+        # a few wrong ones among thousands of edges always draw least squares aside: where these do
+        # not cost less at once, they are not followed
         if np.all(cost > before - LOSS_CHANGE) or not (poses or np.any(cost < usual)):
             break
         before = cost
