@@ -2,8 +2,8 @@
 
     linuxcnc_driver.py -ini FILE
 
-It runs with the Python that has LinuxCNC's own module. Its orders are ``orders.json`` beside the INI
-file, its answer ``answer.json``. Orders: ``joints``, how many; ``poses``, coordinates by letter,
+It runs with the Python that has LinuxCNC's own module. Its orders are ``orders.json`` beside the
+INI file, its answer ``answer.json``. Orders: ``joints``, how many; ``poses``, by letter,
 one a move; ``beyond``, coordinates that limits refuse; ``homes``, whether homing is to end well.
 Answers: joints, and commands to motors, before homing and after it; joints at each pose; texts of
 errors.

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from export_sources import built, source_of
-from test_export_firmware import ideal_linear, put
 from pkmcal.export.contract import make_export
 from pkmcal.export.linuxcnc import LINUXCNC_INI_FILE, ini_words, world
 from pkmcal.export.samples import samples
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import load_mechanism, machine_from_document
+from test_export_firmware import ideal_linear, put
 
+COMPILER = shutil.which("gcc") or shutil.which("cc")
 LINUXCNC, HALCOMPILE = shutil.which("linuxcnc"), shutil.which("halcompile")
 DRIVER = Path(__file__).with_name("linuxcnc_driver.py")
 DRIVER_PYTHON = "/usr/bin/python3"
@@ -145,8 +146,8 @@ def ran(folder, machine, **orders):
 
 
 def middle_poses(machine, count, seed=0):
-    """Poses of readings in the middle of their ranges, and the readings: so that straight lines from
-    one to the next stay within limits.
+    """Poses of readings in the middle of their ranges, and the readings: so that straight lines
+    from one to the next stay within limits.
     """
     rng = np.random.default_rng(seed)
     low, high = machine.joint_ranges.T
@@ -220,16 +221,16 @@ def test_linuxcnc_homes_without_a_move_and_is_right_at_thirty_poses(name, tmp_pa
     assert answer["errors"] == []
     np.testing.assert_allclose(answer["motors"], answer["motors before"], atol=1e-9)
     np.testing.assert_allclose(answer["home"], ini_words(ini, "HOME"), atol=1e-9)
-    joints = joints_of(ini, readings)
+    hal = files.get("pkmcal_kinematics.hal", "")
+    legs = [int(leg) - 1 for leg in re.findall(r"Motor \d is leg \d, joint (\d)", hal)]
+    joints = joints_of(ini, readings[:, legs] if legs else readings)
     # LinuxCNC's linear delta follows the drawing's machine to 0.035 mm
     limit = 0.1 if name == "linear delta" else JOINT_AGREEMENT
     assert len(answer["poses"]) == 30
     np.testing.assert_allclose(answer["poses"], joints, atol=limit, rtol=0)
-    # a pose out of reach is refused, and nothing goes there
+    # a pose out of reach is refused, and nothing moves
     assert answer["refused"]
-    low, high = ini_words(ini, "MIN_LIMIT"), ini_words(ini, "MAX_LIMIT")
-    assert (np.array(answer["beyond"]) >= low - 1e-9).all()
-    assert (np.array(answer["beyond"]) <= high + 1e-9).all()
+    np.testing.assert_allclose(answer["beyond"], answer["poses"][-1], atol=1e-9)
 
 
 @pytest.mark.slow
@@ -297,3 +298,115 @@ def test_with_switches_the_joints_go_to_their_lengths_at_home(tmp_path):
     np.testing.assert_allclose(answer["home"], home, atol=1e-6)
     # where they were before, to what a latch at 1 mm/s leaves
     np.testing.assert_allclose(answer["motors"], home - offsets, atol=0.02)
+
+
+# Without LinuxCNC: the module's text, compiled against its headers' words
+
+HEADERS = {
+    "kinematics.h": """\
+typedef struct { double x, y, z; } PmCartesian;
+typedef struct EmcPose { PmCartesian tran; double a, b, c, u, v, w; } EmcPose;
+typedef enum { KINEMATICS_IDENTITY = 1, KINEMATICS_BOTH } KINEMATICS_TYPE;
+typedef unsigned long int KINEMATICS_FORWARD_FLAGS, KINEMATICS_INVERSE_FLAGS;
+KINEMATICS_TYPE kinematicsType(void);
+int kinematicsInverse(const EmcPose *, double *, const KINEMATICS_INVERSE_FLAGS *,
+                      KINEMATICS_FORWARD_FLAGS *);
+int kinematicsForward(const double *, EmcPose *, const KINEMATICS_FORWARD_FLAGS *,
+                      KINEMATICS_INVERSE_FLAGS *);
+int kinematicsSwitchable(void);
+#define KINS_NOT_SWITCHABLE int kinematicsSwitchable(void) {return 0;}
+""",
+    "hal.h": "int hal_init(const char *name);\nint hal_ready(int id);\nint hal_exit(int id);\n",
+    "rtapi.h": "",
+    "rtapi_app.h": (
+        "#define EXPORT_SYMBOL(name) struct unused_##name\n"
+        "#define MODULE_LICENSE(text) struct unused_license\n"
+        "int rtapi_app_main(void);\nvoid rtapi_app_exit(void);\n"
+    ),
+}
+
+
+class World(ctypes.Structure):
+    _fields_ = (("values", ctypes.c_double * 9),)
+
+
+def compiled_module(machine, folder):
+    """The exported module as a library, its headers those above."""
+    files = make_export(source_of(machine), "linuxcnc").files
+    for name, text in {**files, **HEADERS}.items():
+        (folder / name).write_text(text)
+    done = subprocess.run(
+        [COMPILER, "-std=c99", "-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic-errors",
+         "-Werror", "-I.", "pkmcal_kins.c", "-o", "module.so", "-lm"],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(folder / "module.so"), mode=os.RTLD_LAZY), files
+
+
+def turned_home(name):
+    """A machine whose home is turned about z, as no coordinate of its platform can say."""
+    machine = load_mechanism(name)
+    home = machine.document.home.model_copy(update={"rotation_vector": (0.0, 0.0, 0.1)})
+    return machine_from_document(machine.document.model_copy(update={"home": home}))
+
+
+@pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER: LinuxCNC's module is not compiled")
+@pytest.mark.parametrize(
+    ("machine", "letters"),
+    [
+        (leaning_delta, "XYZ"),
+        pytest.param(lambda: built("delta"), "XYZ", marks=pytest.mark.slow),
+        (lambda: built("3-rpr"), "XYC"),
+        pytest.param(lambda: built("h4"), "XYZC", marks=pytest.mark.slow),
+        (lambda: turned_home("h4"), "XYZC"),
+        pytest.param(lambda: built("hexaglide"), "XYZABC", marks=pytest.mark.slow),
+        (lambda: built("6-rus"), "XYZABC"),
+    ],
+    ids=["leaning delta", "rotary delta", "3-rpr", "h4", "h4 turned", "hexaglide", "6-rus"],
+)
+def test_a_module_is_the_machine_in_linuxcncs_units(machine, letters, tmp_path):
+    machine = machine()
+    module, files = compiled_module(machine, tmp_path)
+    ini = files[LINUXCNC_INI_FILE]
+    assert f"COORDINATES = {letters}\n" in ini
+    poses, readings = samples(machine, 20, seed=3)
+    coordinates = world(poses)
+    if "A" not in letters:  # counted from home
+        coordinates[:, 3:] -= world(machine.home()[None])[0][3:]
+    joints = (ctypes.c_double * 16)()
+    expected = joints_of(ini, readings)
+    last = World()  # of all zeros, as LinuxCNC has it before
+    for row, wanted in zip(coordinates, expected, strict=True):
+        asked = [x if c in letters else 0.0 for c, x in zip("XYZABC", row, strict=True)]
+        at = World((ctypes.c_double * 9)(*asked))
+        assert module.kinematicsInverse(ctypes.byref(at), joints, None, None) == 0
+        np.testing.assert_allclose(joints[: machine.n_joints], wanted, atol=1e-9)
+        # from next to it, as from one cycle to the next, with an angle of a whole turn more
+        near = [x + 0.5 * (c in letters) for c, x in zip("XYZABC", asked, strict=True)]
+        near[5] += 360.0 * ("C" in letters)
+        back = World((ctypes.c_double * 9)(*near))
+        assert module.kinematicsForward(joints, ctypes.byref(back), None, None) == 0
+        asked[5] += 360.0 * ("C" in letters)
+        np.testing.assert_allclose(list(back.values), [*asked, 0, 0, 0], atol=1e-7)
+    assert module.kinematicsForward(joints, ctypes.byref(last), None, None) == 0
+    far = World((ctypes.c_double * 9)(5e3, 5e3, 5e3, 0, 0, 0))
+    assert module.kinematicsInverse(ctypes.byref(far), joints, None, None) == (
+        0 if letters in ("XYC",) else -1
+    )
+
+
+@pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER: LinuxCNC's module is not compiled")
+def test_a_module_lets_no_joint_jump_to_its_other_place(tmp_path):
+    """Above its carriage a rod would stand: within the limits, but by a jump of the joint."""
+    machine = leaning_delta()
+    module, files = compiled_module(machine, tmp_path)
+    joints = (ctypes.c_double * 16)()
+    high = np.max(ini_words(files[LINUXCNC_INI_FILE], "MAX_LIMIT"))
+    for z in np.arange(0.0, 900.0, 5.0):
+        at = World((ctypes.c_double * 9)(0, 0, z))
+        status = module.kinematicsInverse(ctypes.byref(at), joints, None, None)
+        # refused by the module, or by LinuxCNC's own limits
+        assert status == -1 or min(joints[:3]) > z
+        if z > high:
+            assert status == -1 or max(joints[:3]) > high
