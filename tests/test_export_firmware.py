@@ -11,10 +11,10 @@ from export_sources import built, source_of
 from pkmcal.errors import InputError
 from pkmcal.export import klipper, linuxcnc, reprap
 from pkmcal.export.contract import exporters, make_export
-from pkmcal.export.delta import DEGREES_A_RADIAN, MM_A_METRE, Freedoms, delta_of, nearest_fit, reach
+from pkmcal.export.delta import DEGREES_A_RADIAN, Freedoms, delta_of, nearest_fit
 from pkmcal.export.linuxcnc import linear_joints, rotary_joints
 from pkmcal.export.samples import samples
-from pkmcal.geometry.rigid import perturb, rotation
+from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
 
@@ -278,16 +278,3 @@ def test_nothing_closes_within_the_ranges():
         machine = put(machine, leg, length__constant=0.01)
     with pytest.raises(InputError, match="closes nowhere within its ranges"):
         delta_of(machine, "Klipper")
-
-
-def test_the_reach_is_within_the_ranges():
-    machine = load_mechanism("linear-delta")
-    radius = reach(delta_of(machine, "x"))
-    turns = np.linspace(0, 2 * np.pi, 200)
-    for r, inside in ((radius, True), (radius + 0.003, False)):
-        shift = np.zeros((200, 6))
-        shift[:, 3], shift[:, 4] = r * np.cos(turns), r * np.sin(turns)
-        q = machine.inverse(perturb(machine.home(), shift))
-        low, high = machine.joint_ranges.T
-        assert bool(((q >= low - 1e-4) & (q <= high + 1e-4)).all()) is inside
-    assert 0.1 * MM_A_METRE < radius * MM_A_METRE < 150

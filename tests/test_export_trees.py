@@ -230,6 +230,24 @@ def test_an_sdf_closes_by_screws(name):
         assert abs(model.key[dof] - scale * home) < 1e-15
 
 
+def test_an_sdf_declares_the_lowest_version_that_has_what_it_uses():
+    """By SDFormat's list of changes; readers refuse models of later versions than they know."""
+    first = {"relative_to": "1.7", "attached_to": "1.7", "expressed_in": "1.7", "mimic": "1.11"}
+    later = {"rotation_format", "degrees", "merge", "placement_frame"}  # of 1.8 and later
+    found = set()
+    for name in ("gough-stewart", "3-rps", "h4-rods", "h4", "linear-delta"):
+        (text,) = exported(name, "sdf")[1].values()
+        root = fromstring(text)
+        words = {node.tag for node in root.iter()} | {
+            k for node in root.iter() for k in node.attrib
+        }
+        assert not words & later
+        expected = max((first[word] for word in words & set(first)), key=lambda v: int(v[2:]))
+        assert root.get("version") == expected
+        found.add(expected)
+    assert found == {"1.7", "1.11"}
+
+
 def test_an_sdf_names_everything_once():
     for name in [*CATALOGUE, *MADE, *TURNED]:
         (text,) = exported(name, "sdf")[1].values()

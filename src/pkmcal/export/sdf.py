@@ -29,8 +29,11 @@ from pkmcal.export.sdf_read import SDF_MODEL_FRAME, SDF_NAMESPACE, read_sdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw
 from pkmcal.outcome import Finding, Level
 
-SDF_VERSION = "1.11"
-"""The first with joints that follow others (``mimic``)."""
+SDF_VERSION, SDF_MIMIC_VERSION = "1.7", "1.11"
+"""The lowest that has what a model uses, since readers refuse what is newer than they are: 1.7 is
+the first with frames by name (``relative_to``, ``attached_to``, ``expressed_in``), 1.11 with joints
+that follow others (``mimic``).
+"""
 CONVENTIONS = (
     "Units: m, rad. The model's frame is the machine's base frame, the link 'platform' has the"
     " platform frame; its pose is T_base_platform at home, where all is drawn.",
@@ -77,7 +80,8 @@ class SdfExporter(Exporter):
 
 
 def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
-    root = Element("sdf", {"version": SDF_VERSION, "xmlns:pkmcal": SDF_NAMESPACE})
+    version = SDF_MIMIC_VERSION if tree.couplings else SDF_VERSION
+    root = Element("sdf", {"version": version, "xmlns:pkmcal": SDF_NAMESPACE})
     model = SubElement(root, "model", name=name)
     for k, reading in enumerate(tree.home.readings):
         known = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}

@@ -84,6 +84,48 @@ static void world_of_pose(const pkmcal_pose *pose, EmcPose *world)
     world->u = world->v = world->w = 0;
 }
 
+/* How fast the rods' lengths follow their motors at a pose: the sign says which of its two places a
+ * slide or crank has. */
+static void gains(const pkmcal_pose *pose, const pkmcal_real readings[PKMCAL_JOINTS],
+                  pkmcal_real gain[PKMCAL_RODS])
+{
+    state at;
+    int k;
+    at.pose = *pose;
+    upright(&at);
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        double a[3], b[3], u[3], arm[3];
+        base_end(&RODS[k], readings, a);
+        platform_end(&RODS[k], &at, arm, b);
+        direction(a, b, u);
+        gain[k] = reading_gain(&RODS[k], readings, u);
+    }
+}
+
+/* Readings at a pose with all motors on the side on which they are at home: what lies beyond a
+ * stretched arm is out of reach, where LinuxCNC would let the joints jump to their other places. */
+static pkmcal_status readings_as_at_home(const pkmcal_pose *pose,
+                                         pkmcal_real readings[PKMCAL_JOINTS])
+{
+    pkmcal_real home_readings[PKMCAL_JOINTS], home_gain[PKMCAL_RODS], gain[PKMCAL_RODS];
+    pkmcal_status status = pkmcal_inverse(&HOME, home_readings);
+    int k;
+    if (status == PKMCAL_OK) {
+        status = pkmcal_inverse(pose, readings);
+    }
+    if (status != PKMCAL_OK) {
+        return status;
+    }
+    gains(&HOME, home_readings, home_gain);
+    gains(pose, readings, gain);
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        if (RODS[k].drive != CONSTANT && !(gain[k] * home_gain[k] > 0)) {
+            return PKMCAL_OUT_OF_REACH;
+        }
+    }
+    return PKMCAL_OK;
+}
+
 KINEMATICS_TYPE kinematicsType(void)
 {
     return KINEMATICS_BOTH;
@@ -98,7 +140,7 @@ int kinematicsInverse(const EmcPose *world, double *joints, const KINEMATICS_INV
     (void)iflags;
     (void)fflags;
     pose_of_world(world, &pose);
-    if (pkmcal_inverse(&pose, readings) != PKMCAL_OK) {
+    if (readings_as_at_home(&pose, readings) != PKMCAL_OK) {
         return -1;
     }
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
