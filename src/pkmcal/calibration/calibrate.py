@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
@@ -44,7 +45,7 @@ from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
 from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.covariance import Information, identifiability
@@ -164,8 +165,71 @@ def calibrate_session(
 
             check_predictable(session, "--holdout")
         seen = _observe(session, seed, clock)
-        settled = settle(session, seen, refine_camera, seed, clock)
-        return _finished(settled, method, seed, holdout, clock)
+
+        def calibrated(refine: bool) -> Calibration:
+            settled = settle(session, seen, refine, seed, clock)
+            return _finished(settled, method, seed, holdout, clock)
+
+        if not refine_camera or refinement_of(session, False).refines_all:
+            return calibrated(refine_camera)
+        return better_refined(partial(calibrated, True), partial(calibrated, False))
+
+
+def better_refined(
+    refined: Callable[[], Calibration], held: Callable[[], Calibration]
+) -> Calibration:
+    """The calibration with the cameras' intrinsics estimated, unless the one with those of the
+    files is better; a warning then says so.
+
+    Intrinsics that are estimated can be led astray by photographs that are few or without a sure
+    place. A result that may be used is better, then one that keeps more photographs, then one that
+    fits what it keeps beyond chance better, which no added unknowns do by themselves. Raises the
+    error of ``refined`` where neither ends.
+    """
+    try:
+        found = refined()
+    except PkmcalError as error:
+        try:
+            return _with_files_intrinsics(held(), f"there is no result ({str(error).rstrip('.')})")
+        except PkmcalError:
+            raise error from None
+    try:
+        other = held()
+    except PkmcalError:
+        return found
+    why = worse_refined(found, other)
+    return _with_files_intrinsics(other, why) if why else found
+
+
+def worse_refined(refined: Calibration, held: Calibration) -> str:
+    """Why a calibration with estimated intrinsics is worse than one with those of the files, in
+    words; empty where it is not.
+    """
+    if refined.verdict.usable != held.verdict.usable:
+        return "" if refined.verdict.usable else "the result should not be used"
+    taken = refined.session.images_taken
+    kept, more = (
+        taken - sum(len(one.station.photographs) for one in found.session.rejected)
+        for found in (refined, held)
+    )
+    if kept != more:
+        return f"{kept} of {taken} photographs have a sure place, not {more}" if kept < more else ""
+    by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
+    # the mean square of n numbers that are noise has the standard deviation sqrt(2 / n)
+    chance = 1 + 4 * np.sqrt(2 / max(by_refined.dof, 1.0))
+    if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
+        return "the data fit worse than with the intrinsics of the files"
+    return ""
+
+
+def _with_files_intrinsics(held: Calibration, why: str) -> Calibration:
+    """A calibration with the files' intrinsics, taken because with estimated ones ``why``."""
+    warning = (
+        "The cameras' intrinsics are those of their files, although --refine-camera was given: with"
+        f" estimated ones {why}."
+    )
+    verdict = replace(held.verdict, warnings=(warning, *held.verdict.warnings))
+    return replace(held, verdict=verdict)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:

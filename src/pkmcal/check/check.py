@@ -289,9 +289,10 @@ def _observed(
         for k, station in enumerate(session.stations)
     ]
     places = _found_places(session, whole, located)
-    gone = {one.station.name for one in rejected}
+    # one on a tripod was recognised all the same, and its quality tells why it may be left out
+    gone = {one.station.name for one in rejected if one.station.handheld}
     if isinstance(kept, PkmcalError):  # of photographs by hand none was placed then
-        gone |= {station.name for station in session.stations if station.handheld}
+        gone = {station.name for station in session.stations if station.handheld}
     looks: list[StationLook] = []
     for p in whole:
         if p.station not in places:  # another station's fault came first

@@ -66,7 +66,6 @@ def outcome_of(calibration: Calibration) -> Outcome:
             **(told.summary or {}),
             "session_warnings": c.session.warnings,
             "photographs": c.session.images_taken,
-            "photographs_used": sum(provenance.used_photographs(c.session, c.observation)),
             "rejected_photographs": rejected_photographs(c.session),
             "holdout": predicted,
             "timings": c.timings,

@@ -137,11 +137,10 @@ class Session:
     rejected: tuple[RejectedStation, ...] = ()
 
     def __repr__(self) -> str:
-        taken = sum(len(station.photographs) for station in self.stations)
         parts = (
             count(len(self.configurations), "configuration"),
             count(len(self.station_names), "station"),
-            count(taken, "photograph"),
+            count(self.images_taken, "photograph"),
         )
         return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
 
