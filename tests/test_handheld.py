@@ -522,7 +522,7 @@ def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
     assert [station.recognised for station in found.stations] == [True, False, True]
     assert found.stations[0].legs > 2
     said = [finding.text for finding in found.findings]
-    assert any(text.startswith("phone-0001-1 is left out, for its edges fit") for text in said)
+    assert any(text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in said)
     assert not any("not recognised" in text for text in said)
     assert found.forecast is None
 

@@ -25,7 +25,7 @@ from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import CalibrationProgress, station_poses
+from pkmcal.calibration.recognise import CalibrationProgress, Recognition, search_stations
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MachineTold
@@ -39,7 +39,6 @@ from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
-from pkmcal.session.photographs import label_of
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
@@ -60,6 +59,20 @@ focal length are seven numbers: each edge tells two, and each leg little more, s
 contradicts another that was taken for something else."""
 
 
+@dataclass(frozen=True)
+class Localization:
+    """Where the stations of a session stand, by what their photographs show; nothing raised.
+
+    recognition : of the machine in the photographs on tripods, None where none was searched. places
+    : that each photograph by hand could show, by its station's number. result : what is known,
+    without the rejected photographs by hand, or why nothing is.
+    """
+
+    recognition: Recognition | None
+    places: Mapping[int, Alone]
+    result: SeenSession | PkmcalError
+
+
 def place(
     session: Session,
     photographs: list[Photographs],
@@ -67,26 +80,52 @@ def place(
     rng: np.random.Generator,
     told: CalibrationProgress | None = None,
 ) -> SeenSession:
-    """Where all stations stand; photographs by hand that are not found are left out and told.
+    """Where all stations stand, as of :func:`localize`.
+
+    Raises `InputError`, or `ResultError`, where nothing tells where a station stands that is not by
+    hand, and where no photograph by hand is placed.
+    """
+    found = localize(session, photographs, boards, rng, told).result
+    if isinstance(found, PkmcalError):
+        raise found
+    return found
+
+
+def localize(
+    session: Session,
+    photographs: list[Photographs],
+    boards: Boards,
+    rng: np.random.Generator,
+    told: CalibrationProgress | None = None,
+) -> Localization:
+    """Where all stations stand; photographs by hand that are not found are rejected, with a reason.
 
     photographs : of all stations that observe legs. told : called with the step in words and the
-    share done. Raises `InputError`, or `ResultError`, where nothing tells where a station stands
-    that is not by hand, and where no photograph by hand is placed.
+    share done.
     """
     fixed = [p for p in photographs if not session.stations[p.station].handheld]
-    stations = station_poses(session, fixed, boards, rng, told)
-    known = KnownScene.as_drawn(session.machine, stations, session.joints)
+    search = search_stations(session, fixed, boards, rng, told)
+    places: dict[int, Alone] = {}
+    if search.error is not None:
+        return Localization(search.recognition, places, search.error)
+    known = KnownScene.as_drawn(session.machine, search.T_camera_base, session.joints)
+    lost: dict[int, str] = {}
     if len(fixed) < len(photographs):
-        found, known = search_by_hand(session, photographs, boards, known, told)
-        nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
-        sure = _sure(found, len(found))
-        lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(found[k]) for k in nowhere}
-        for k in sorted(found.keys() & known.edges.keys()):
-            turn = angle_between(known.T_camera_base[k], found[k].T_camera_base[0])
+        places, known = search_by_hand(session, photographs, boards, known, told)
+        nowhere = {k for k in places if np.isnan(known.T_camera_base[k]).any()}
+        sure = _sure(places, len(places))
+        lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(places[k]) for k in nowhere}
+        for k in sorted(places.keys() & known.edges.keys()):
+            turn = angle_between(known.T_camera_base[k], places[k].T_camera_base[0])
             if turn > MOST_TURN and k in sure:
                 lost[k] = CAMERA_TURNED_REASON
-        return _without(SeenSession(session, photographs, boards, known), lost)
-    return SeenSession(session, photographs, boards, known)
+    seen = SeenSession(session, photographs, boards, known)
+    if len(fixed) < len(photographs):
+        try:
+            seen = _without(seen, lost)
+        except PkmcalError as error:
+            return Localization(search.recognition, places, error)
+    return Localization(search.recognition, places, seen)
 
 
 def search_by_hand(
@@ -392,40 +431,34 @@ def why_lost(found: Alone) -> str:
 
 
 def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
-    """What is seen without the stations that are lost, each told, the others numbered anew; an
-    error where no photograph by hand is left.
+    """What is seen without the stations that are lost, each rejected for a reason, the others
+    numbered anew; an error where no photograph by hand is left.
     """
     session, known = seen.session, seen.known
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
-
-    def label(k: int) -> str:
-        station = session.stations[k]
-        if not station.handheld:
-            return station.name
-        return label_of(session.folder, station.photographs[0].path)
-
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
             "the machine is recognised in none of the photographs by hand",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
-            found=f"{label(by_hand[0])}: {lost[by_hand[0]]}",
+            found=f"{session.label(by_hand[0])}: {lost[by_hand[0]]}",
             expected="one place for each where its legs lie on edges of the picture far oftener"
             " than elsewhere",
             next_step="Check that these photographs show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the drawing is this machine's",
         )
-    warnings = tuple(f"{label(k)}: left out, for {why}." for k, why in lost.items())
     kept = [k for k in range(len(session.stations)) if k not in lost]
     number = {k: new for new, k in enumerate(kept)}
     trackers = range(len(session.stations), len(known.T_camera_base))
-    left = session.of_stations(kept, warnings)
+    left = session.without(lost)
     rows = {photo.configuration for s in left.stations for photo in s.photographs}
     if len(rows) < 2:
         names = [session.configurations[k] for k in sorted(rows)]
         raise InputError(
             "the photographs that are recognised show one configuration only",
             where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
-            found=f"{listed(names)}; {warnings[0]}" if warnings else listed(names),
+            found=f"{listed(names)}; {left.rejected[0].sentence}"
+            if left.rejected
+            else listed(names),
             expected="two at least",
             next_step="Take photographs in which all legs are large and before a plain background",
         )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
@@ -45,7 +46,7 @@ from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
 from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.covariance import Information, identifiability
@@ -158,28 +159,78 @@ def calibrate_session(
     # Matrices here are small: threads inside the linear algebra only wait for one another, and
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
-        clock = _Clock(progress)
+        clock = Clock(progress)
         session = _load(session, refine_camera, clock)
         if holdout:
             from pkmcal.calibration.aside import check_predictable
 
             check_predictable(session, "--holdout")
         seen = _observe(session, seed, clock)
-        turns, richer = _identify(seen, refine_camera, seed, clock)
-        turned = upside_down(seen.session, turns)
-        if sure := {one.file: one.camera for one in turned if one.sure}:
-            session = turned_round(session, sure)
-            seen = _observe(session, seed, clock)
-            turns, richer = _identify(seen, refine_camera, seed, clock)
-        # without one that was in a wrong place, another may show itself to be
-        while wrong := by_chance(seen.session, turns) or misplaced(
-            seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
-        ):
-            seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-            turns, richer = _identify(seen, refine_camera, seed, clock)
-        check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
-        found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
-        return _judge(seen, found, turned, method, seed, clock)
+
+        def calibrated(refine: bool) -> Calibration:
+            settled = settle(session, seen, refine, seed, clock)
+            return _finished(settled, method, seed, holdout, clock)
+
+        if not refine_camera or refinement_of(session, False).refines_all:
+            return calibrated(refine_camera)
+        return better_refined(partial(calibrated, True), partial(calibrated, False))
+
+
+def better_refined(
+    refined: Callable[[], Calibration], held: Callable[[], Calibration]
+) -> Calibration:
+    """The calibration with the cameras' intrinsics estimated, unless the one with those of the
+    files is better; a warning then says so.
+
+    Intrinsics that are estimated can be led astray by photographs that are few or without a sure
+    place. A result that may be used is better, then one that keeps more photographs, then one that
+    fits what it keeps beyond chance better, which no added unknowns do by themselves. Raises the
+    error of ``refined`` where neither ends.
+    """
+    try:
+        found = refined()
+    except PkmcalError as error:
+        try:
+            return _with_files_intrinsics(held(), f"there is no result ({str(error).rstrip('.')})")
+        except PkmcalError:
+            raise error from None
+    try:
+        other = held()
+    except PkmcalError:
+        return found
+    why = worse_refined(found, other)
+    return _with_files_intrinsics(other, why) if why else found
+
+
+def worse_refined(refined: Calibration, held: Calibration) -> str:
+    """Why a calibration with estimated intrinsics is worse than one with those of the files, in
+    words; empty where it is not.
+    """
+    if refined.verdict.usable != held.verdict.usable:
+        return "" if refined.verdict.usable else "the result should not be used"
+    taken = refined.session.images_taken
+    kept, more = (
+        taken - sum(len(one.station.photographs) for one in found.session.rejected)
+        for found in (refined, held)
+    )
+    if kept != more:
+        return f"{kept} of {taken} photographs have a sure place, not {more}" if kept < more else ""
+    by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
+    # the mean square of n numbers that are noise has the standard deviation sqrt(2 / n)
+    chance = 1 + 4 * np.sqrt(2 / max(by_refined.dof, 1.0))
+    if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
+        return "the data fit worse than with the intrinsics of the files"
+    return ""
+
+
+def _with_files_intrinsics(held: Calibration, why: str) -> Calibration:
+    """A calibration with the files' intrinsics, taken because with estimated ones ``why``."""
+    warning = (
+        "The cameras' intrinsics are those of their files, although --refine-camera was given: with"
+        f" estimated ones {why}."
+    )
+    verdict = replace(held.verdict, warnings=(warning, *held.verdict.warnings))
+    return replace(held, verdict=verdict)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -199,6 +250,63 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
             )
 
 
+class Settled(NamedTuple):
+    """A session whose stations all stand where their photographs say, and the estimate of it that
+    no known mistake explains better.
+
+    turned : cameras whose photographs are upside down, or may be.
+    """
+
+    seen: SeenSession
+    turns: Turns
+    richer: tuple[RicherModel, ...]
+    turned: tuple[UpsideDown, ...]
+
+
+def settle(
+    session: Session, seen: SeenSession, refine_camera: bool, seed: int, clock: Clock
+) -> Settled:
+    """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
+    `check` ends with it.
+
+    seen : of the session. Raises `InputError` or `ResultError` where it cannot.
+    """
+    turns = _identify(seen, refine_camera, seed, clock)
+    turned = upside_down(seen.session, turns)
+    if sure := {one.file: one.camera for one in turned if one.sure}:
+        session = turned_round(session, sure)
+        seen = _observe(session, seed, clock)
+        turns = _identify(seen, refine_camera, seed, clock)
+    # without one that was in a wrong place, another may show itself to be
+    while wrong := by_chance(seen.session, turns) or misplaced(
+        seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
+    ):
+        seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
+        turns = _identify(seen, refine_camera, seed, clock)
+    clock.told("Looking for mistakes that explain the data", 0.86)
+    machine = seen.session.machine
+    stated = as_stated(machine, turns.measurements, turns.estimate)
+    richer = richer_models(seen.session, turns.measurements, stated)
+    check_poses(seen.session, turns.measurements, stated, richer)
+    check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
+    return Settled(seen, turns, richer, turned)
+
+
+def _finished(
+    settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
+) -> Calibration:
+    """The calibration of a settled session."""
+    seen, turns, richer, turned = settled
+    machine = seen.session.machine
+    turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
+    clock.lap("identify")
+    stated = as_stated(machine, turns.measurements, turns.estimate)
+    if model_at_fault(richer, stated):
+        turns = turns._replace(estimate=stated)
+    found = _estimated(machine, turns, richer, method, seed, holdout, clock)
+    return _judge(seen, found, turned, method, seed, clock)
+
+
 class _Identified(NamedTuple):
     """The last turn, the estimate by the method asked for, richer models that were tried, and what
     was left out.
@@ -210,7 +318,7 @@ class _Identified(NamedTuple):
     out: LeftOut | None
 
 
-def _load(session: Session | Path | str, refine_camera: bool, clock: _Clock) -> Session:
+def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> Session:
     """The session, whole and possible."""
     if not isinstance(session, Session):
         session = load_session(session)
@@ -222,7 +330,7 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: _Clock) -> 
     return session
 
 
-def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
+def _observe(session: Session, seed: int, clock: Clock) -> SeenSession:
     """Where the stations stand, by what their photographs and tables show; without photographs by
     hand that could not be placed.
     """
@@ -237,37 +345,23 @@ def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
     return seen
 
 
-def _identify(
-    seen: SeenSession, refine_camera: bool, seed: int, clock: _Clock
-) -> tuple[Turns, tuple[RicherModel, ...]]:
-    """The machine, in turns with looks at the edges, and richer models that were tried; where there
-    is none, diameters for radii may be why.
+def _identify(seen: SeenSession, refine_camera: bool, seed: int, clock: Clock) -> Turns:
+    """The machine, in turns with looks at the edges; where there is none, diameters for radii may
+    be why.
     """
+    session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     try:
-        return _in_turns(seen, refine_camera, clock)
+        if seen.photographs:
+            turns = take_turns(seen, cameras, clock.told, clock.lap)
+        else:
+            turns = identify_poses(
+                session, seen.boards, seen.known.T_camera_base, cameras, clock.told
+            )
     except ResultError:
         check_radii(seen, None, False, refine_camera, seed)
         raise
-
-
-def _in_turns(
-    seen: SeenSession, refine_camera: bool, clock: _Clock
-) -> tuple[Turns, tuple[RicherModel, ...]]:
-    """The same, or why there is none."""
-    session, cameras = seen.session, refinement_of(seen.session, refine_camera)
-    if seen.photographs:
-        turns = take_turns(seen, cameras, clock.told, clock.lap)
-        turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
-    else:
-        turns = identify_poses(session, seen.boards, seen.known.T_camera_base, cameras, clock.told)
     clock.lap("identify")
-    clock.told("Looking for mistakes that explain the data", 0.88)
-    stated = as_stated(session.machine, turns.measurements, turns.estimate)
-    richer = richer_models(session, turns.measurements, stated)
-    check_poses(session, turns.measurements, stated, richer)
-    if model_at_fault(richer, stated):
-        turns = turns._replace(estimate=stated)
-    return turns, richer
+    return turns
 
 
 def _estimated(
@@ -277,7 +371,7 @@ def _estimated(
     method: CalibrationMethod,
     seed: int,
     holdout: int,
-    clock: _Clock,
+    clock: Clock,
 ) -> _Identified:
     """The estimate without what is held out, by the paper's method if asked for.
 
@@ -305,7 +399,7 @@ def _judge(
     turned: tuple[UpsideDown, ...],
     method: CalibrationMethod,
     seed: int,
-    clock: _Clock,
+    clock: Clock,
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
     session = seen.session
@@ -413,7 +507,7 @@ def _findings(measurements: Measurements, estimate: Estimate, info: Information)
     return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
 
 
-class _Clock:
+class Clock:
     """Seconds by step, each of which may be lapped several times; told : what is being done."""
 
     def __init__(self, progress: CalibrationProgress | None) -> None:

@@ -56,6 +56,11 @@ class CameraRefinement:
         return self.factor.shape[-1] > 0
 
     @property
+    def refines_all(self) -> bool:
+        """Whether every camera's intrinsics are refined."""
+        return self.refined and bool(np.any(self.factor != 0, axis=(1, 2)).all())
+
+    @property
     def active(self) -> bool:
         """Whether there is anything to refine, of a camera or of a photograph."""
         return self.refined or bool(self.breathes.any())

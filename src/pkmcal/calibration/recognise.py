@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
-from pkmcal.errors import GeometryError, InputError, ResultError
+from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.evidence import StationView
@@ -305,6 +306,19 @@ def frozen_in(session: Session) -> InputError | None:
     return frozen(session.joints, session.joint_noise, joints["columns"], joints["file"])
 
 
+class StationSearch(NamedTuple):
+    """Where the search for all stations ended.
+
+    recognition : of the machine in the photographs that were searched, one a station, None where
+    none was. T_camera_base : (S, 4, 4), NaN of photographs by hand that nothing tells yet. error :
+    why one that is not by hand is not known, or what is mixed up; poses are then incomplete.
+    """
+
+    recognition: Recognition | None
+    T_camera_base: Array
+    error: PkmcalError | None
+
+
 def station_poses(
     session: Session,
     photographs: list[Photographs],
@@ -312,33 +326,57 @@ def station_poses(
     rng: np.random.Generator,
     told: CalibrationProgress | None = None,
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
-    before any leg is looked for, the search for the legs, and what measured poses tell. NaN of
-    photographs by hand that nothing tells yet.
+    """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`search_stations`.
+
+    Raises `InputError`, or `ResultError`, where nothing tells one that is not by hand.
+    """
+    found = search_stations(session, photographs, boards, rng, told)
+    if found.error is not None:
+        raise found.error
+    return found.T_camera_base
+
+
+def search_stations(
+    session: Session,
+    photographs: list[Photographs],
+    boards: Boards,
+    rng: np.random.Generator,
+    told: CalibrationProgress | None = None,
+) -> StationSearch:
+    """The poses of all stations, each by the first that tells it: what is known before any leg is
+    looked for, the search for the legs, and what measured poses tell. Nothing is raised.
 
     photographs : in which the machine is looked for, none by hand. told : called with the step in
-    words and the share done. Raises `InputError`, or `ResultError`, where nothing tells one that is
-    not by hand.
+    words and the share done.
     """
-    known = known_stations(session, boards)
+    nowhere = np.full((len(session.station_names), 4, 4), np.nan)
+    found: Recognition | None = None
+    try:
+        known = known_stations(session, boards)
+        poses = platform_poses(session) if photographs else nowhere
+    except PkmcalError as error:
+        return StationSearch(None, nowhere, error)
     if photographs:
         rngs = rng.spawn(len(photographs) + 1)
         told = told or (lambda _text, _share: None)
         count = sum(len(p.images) for p in photographs)
         told(f"Recognising the machine in {count} photographs", 0.2)
-        found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, known)
+        found = recognise(session, photographs, poses, rngs[1:], boards, known)
         told("Comparing with what is often mixed up", 0.3)
-        error = mistake_in(session, photographs, found, rngs[0])
-        if error is not None:
-            raise error
+        mixed_up = mistake_in(session, photographs, found, rngs[0])
+        if mixed_up is not None:
+            return StationSearch(found, known, mixed_up)
         known[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
         seen = [None if np.isnan(T).any() else T for T in known[: len(session.stations)]]
         for k, T in enumerate(boards.joined(seen)):
             known[k] = known[k] if T is None else T
     by_hand = [s.handheld for s in session.stations] + [False] * len(session.trackers)
     if not (np.isnan(known[:, 0, 0]) & ~np.array(by_hand, dtype=bool)).any():
-        return known
-    return _by_poses(session, boards, known)
+        return StationSearch(found, known, None)
+    try:
+        return StationSearch(found, _by_poses(session, boards, known), None)
+    except PkmcalError as error:
+        return StationSearch(found, known, error)
 
 
 def known_stations(session: Session, boards: Boards) -> Array:

@@ -25,7 +25,8 @@ from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import mechanism_text
-from pkmcal.session.load import digests, session_digest
+from pkmcal.session.load import Session, digests, session_digest
+from pkmcal.session.photographs import label_of
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:
@@ -183,6 +184,7 @@ def calibration_document(
         "holdout": holdout,
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),
+        "rejected_photographs": rejected_photographs(session),
         "mechanism": estimate.machine.to_document(),
         "session": {
             "folder": session.folder.resolve().name,
@@ -441,6 +443,22 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
             estimate.pose_residuals,
         ),
     }
+
+
+def rejected_photographs(session: Session) -> list[dict[str, Any]]:
+    """Photographs that do not show where they were taken from, one entry each: file by its path in
+    the session, station, configuration, and the reason in words.
+    """
+    return [
+        {
+            "file": label_of(session.folder, photo.path),
+            "station": one.station.name,
+            "configuration": session.configurations[photo.configuration],
+            "reason": one.reason,
+        }
+        for one in session.rejected
+        for photo in one.station.photographs
+    ]
 
 
 def _rejected(calibration: Calibration) -> list[dict[str, Any]]:

@@ -19,23 +19,18 @@ from threadpoolctl import threadpool_limits
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.stations import board_of, station_board
 from pkmcal.boards.views import Boards, StationBoard
-from pkmcal.calibration.byhand import search_by_hand, why_lost
-from pkmcal.calibration.calibrate import CalibrationProgress
-from pkmcal.calibration.doubts import check_poses, richer_models, turning
-from pkmcal.calibration.gather import measurements_of, refinement_of
-from pkmcal.calibration.known import KnownScene
+from pkmcal.calibration.byhand import Localization, localize
+from pkmcal.calibration.calibrate import CalibrationProgress, Clock, Settled, settle
+from pkmcal.calibration.doubts import turning
+from pkmcal.calibration.gather import measurements_of
+from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
     board_images,
     check_observable,
-    known_stations,
     legs_stations,
-    mistake_in,
     platform_poses,
-    recognise,
-    station_poses,
 )
-from pkmcal.calibration.turns import identify_poses
 from pkmcal.check.advice import advice
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck
 from pkmcal.check.forecast import forecast
@@ -47,7 +42,6 @@ from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
-from pkmcal.observe.alone import Alone
 from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
 from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
@@ -91,8 +85,7 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     photographs, broken = _decoded(session)
     told("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
-    rng = np.random.default_rng(seed)
-    seen = _observed(session, photographs, motion.poses, rng, told)
+    seen = _observed(session, photographs, motion.poses, seed, told)
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
     findings += [note(text) for text in numbering_told(session)]
@@ -237,7 +230,7 @@ def _observed(
     session: Session,
     photographs: list[Photographs | None],
     poses: Array | None,
-    rng: np.random.Generator,
+    seed: int,
     progress: CalibrationProgress,
 ) -> _Observed:
     """What the photographs of every station show, and what is to be said of it."""
@@ -265,65 +258,115 @@ def _observed(
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
         return _Observed(unlooked(), boards.findings)
-    told = (*boards.findings, *(() if lost else pose_findings(session, boards.boards)))
-    rngs = rng.spawn(len(whole) + 1)
-    try:
-        starts = None if lost else known_stations(session, boards.boards)
-    except PkmcalError as error:
-        return _Observed(unlooked(), (wrong(error), *boards.findings))
-    fixed = [p for p in whole if not session.stations[p.station].handheld]
-    recognition = recognise(session, fixed, poses, rngs[1 : len(fixed) + 1], boards.boards, starts)
-    places = {p.station: found for p, found in zip(fixed, recognition.found, strict=True)}
-    nowhere = np.full((len(session.stations), 4, 4), np.nan)
-    known = KnownScene(session.machine, nowhere if starts is None else starts, poses)
-    by_hand: dict[int, Alone] = {}
-    if len(fixed) < len(whole):
-        by_hand, _ = search_by_hand(
-            session, whole, boards.boards, known, lambda text, share: progress(text, 0.4 + share)
-        )
-    for k, one in by_hand.items():  # what chance is to others, another place is to one alone
-        places[k] = FoundStation(
-            one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True
-        )
-        if not places[k].good:
-            name = session.stations[k].name
-            told = (*told, doubtful(f"{name} is left out, for {why_lost(one)}.", name))
+    turns = () if lost else pose_findings(session, boards.boards)
+    located = localize(  # by the random numbers of `calibrate`
+        session,
+        whole,
+        boards.boards,
+        np.random.default_rng(seed),
+        lambda text, share: progress(text, 0.4 + 0.4 * share),
+    )
+    settled: Settled | PkmcalError | None = None
+    if isinstance(located.result, PkmcalError):
+        settled = located.result
+    elif not lost and not any(finding.level is Level.WRONG for finding in turns):
+        settled = _settled(session, located.result, seed, progress)
+    kept = located.result if not isinstance(settled, Settled) else settled.seen
+    rejected = () if isinstance(kept, PkmcalError) else kept.session.rejected
+    findings = [
+        *([_refused(settled)] if isinstance(settled, PkmcalError) else []),
+        *boards.findings,
+        *turns,
+        *(doubtful(one.sentence, one.station.name) for one in rejected),
+    ]
+    if isinstance(settled, Settled):
+        findings += [
+            note(one.sentence) if one.sure else doubtful(one.sentence) for one in settled.turned
+        ]
+        findings += _verdict_of_poses(settled)
     stations = [  # as it is known of one that observes no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
+    places = _found_places(session, whole, located)
+    # one on a tripod was recognised all the same, and its quality tells why it may be left out
+    gone = {one.station.name for one in rejected if one.station.handheld}
+    if isinstance(kept, PkmcalError):  # of photographs by hand none was placed then
+        gone = {station.name for station in session.stations if station.handheld}
     looks: list[StationLook] = []
     for p in whole:
-        stations[p.station], look = _station(session, p, places[p.station], poses)
+        if p.station not in places:  # another station's fault came first
+            summary = unrecognised_quality(p.images, session.machine.n_legs)
+            stations[p.station] = _summary(session.stations[p.station], summary, recognised=False)
+            continue
+        place = places[p.station]
+        recognised = place.good and stations[p.station].name not in gone
+        stations[p.station], look = _station(session, p, place, poses, recognised)
         looks.append(look)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     look = Look(session, poses, tuple(looks)) if looks else None
-    mistake = mistake_in(session, fixed, recognition, rngs[0])
-    return _Observed(stations, (*([wrong(mistake)] if mistake else []), *told), look)
+    return _Observed(stations, tuple(findings), look)
+
+
+def _settled(
+    session: Session, seen: SeenSession, seed: int, progress: CalibrationProgress
+) -> Settled | PkmcalError:
+    """Where `calibrate` begins, or why it would not."""
+    clock = Clock(lambda text, share: progress(text, 0.4 + 0.4 * share))
+    try:
+        return settle(session, seen, False, seed, clock)
+    except PkmcalError as error:
+        return error
+
+
+def _refused(error: PkmcalError) -> Finding:
+    """Why `calibrate` gives no result, as it says so: wrong where the session is at fault, doubtful
+    where these data tell too little.
+    """
+    found = wrong(error)
+    return found if error.exit_code > 1 else replace(found, level=Level.DOUBTFUL)
+
+
+def _found_places(
+    session: Session, photographs: list[Photographs], located: Localization
+) -> dict[int, FoundStation]:
+    """Where the search for each station ended, by its number; without those not searched."""
+    fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
+    found = located.recognition.found if located.recognition else ()
+    places = dict(zip(fixed, found, strict=bool(found)))
+    for k, one in located.places.items():  # what chance is to others, another place is to one alone
+        places[k] = FoundStation(
+            one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True
+        )
+    return places
 
 
 def _station(
-    session: Session, photographs: Photographs, pose: FoundStation, poses: Array
+    session: Session,
+    photographs: Photographs,
+    pose: FoundStation,
+    poses: Array,
+    recognised: bool,
 ) -> tuple[StationCheck, StationLook]:
     """One station in which the machine was looked for."""
     station, machine = session.stations[photographs.station], session.machine
     found, by_hand = pose.T_camera_base, station.T_camera_base
     what = (
         quality(photographs, machine, found, poses[photographs.configuration])
-        if pose.good
+        if recognised
         else unrecognised_quality(photographs.images, machine.n_legs)
     )
     summary = replace(
-        _summary(station, what, recognised=pose.good),
+        _summary(station, what, recognised=recognised),
         mismatch=pose.score,
         by_chance=pose.by_chance,
     )
-    if pose.good and by_hand is not None:
+    if recognised and by_hand is not None:
         change = pose_difference(inverse(found), inverse(by_hand))
         moved, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
         summary = replace(summary, moved=moved, turned=turned)
     return summary, StationLook(
-        station.name, photographs, by_hand, found, what if pose.good else None
+        station.name, photographs, by_hand, found, what if recognised else None
     )
 
 
@@ -424,31 +467,23 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
-    """How the platform turns, and, where no legs are needed for it, whether the poses fit."""
+    """How the platform turns, by the poses that were measured."""
     if not session.trackers and (not boards.stations or boards.body == "base"):
         return []
     try:
         measurements = measurements_of(session, boards)
         turns = turning(session, measurements.poses, measurements.on_platform)
-        findings = [doubtful(text) if bad else note(text) for bad, text in turns]
-        if any("legs" in station.observe for station in session.stations):
-            return findings
-        return findings + _fit(session, boards)
+        return [doubtful(text) if bad else note(text) for bad, text in turns]
     except InputError as error:
         return [wrong(error)]
     except PkmcalError as error:
         return [doubtful(str(error))]
 
 
-def _fit(session: Session, boards: Boards) -> list[Finding]:
-    """Whether the mechanism, its parameters adjusted, explains the poses."""
-    known = station_poses(session, [], boards, np.random.default_rng(0))
-    cameras = refinement_of(session, refine=False)
-    turns = identify_poses(session, boards, known, cameras, lambda _text, _share: None)
-    richer = richer_models(session, turns.measurements, turns.estimate)
-    check_poses(session, turns.measurements, turns.estimate, richer)
-    scale = turns.estimate.statistics.pose_scale
-    if scale <= POOR_MODEL_POSE_SCALE:
+def _verdict_of_poses(settled: Settled) -> list[Finding]:
+    """Whether the mechanism, its parameters adjusted, explains the poses that were measured."""
+    scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
+    if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []
     better = min(richer, key=lambda model: model.scale, default=None)
     told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""

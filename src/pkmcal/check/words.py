@@ -177,6 +177,7 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         "It cannot be calibrated yet.",
     )
     code = exit_code_of(findings)
+    refused = any(finding.error is not None for finding in findings)
     name = found.folder
     if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
         name = Path(name).resolve().name or name
@@ -202,8 +203,8 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         f" {found.configurations} configurations, {photographs} photographs"
         if found.machine
         else "",
-        verdict=Verdict(code == 0, headlines[code], advice=found.advice),
-        stamp=("Ready", "Doubtful", "Not yet")[code],
+        verdict=Verdict(code == 0, headlines[2 if refused else code], advice=found.advice),
+        stamp=("Ready", "Doubtful", "Not yet")[2 if refused else code],
         level=Level.WRONG if code == 2 else Level.DOUBTFUL,
         figures=(forecast_figure(found.forecast),) if found.forecast else (),
         parts=(*parts, part_of(study)) if study else parts,

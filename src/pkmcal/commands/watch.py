@@ -17,7 +17,9 @@ def watch(
     calibration: console.CalibrationFolder,
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", help="New photographs with readings: five from one place."),
+        typer.Argument(
+            metavar="SESSION", help="Five new photographs from one place, with their readings."
+        ),
     ],
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
     alpha: Annotated[float, typer.Option(metavar="P", help="Share of false alarms.")] = 0.01,

@@ -16,6 +16,7 @@ from pkmcal.calibration.results import (
     CALIBRATION_REPORT_FILE,
     calibration_document,
     check_output,
+    rejected_photographs,
     texts_of,
 )
 from pkmcal.calibration.toolmap import ToolMap
@@ -64,6 +65,8 @@ def outcome_of(calibration: Calibration) -> Outcome:
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
             "session_warnings": c.session.warnings,
+            "photographs": c.session.images_taken,
+            "rejected_photographs": rejected_photographs(c.session),
             "holdout": predicted,
             "timings": c.timings,
         },
@@ -306,10 +309,12 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
         )
         if len(weights)
     ]
+    lost = taken - sum(len(station.photographs) for station in session.stations)
+    left = f"; {count(lost, 'photograph')} left out whole" if lost else ""
     return Figure(
         "What is it based on?",
         ((f"{used} of {taken}", "photographs"),),
-        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected",
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected{left}",
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,7 +35,7 @@ from pkmcal.pages.drawn import (
 from pkmcal.pages.jpegs import small_and_large
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Links, Place
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph
 from pkmcal.wording import brief, count, number
 
@@ -52,11 +52,13 @@ CORNER_ARROW_LENGTH = 0.03
 
 @dataclass(frozen=True)
 class Album:
-    """The photographs on the page. total : how many there are. factor : enlarges the corners'
-    residuals. corners : of the board, in all photographs.
+    """The photographs on the page. rejected : those that do not show where they were taken from.
+    total : how many others there are. factor : enlarges the corners' residuals. corners : of the
+    board, in all photographs.
     """
 
     pictures: tuple[Picture, ...]
+    rejected: tuple[Picture, ...]
     total: int
     factor: float
     links: Links
@@ -99,12 +101,14 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
     found = _Found(calibration, shifts, centres, chosen)
+    room = JPEG_CHARACTERS_A_PAGE - sum(len(small) + len(large) for small, large in shots)
     return Album(
         tuple(
             found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
             for place in [(s, photo.configuration)]
         ),
+        tuple(_rejected(session, room)),
         len(every),
         found.factor,
         links,
@@ -112,9 +116,38 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     )
 
 
+def _rejected(session: Session, room: int) -> Iterator[Picture]:
+    """Photographs without a place, each with the reason, in ``room`` characters of their JPEGs;
+    what there is no room for is named all the same.
+    """
+    lost = [(one, photo) for one in session.rejected for photo in one.station.photographs]
+    files = [
+        (_decoded(one.station), one.station.photographs.index(photo))
+        for one, photo in lost[:MOST_PHOTOGRAPHS_SHOWN]
+    ]
+    shots = list(small_and_large(files, room))
+    shots += [("", "")] * (len(lost) - len(shots))
+    for k, ((one, photo), shot) in enumerate(zip(lost, shots, strict=True), start=1):
+        width, height = one.station.camera.image_size
+        yield Picture(
+            station=one.station.name,
+            configuration=session.configurations[photo.configuration],
+            width=width,
+            height=height,
+            jpeg=shot[0],
+            large=shot[1],
+            caption=f"left out, for {one.reason}",
+            anchor=f"rejected-{k}",
+        )
+
+
 def _images(session: Session, s: int) -> Pictures:
     """A station's photographs, decoded when they are looked at."""
-    station = session.stations[s]
+    return _decoded(session.stations[s])
+
+
+def _decoded(station: Station) -> Pictures:
+    """The same of a station that is not in the session any more."""
     paths = [photo.path for photo in station.photographs]
     return Pictures(paths, station.camera.image_size, [path.name for path in paths])
 

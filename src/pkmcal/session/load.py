@@ -87,6 +87,22 @@ class Station:
 
 
 @dataclass(frozen=True)
+class RejectedStation:
+    """A station whose images do not show where it stands. label : its name in messages. reason : in
+    words, that follow "for".
+    """
+
+    station: Station
+    label: str
+    reason: str
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return f"{self.label}: left out, for {self.reason}."
+
+
+@dataclass(frozen=True)
 class Session:
     """A session, checked.
 
@@ -101,7 +117,7 @@ class Session:
     model : the machine's model by its name in the mechanism file, None for the file's own.
     mechanism : where the machine came from, for other models of it.
     workspace : where the tool is to be right, None where the file does not say.
-    images_left_out : images of stations that are in the session's files, and not in ``stations``.
+    rejected : stations that were taken out because their images do not show where they stand.
     """
 
     folder: Path
@@ -118,7 +134,7 @@ class Session:
     model: str | None = None
     mechanism: Path | str = ""
     workspace: Region | None = None
-    images_left_out: int = 0
+    rejected: tuple[RejectedStation, ...] = ()
 
     def __repr__(self) -> str:
         parts = (
@@ -127,12 +143,6 @@ class Session:
             count(self.images_taken, "photograph"),
         )
         return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
-
-    @property
-    def images_taken(self) -> int:
-        """Number of the images of all stations, those that were left out among them."""
-        kept = sum(len(station.photographs) for station in self.stations)
-        return kept + self.images_left_out
 
     @property
     def called(self) -> str:
@@ -159,18 +169,33 @@ class Session:
         cameras = numbered(station.camera_file for station in self.stations)
         return np.pad(cameras, (0, len(self.trackers)))
 
-    def of_stations(self, numbers: Sequence[int], warnings: tuple[str, ...] = ()) -> Session:
-        """The session with some of its stations that have a camera, and what is to be known of
-        the others.
-        """
-        stations = tuple(self.stations[k] for k in numbers)
-        kept = sum(len(station.photographs) for station in stations)
-        return replace(
-            self,
-            stations=stations,
-            warnings=self.warnings + warnings,
-            images_left_out=self.images_taken - kept,
+    def of_stations(self, numbers: Sequence[int]) -> Session:
+        """The session with some of its stations that have a camera."""
+        return replace(self, stations=tuple(self.stations[k] for k in numbers))
+
+    def without(self, reasons: Mapping[int, str]) -> Session:
+        """The session without some stations, by their numbers, each rejected for a reason."""
+        rejected = tuple(
+            RejectedStation(self.stations[k], self.label(k), why) for k, why in reasons.items()
         )
+        return replace(
+            self.of_stations([k for k in range(len(self.stations)) if k not in reasons]),
+            rejected=self.rejected + rejected,
+            warnings=self.warnings + tuple(one.sentence for one in rejected),
+        )
+
+    def label(self, number: int) -> str:
+        """What a station is called in messages: a hand-held one by the file of its image."""
+        station = self.stations[number]
+        if not station.handheld:
+            return station.name
+        return label_of(self.folder, station.photographs[0].path)
+
+    @property
+    def images_taken(self) -> int:
+        """Images of all stations, those of rejected ones among them."""
+        stations = (*self.stations, *(one.station for one in self.rejected))
+        return sum(len(station.photographs) for station in stations)
 
     def other_model(self, name: str | None) -> Machine:
         """Another model of the same machine."""
