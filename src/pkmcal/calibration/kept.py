@@ -67,7 +67,7 @@ def _told(name: str, content: str | bytes) -> object:
         return raw
     try:
         document = json.loads(raw)
-    except ValueError:  # changed by hand, or cut short: kept all the same
+    except (ValueError, RecursionError):  # changed by hand, or cut short: kept all the same
         return raw
     if isinstance(document, dict):
         document.pop("timings", None)

@@ -180,6 +180,7 @@ def plan_measurements(
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
+    rig.machine.check_free("fixed")
     if index not in PLAN_INDICES:
         raise InputError(
             "there is no such index", where="--index", found=index, expected=", ".join(PLAN_INDICES)
