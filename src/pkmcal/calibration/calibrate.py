@@ -62,6 +62,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
+from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
@@ -187,11 +188,8 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
             found=shown(method),
             expected=guess or listed(CALIBRATION_METHODS),
         )
-    for name, value in (("seed", seed), ("holdout", holdout)):
-        if value < 0:
-            raise InputError(
-                "this number is negative", where=name, found=shown(value), expected="0 or more"
-            )
+    check_number("calibrate", "seed", seed)
+    check_number("calibrate", "holdout", holdout)
 
 
 class _Identified(NamedTuple):

@@ -30,7 +30,14 @@ def plan(
     out: Annotated[Path | None, console.folder("SESSION/plan, or plan, unless given.")] = None,
     configurations: Annotated[
         int,
-        typer.Option("-n", "--configurations", metavar="N", help="Configurations from each place."),
+        console.number(
+            "plan",
+            "configurations",
+            "N",
+            "Configurations from each place.",
+            "-n",
+            "--configurations",
+        ),
     ] = 15,
     index: Annotated[
         Literal["tool", "D", "E", "O1"],
@@ -38,10 +45,10 @@ def plan(
     ] = "tool",
     places: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, max=12, help="Choose N places of the camera as well."),
+        console.number("plan", "places", "N", "Choose N places of the camera as well."),
     ] = None,
     best_of: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Choose N of the session's stations.")
+        int | None, console.number("plan", "best_of", "N", "Choose N of the session's stations.")
     ] = None,
     after: Annotated[
         Path | None,
@@ -76,13 +83,17 @@ def plan(
         ),
     ] = None,
     edge_noise: Annotated[
-        float, typer.Option(metavar="PX", help="Of an edge, where no photograph tells.")
+        float, console.number("plan", "edge_noise", "PX", "Of an edge, where no photograph tells.")
     ] = 0.1,
     corner_noise: Annotated[
-        float, typer.Option(metavar="PX", help="Of a board's corner, where no photograph tells.")
+        float,
+        console.number(
+            "plan", "corner_noise", "PX", "Of a board's corner, where no photograph tells."
+        ),
     ] = 0.05,
     joint_noise: Annotated[
-        float, typer.Option(metavar="M", help="Of a MACHINE: noise of a reading, m or rad.")
+        float,
+        console.number("plan", "joint_noise", "M", "Of a MACHINE: noise of a reading, m or rad."),
     ] = 3e-6,
     seed: console.Seed = 0,
     as_json: console.Json = False,
@@ -102,9 +113,6 @@ def plan(
     from pkmcal.simulation.demo import camera_of_size
     from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 
-    console.check_positive("--edge-noise", edge_noise, 100)
-    console.check_positive("--corner-noise", corner_noise, 100)
-    console.check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
     files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}
