@@ -188,3 +188,29 @@ def test_commands_refuse_a_calibration_of_other_types(tracker, tmp_path, key, va
         ("watch", tmp_path / "calibration", tracker),
     ):
         assert key in refused(*words)
+
+
+# ------------------------------------------------------------------ links that lead to themselves
+
+
+@pytest.mark.parametrize("words", [
+    "calibrate LOOP", "check LOOP", "validate CAL LOOP", "validate LOOP S", "watch CAL LOOP",
+    "diff CAL LOOP", "diff S/mechanism.yaml CAL -o LOOP", "export LOOP --to c",
+    "export CAL --to c -o LOOP", "export CAL --to ros --session LOOP", "plan LOOP",
+    "plan S --after LOOP", "plan h4 --camera LOOP", "simulate LOOP", "simulate X --plan LOOP",
+    "simulate X --mechanism LOOP", "new LOOP", "new X --machine LOOP", "new X --printer LOOP",
+    "board LOOP", "camera LOOP", "camera S/session.yaml --board LOOP", "study LOOP", "servo LOOP",
+    "servo h4 --session LOOP", "view LOOP", "view S --calibration LOOP",
+    "calibrate S -o LOOP", "calibrate S -o LOOP/x",
+])  # fmt: skip
+def test_a_link_to_itself_is_a_users_mistake(tracker, tmp_path, words):
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    places = {"LOOP": loop, "CAL": tracker / "calibration", "S": tracker, "X": tmp_path / "x"}
+    given = [
+        str(places[head]) + rest if head in places else word
+        for word in words.split()
+        for head, rest in [(word.partition("/")[0], "".join(word.partition("/")[1:]))]
+    ]
+    assert refused(*given)
+    assert not (tmp_path / "x").exists()

@@ -45,7 +45,7 @@ from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
 from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import closest, shown
+from pkmcal.files import closest, resolved, shown
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
@@ -115,7 +115,7 @@ class Calibration(ShownCalibration):
         session, e = self.session, self.estimate
         edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
         return Overview(
-            source=session.folder.resolve().name,
+            source=resolved(session.folder).name,
             method=self.method,
             machine=e.machine,
             verdict=self.verdict,

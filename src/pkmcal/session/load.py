@@ -33,6 +33,7 @@ from pkmcal.files import (
     no_such,
     read_csv,
     read_yaml,
+    resolved,
     shown,
     validated_document,
     wanted_file,
@@ -126,12 +127,12 @@ class Session:
             count(len(self.station_names), "station"),
             count(taken, "photograph"),
         )
-        return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
+        return f"<Session {resolved(self.folder).name}: {self.machine.name}, {', '.join(parts)}>"
 
     @property
     def called(self) -> str:
         """``session mine`` by its folder, or by the one around it where it is called session."""
-        folder = self.folder.resolve()
+        folder = resolved(self.folder)
         return f"session {(folder if folder.name != 'session' else folder.parent).name}"
 
     @property
