@@ -382,7 +382,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["gough-stewart", "-n", "1"], "a plan needs two configurations or more"),
+        (["gough-stewart", "-n", "1"], "--configurations: this number cannot be used"),
         (["gough-stewart", "--after", "x"], "this option is for a session"),
         (["gough-stewart", "--tracker", "far"], "a tracker's noise cannot be this"),
         (["gough-stewart", "--tracker", "2e-5", "--places", "2"], "no camera whose place"),

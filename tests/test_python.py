@@ -274,8 +274,8 @@ def test_a_result_is_saved_as_the_command_saves_it(result, demo, tmp_path):
                                " bundle."),
         ({"method": "best"}, "expected bundle, four-step, linear and inverse-kinematic."),
         ({"method": None}, "found nothing, expected bundle, four-step"),
-        ({"seed": -1}, "seed: this number is negative; found -1, expected 0 or more."),
-        ({"holdout": -2}, "holdout: this number is negative"),
+        ({"seed": -1}, "seed: this number cannot be used; found -1"),
+        ({"holdout": -2}, "holdout: this number cannot be used"),
     ],
 )  # fmt: skip
 def test_an_option_that_cannot_be_is_refused_before_any_work(options, said):

@@ -172,7 +172,7 @@ def test_another_machine(demo, again):
 def test_a_share_of_false_alarms_that_makes_no_sense(demo, again, alpha):
     done = run("watch", demo.calibration, again, "--alpha", alpha)
     assert done.code == 2
-    assert "this share of false alarms is not possible" in done.err
+    assert "--alpha: this number cannot be used" in done.err
     assert "0.2" in done.err
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.ranges import RANGES, check_number
 from pkmcal.session.load import Session, load_session
-from pkmcal.simulation import Settings, simulate_session, to_simulate
+from pkmcal.simulation import Sensor, Settings, simulate_session, to_simulate
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.wording import listed
 
@@ -67,8 +68,24 @@ def simulate(
                 found=name,
                 expected=guess or listed(known, len(known)),
             )
+    check_number("simulate", "seed", seed)
+    _check_settings(settings)
     drawing = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
     eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
     machine = to_simulate(drawing, drawing.name)
     simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
     return load_session(folder)
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    """Raise InputError for a number of the settings, or of their sensor, that is out of range."""
+    for name, value in settings.items():
+        if name == "stations" and not isinstance(value, int | float):
+            continue  # where they stand
+        if name in RANGES["simulate"]:
+            for one in value if name == "shake" else (value,):
+                check_number("simulate", name, one)
+    sensor = settings.get("sensor")
+    if isinstance(sensor, Sensor):
+        check_number("simulate", "blur", sensor.blur, "sensor.blur")
+        check_number("simulate", "noise", sensor.read_noise, "sensor.read_noise")

@@ -394,7 +394,9 @@ def misplaced(
     kept = np.bincount(station, measured * estimate.edge_weights, len(session.stations))
     count = np.bincount(station, measured, len(session.stations))
     poses = measurements.poses.station
-    by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
+    # trackers have the numbers behind the cameras'
+    by_board = np.bincount(poses, estimate.pose_weights, len(session.stations))
+    by_board = by_board[: len(session.stations)] >= 0.5
     shown = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
     used = measured & (estimate.edge_weights >= 0.5)
     shown[station[used], measurements.edges.leg[used]] = True

@@ -47,7 +47,7 @@ from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
 from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.errors import InputError, PkmcalError, ResultError
-from pkmcal.files import closest, shown
+from pkmcal.files import closest, resolved, shown
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
@@ -64,6 +64,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
+from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
@@ -116,7 +117,7 @@ class Calibration(ShownCalibration):
         session, e = self.session, self.estimate
         edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
         return Overview(
-            source=session.folder.resolve().name,
+            source=resolved(session.folder).name,
             method=self.method,
             machine=e.machine,
             verdict=self.verdict,
@@ -243,11 +244,8 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
             found=shown(method),
             expected=guess or listed(CALIBRATION_METHODS),
         )
-    for name, value in (("seed", seed), ("holdout", holdout)):
-        if value < 0:
-            raise InputError(
-                "this number is negative", where=name, found=shown(value), expected="0 or more"
-            )
+    check_number("calibrate", "seed", seed)
+    check_number("calibrate", "holdout", holdout)
 
 
 class Settled(NamedTuple):

@@ -155,8 +155,9 @@ def _departed(one: Departure, score: Score, fit: Freed, tool: ToolError) -> Depa
     moved = np.linalg.norm((tool.by_parameters @ fit.moved)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(moved**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
+    ratio = shift / sigma if sigma > 0 else np.inf  # where nothing that is free moves the tool
     what, todo = one.says(fit.value, fit.sigma)
-    return Departed(one.kind, one.of, fit.value, fit.sigma, score, shift / sigma, shift, what, todo)
+    return Departed(one.kind, one.of, fit.value, fit.sigma, score, ratio, shift, what, todo)
 
 
 def _lenses(

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
-from pkmcal.files import entries, staged_folder
+from pkmcal.files import entries, resolved, staged_folder
 
 
 def keep_earlier(
@@ -31,7 +31,7 @@ def keep_earlier(
     folder's with the earlier result's date, as calibration-2026-11-23T1502; a second one of the
     same minute ends in -2.
     """
-    folder = folder.resolve()
+    folder = resolved(folder)
     names = entries(folder)
     if document not in names or _same(folder, names, texts, page):
         return None
@@ -67,7 +67,7 @@ def _told(name: str, content: str | bytes) -> object:
         return raw
     try:
         document = json.loads(raw)
-    except ValueError:  # changed by hand, or cut short: kept all the same
+    except (ValueError, RecursionError):  # changed by hand, or cut short: kept all the same
         return raw
     if isinstance(document, dict):
         document.pop("timings", None)

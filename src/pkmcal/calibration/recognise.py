@@ -44,6 +44,7 @@ ALMOST_ALL = 0.9
 
 def check_observable(session: Session) -> None:
     """What the session's form allows but this observation cannot use."""
+    session.machine.check_free(f"{session.document['mechanism']}, fixed")
     seen = [station.name for station in session.stations if "legs" in station.observe]
     if seen and not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(

@@ -20,7 +20,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError, legible
-from pkmcal.files import check_writable, entries, json_text, json_value
+from pkmcal.files import check_writable, entries, json_text, json_value, resolved
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import BREATHING_SIGMA
@@ -95,7 +95,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
         )
     if standing and not force:
         try:
-            check_writable(folder.resolve().parent)
+            check_writable(resolved(folder).parent)
         except InputError:
             raise InputError(
                 "the calibration that is there cannot be kept, for nothing can be written beside"
@@ -129,7 +129,7 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
 def calibrated_mechanism_text(calibration: Calibration) -> str:
     """The calibrated machine as a mechanism file, with what it is on top."""
     verdict = calibration.verdict
-    name = calibration.session.folder.resolve().name
+    name = resolved(calibration.session.folder).name
     lines = [
         f"Calibrated by pkmcal {version('pkmcal')} from the session {name}"
         f" (method {calibration.method}, seed {calibration.seed}).",
@@ -187,7 +187,7 @@ def calibration_document(
         "rejected_photographs": rejected_photographs(session),
         "mechanism": estimate.machine.to_document(),
         "session": {
-            "folder": session.folder.resolve().name,
+            "folder": resolved(session.folder).name,
             "digest": session_digest(session, seen),
             **session.document,
         },

@@ -10,20 +10,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.results import (
     CALIBRATION_DOCUMENT_FILE,
     CALIBRATION_FORMAT,
+    EDGE_COLUMNS,
     EDGE_RESIDUALS,
     EDGE_WEIGHT,
     FORMAT_KEY,
+    POSE_COLUMNS,
     POSE_WEIGHT,
     of_inverse_poses,
     rows_of_stations,
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
+from pkmcal.cameras.response import Response
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
@@ -199,6 +202,9 @@ class _Station(_Part):
     T_base_camera: Matrix4
     sigma_rotation: Row3
     sigma_translation: Row3
+    response: Response | None = None
+    binning: Annotated[int, Field(ge=1)] | None = None
+    focal_scale: Factor = 1.0
 
 
 class _StationCovariance(_Part):
@@ -217,6 +223,7 @@ class _Configuration(_Part):
 class _Camera(_Part):
     file: str
     edge_shift: float
+    upside_down: bool | None = None
 
 
 class _Target(_Part):
@@ -224,14 +231,69 @@ class _Target(_Part):
     T_platform_target: Matrix4 | None = None
 
 
+Numbers = tuple[float | None, ...]
+
+
+def _has_weight(columns: Sequence[str], fewest: int) -> AfterValidator:
+    """A row of residuals has these columns, of which older files lack the last, and numbers up to
+    its weight.
+    """
+    most = columns.index("weight") + 1
+
+    def check(row: Numbers) -> Numbers:
+        if not fewest <= len(row) <= len(columns) or None in row[:most]:
+            raise ValueError(f"a row of residuals has other columns than {', '.join(columns)}")
+        return row
+
+    return AfterValidator(check)
+
+
 class _Residuals(_Part):
-    edges: list[Any] | None = None
+    edges: list[Annotated[Numbers, _has_weight(EDGE_COLUMNS, EDGE_RESIDUALS.stop)]] | None = None
+    poses: list[Annotated[Numbers, _has_weight(POSE_COLUMNS, len(POSE_COLUMNS))]] | None = None
 
 
 class _Statistics(_Part):
+    """All of them are numbers; factors are positive."""
+
     noise_scale: Factor = 1.0
     pose_scale: Factor = 1.0
     reading_scale: Factor = 1.0
+    chi2: float = 0.0
+    dof: float = 0.0
+    chi2_edges: float = 0.0
+    n_edges: float = 0.0
+    chi2_joints: float = 0.0
+    n_joints: float = 0.0
+    chi2_drawing: float = 0.0
+    n_drawing: float = 0.0
+    chi2_poses: float = 0.0
+    n_poses: float = 0.0
+    steps: int = 0
+    stopped: str = ""
+
+
+Ends = tuple[float, float] | None
+
+
+class _Region(_Part):
+    x: Ends = None
+    y: Ends = None
+    z: Ends = None
+    turn: float | None = None
+
+
+class _Tool(_Part):
+    region: _Region | None = None
+
+
+class _Bed(_Part):
+    z: float | None = None
+
+
+class _Rejected(_Part):
+    reason: str
+    cases: tuple[tuple[str, str, int, int, int], ...] = ()
 
 
 class _Readings(_Part):
@@ -241,6 +303,7 @@ class _Readings(_Part):
 
 class _Session(_Part):
     folder: str = ""
+    digest: str = ""
     joints: _Readings | None = None
 
 
@@ -262,6 +325,10 @@ class _Saved(_Part):
     residuals: _Residuals | None = None
     statistics: _Statistics | None = None
     session: _Session | None = None
+    tool: _Tool | None = None
+    bed: _Bed | None = None
+    rejected: tuple[_Rejected, ...] | None = None
+    warnings: tuple[str, ...] | None = None
 
 
 def load(source: Path | str) -> SavedCalibration:

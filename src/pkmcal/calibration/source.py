@@ -20,7 +20,7 @@ from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera, written_camera
 from pkmcal.errors import InputError, legible
-from pkmcal.files import closest
+from pkmcal.files import closest, resolved
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
@@ -167,7 +167,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
         ),
         headline=saved.verdict.headline,
         usable=saved.verdict.usable,
-        origin=folder.resolve().name,
+        origin=resolved(folder).name,
         covariance=saved.covariance,
         reasons=() if saved.verdict.usable else saved.verdict.reasons,
         calibrated=True,
@@ -185,7 +185,7 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
                 "there is no session here", where=str(session), expected=f"a {SESSION_FILE}"
             )
         return session
-    above = saved.path.resolve().parent.parent
+    above = resolved(saved.path).parent.parent
     name = str((saved.document.get("session") or {}).get("folder", ""))
     for folder in (above, above / name):
         if legible(folder.name) == legible(name) and (folder / SESSION_FILE).is_file():

@@ -11,6 +11,7 @@ import numpy as np
 from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
+from pkmcal.files import resolved
 from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
@@ -180,7 +181,7 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
     refused = any(finding.error is not None for finding in findings)
     name = found.folder
     if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
-        name = Path(name).resolve().name or name
+        name = resolved(Path(name)).name or name
     parts: tuple[Part, ...] = ()
     if found.machine:
         said = KINEMATICS_SENTENCE.format(found) if math.isfinite(found.singularity) else ""

@@ -38,7 +38,7 @@ def calibrate(
     ] = False,
     holdout: Annotated[
         int,
-        typer.Option(metavar="N", min=0, help="Leave N poses out, and predict them."),
+        console.number("calibrate", "holdout", "N", "Leave N poses out, and predict them."),
     ] = 0,
     force: Annotated[
         bool,

@@ -149,9 +149,10 @@ def photographs(images: list[Path]) -> list[Path]:
 def board_file_of(images: list[Path]) -> Path:
     """board.yaml in the photographs' folder, or in the one above it."""
     from pkmcal.errors import InputError
+    from pkmcal.files import resolved
 
     first = images[0] if images[0].is_dir() else images[0].parent
-    for folder in (first, first.resolve().parent):
+    for folder in (first, resolved(first).parent):
         if (folder / "board.yaml").is_file():
             return folder / "board.yaml"
     raise InputError(

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkmcal.errors import InputError, legible
+from pkmcal.errors import legible
+from pkmcal.ranges import RANGES, check_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +28,31 @@ if TYPE_CHECKING:
 ToldProgress = Callable[[str, float], None]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of all random draws.")]
+
+
+def number(command: str, name: str, metavar: str, described: str, *flags: str) -> Any:
+    """A numeric option with its range in :data:`pkmcal.ranges.RANGES`, which its help tells.
+
+    described : its help. flags : as they are written; ``--name`` unless given.
+    """
+    long = flags[-1] if flags else f"--{name.replace('_', '-')}"
+
+    def check(value: Any) -> Any:
+        check_number(command, name, value, long)
+        return value
+
+    text = f"{described} [{RANGES[command][name]}]"
+    return typer.Option(*(flags or (long,)), metavar=metavar, callback=check, help=text)
+
+
+def _seed(value: int) -> int:
+    check_number("calibrate", "seed", value, "--seed")
+    return value
+
+
+Seed = Annotated[
+    int, typer.Option("--seed", metavar="N", callback=_seed, help="Of all random draws.")
+]
 
 SessionFolder = Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")]
 CalibrationFolder = Annotated[
@@ -55,17 +80,6 @@ WIDEST_NAME = 32
 def folder(given: str) -> Any:
     """The option of the folder in which results go; given : its help."""
     return typer.Option("-o", "--out", metavar="DIR", help=given)
-
-
-def check_positive(option: str, value: float, most: float) -> None:
-    """Raise `InputError` where an option's number is not above zero, or above ``most``."""
-    if not 0 < value <= most:
-        raise InputError(
-            "this number cannot be used",
-            where=option,
-            found=f"{value:g}",
-            expected=f"more than 0 and at most {most:g}",
-        )
 
 
 @cache

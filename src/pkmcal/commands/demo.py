@@ -89,7 +89,9 @@ def demo(
         if not no_open and console.can_show():
             import webbrowser
 
-            webbrowser.open((result / "report.html").resolve().as_uri())
+            from pkmcal.files import resolved
+
+            webbrowser.open(resolved(result / "report.html").as_uri())
     return code
 
 

@@ -35,7 +35,7 @@ def diff(
     from threadpoolctl import threadpool_limits
 
     from pkmcal.calibration.kept import keep_earlier
-    from pkmcal.files import check_own_folder, json_text
+    from pkmcal.files import check_own_folder, json_text, resolved
     from pkmcal.judge.difference import difference
     from pkmcal.report.difference import outcome_of
 
@@ -48,7 +48,7 @@ def diff(
     folder = out or Path("diff")
     if out is None:
         if saved is not None:
-            beside, here = saved.path.resolve().parent.parent / "diff", Path.cwd()
+            beside, here = resolved(saved.path).parent.parent / "diff", Path.cwd()
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
         check_own_folder(folder, DIFFERENCE_FILES, "a difference")
     outcome = outcome_of(found)

@@ -58,10 +58,12 @@ def export(
 
 def _beside(calibration: str, to: str) -> Path:
     """Beside a calibration's folder, or here for a machine that is only a file or a name."""
+    from pkmcal.files import resolved
+
     path = Path(calibration)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
     if (folder / "calibration.json").is_file():
-        return folder.resolve().parent / f"export-{to}"
+        return resolved(folder).parent / f"export-{to}"
     return Path(f"export-{to}")
 
 

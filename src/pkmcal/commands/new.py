@@ -42,7 +42,7 @@ def new(
     ] = False,
     places: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, max=20, help="Places that the camera stands in. [1]"),
+        console.number("new", "places", "N", "Places that the camera stands in; 1."),
     ] = None,
     printer: Annotated[
         Path | None,

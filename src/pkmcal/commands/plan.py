@@ -36,7 +36,14 @@ def plan(
     out: Annotated[Path | None, console.folder("SESSION/plan, or plan, unless given.")] = None,
     configurations: Annotated[
         int,
-        typer.Option("-n", "--configurations", metavar="N", help="Configurations from each place."),
+        console.number(
+            "plan",
+            "configurations",
+            "N",
+            "Configurations from each place.",
+            "-n",
+            "--configurations",
+        ),
     ] = CONFIGURATIONS_A_CAPTURE,
     index: Annotated[
         Literal["tool", "D", "E", "O1"],
@@ -44,10 +51,10 @@ def plan(
     ] = "tool",
     places: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, max=12, help="Choose N places of the camera as well."),
+        console.number("plan", "places", "N", "Choose N places of the camera as well."),
     ] = None,
     best_of: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Choose N of the session's stations.")
+        int | None, console.number("plan", "best_of", "N", "Choose N of the session's stations.")
     ] = None,
     after: Annotated[
         Path | None,
@@ -82,13 +89,17 @@ def plan(
         ),
     ] = None,
     edge_noise: Annotated[
-        float, typer.Option(metavar="PX", help="Of an edge, where no photograph tells.")
+        float, console.number("plan", "edge_noise", "PX", "Of an edge, where no photograph tells.")
     ] = NOMINAL_EDGE_SIGMA,
     corner_noise: Annotated[
-        float, typer.Option(metavar="PX", help="Of a board's corner, where no photograph tells.")
+        float,
+        console.number(
+            "plan", "corner_noise", "PX", "Of a board's corner, where no photograph tells."
+        ),
     ] = NOMINAL_CORNER_SIGMA,
     joint_noise: Annotated[
-        float, typer.Option(metavar="M", help="Of a MACHINE: noise of a reading, m or rad.")
+        float,
+        console.number("plan", "joint_noise", "M", "Of a MACHINE: noise of a reading, m or rad."),
     ] = UNTOLD_READING_NOISE,
     seed: console.Seed = 0,
     as_json: console.Json = False,
@@ -101,9 +112,6 @@ def plan(
     from pkmcal.session.load import session_folder
     from pkmcal.simulation.demo import camera_of_size
 
-    console.check_positive("--edge-noise", edge_noise, 100)
-    console.check_positive("--corner-noise", corner_noise, 100)
-    console.check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
     files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}

@@ -24,9 +24,7 @@ def reproduce(
         list[Paper] | None,
         typer.Argument(metavar="[a|b|c]...", help="Which papers; all unless given."),
     ] = None,
-    runs: Annotated[
-        int, typer.Option(metavar="N", min=2, max=100_000, help="Simulated runs.")
-    ] = 100,
+    runs: Annotated[int, console.number("reproduce", "runs", "N", "Simulated runs.")] = 100,
     seed: console.Seed = 0,
     long: Annotated[
         bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")

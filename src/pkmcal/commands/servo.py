@@ -38,32 +38,37 @@ def servo(
         str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
     ] = None,
     runs: Annotated[
-        int, typer.Option(metavar="N", min=1, max=1000, help="Ways to go, of every estimate.")
+        int, console.number("servo", "runs", "N", "Ways to go, of every estimate.")
     ] = 60,
     gain: Annotated[
-        float, typer.Option(metavar="G", help="Part of the error corrected in a second.")
+        float, console.number("servo", "gain", "G", "Part of the error corrected in a second.")
     ] = 1.0,
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Images a second.")] = 25.0,
+    rate: Annotated[float, console.number("servo", "rate", "HZ", "Images a second.")] = 25.0,
     delay: Annotated[
-        int, typer.Option(metavar="N", min=0, max=50, help="Images from exposure to motion.")
+        int, console.number("servo", "delay", "N", "Images from exposure to motion.")
     ] = 1,
     noise: Annotated[
-        float, typer.Option(metavar="PX", min=0, help="Noise of an edge, shift and tilt.")
+        float, console.number("servo", "noise", "PX", "Noise of an edge, shift and tilt.")
     ] = 0.02,
     joint_noise: Annotated[
-        float, typer.Option(metavar="M", min=0, help="Noise of a reading, m or rad.")
+        float, console.number("servo", "joint_noise", "M", "Noise of a reading, m or rad.")
     ] = 3e-6,
     speed: Annotated[
-        float | None, typer.Option(metavar="V", help="Fastest drive, m/s or rad/s; no limit.")
+        float | None,
+        console.number("servo", "speed", "V", "Fastest drive, m/s or rad/s."),
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Seconds of a run; 10 / gain.")
+        float | None, console.number("servo", "duration", "S", "Seconds of a run; 10 / gain.")
     ] = None,
     hand_position: Annotated[
-        float, typer.Option(metavar="M", min=0, help="Error of the camera's place by hand, m.")
+        float,
+        console.number("servo", "hand_position", "M", "Error of the hand-placed camera, m."),
     ] = 0.03,
     hand_rotation: Annotated[
-        float, typer.Option(metavar="DEG", min=0, max=180, help="And of its direction, degrees.")
+        float,
+        console.number(
+            "servo", "hand_rotation", "DEG", "Error of the hand-placed camera's direction, degrees."
+        ),
     ] = 3.0,
     start: Annotated[
         str | None, typer.Option(metavar="POSE", help="x,y,z,rx,ry,rz of every run (m, rad).")
@@ -87,10 +92,6 @@ def servo(
     from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
-    console.check_positive("--gain", gain, 1000)
-    console.check_positive("--rate", rate, 10000)
-    console.check_positive("--speed", 1.0 if speed is None else speed, 1e6)
-    console.check_positive("--duration", 1.0 if duration is None else duration, 3600)
     loop = LoopSettings(
         law=law,
         gain=gain,

@@ -30,29 +30,29 @@ def simulate(
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of a photograph.")] = "800x600",
     stations: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Places of the camera.")
+        int, console.number("simulate", "stations", "N", "Places of the camera.")
     ] = 3,
     configurations: Annotated[
-        int, typer.Option(metavar="N", min=2, max=1000, help="Photographs from each place.")
+        int, console.number("simulate", "configurations", "N", "Photographs from each place.")
     ] = 15,
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
     repeats: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Photographs of each configuration.")
+        int, console.number("simulate", "repeats", "N", "Photographs of each configuration.")
     ] = 1,
     tolerance: Annotated[
         float,
-        typer.Option(metavar="X", min=0, help="True values' deviation, in tolerances."),
+        console.number("simulate", "tolerance", "X", "True values' deviation, in tolerances."),
     ] = 1.0,
     joint_noise: Annotated[
-        float, typer.Option(metavar="M", help="Noise of a reading, m or rad.")
+        float, console.number("simulate", "joint_noise", "M", "Noise of a reading, m or rad.")
     ] = 3e-6,
     noise: Annotated[
-        float, typer.Option(metavar="GREY", min=0, help="Noise of a pixel, grey levels.")
+        float, console.number("simulate", "noise", "GREY", "Noise of a pixel, grey levels.")
     ] = 0.9,
     blur: Annotated[
-        float, typer.Option(metavar="PX", min=0, help="Blur of the lens, pixels.")
+        float, console.number("simulate", "blur", "PX", "Blur of the lens, pixels.")
     ] = 0.6,
     board: Annotated[
         bool, typer.Option("--board", help="A board on the base, which joins the stations.")
@@ -90,7 +90,6 @@ def simulate(
     from pkmcal.simulation.demo import camera_of_size
     from pkmcal.simulation.rehearsal import rehearsal_of
 
-    console.check_positive("--joint-noise", joint_noise, 1)
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
     drawing = planned.machine if planned else load_mechanism(mechanism, label=None)

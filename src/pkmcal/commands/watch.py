@@ -22,7 +22,7 @@ def watch(
         ),
     ],
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
-    alpha: Annotated[float, typer.Option(metavar="P", help="Share of false alarms.")] = 0.01,
+    alpha: Annotated[float, console.number("watch", "alpha", "P", "Share of false alarms.")] = 0.01,
     same_place: Annotated[
         list[str] | None,
         typer.Option(
@@ -35,12 +35,10 @@ def watch(
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
     from pkmcal.files import check_own_folder
-    from pkmcal.judge.watch import check_alpha
     from pkmcal.judge.watch import watch_machine as run
     from pkmcal.report.watch import outcome_of
     from pkmcal.session.load import load_session
 
-    check_alpha(alpha)
     loaded = load_session(session)
     folder = out or loaded.folder / "watch"
     check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")

@@ -30,7 +30,7 @@ from pkmcal.files.quantities import (
     no_such,
     written_unit,
 )
-from pkmcal.files.regular import check_regular
+from pkmcal.files.regular import check_regular, resolved
 from pkmcal.files.schema import Schema, validated_document
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
@@ -82,6 +82,7 @@ __all__ = [
     "remember",
     "remembered",
     "remove_folder",
+    "resolved",
     "shown",
     "staged_file",
     "staged_folder",

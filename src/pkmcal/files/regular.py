@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from pathlib import Path
 
@@ -14,6 +15,13 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+def resolved(path: Path) -> Path:
+    """The absolute path with its links followed, as far as they lead: of a link that leads to
+    itself, the link. `Path.resolve` raises an error of its own kind there.
+    """
+    return Path(os.path.realpath(path))
 
 
 def check_regular(path: Path, label: str) -> None:

@@ -81,7 +81,7 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     then = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
         row["file"]: load_camera(saved.path.parent / written_camera(row["file"]))
-        for row in saved.document["cameras"]
+        for row in saved.document.get("cameras", ())
         if row.get("upside_down")
     }
     out: list[Station] = []

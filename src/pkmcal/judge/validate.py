@@ -29,6 +29,7 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
 
 VALIDATION_FORMAT = 1
@@ -99,6 +100,8 @@ def validate_calibration(
     """
     from threadpoolctl import threadpool_limits
 
+    check_number("validate", "regions", regions)
+    check_number("validate", "seed", seed)
     told = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()

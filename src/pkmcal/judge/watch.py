@@ -31,13 +31,13 @@ from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import check_new, known_rows, measured_new_data
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
+from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 WATCH_FORMAT = 1
 WATCH_ALPHA = 0.01
 """Share of machines that did not change that are flagged all the same."""
-LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "photographs, or poses, that were taken after the calibration",
@@ -118,7 +118,8 @@ def watch_machine(
     """
     from threadpoolctl import threadpool_limits
 
-    check_alpha(alpha)
+    check_number("watch", "alpha", alpha)
+    check_number("watch", "seed", seed)
     told = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
@@ -172,17 +173,6 @@ def _readings(saved: SavedCalibration, session: Session) -> float:
     statistics = saved.document.get("statistics") or {}
     alike = joints.get("noise") == session.joint_noise
     return float(statistics.get("reading_scale", 1.0)) if alike else 1.0
-
-
-def check_alpha(alpha: float) -> None:
-    """Raise `InputError` for a share of false alarms that makes no sense."""
-    if not LEAST_ALPHA <= alpha <= MOST_ALPHA:
-        raise InputError(
-            "this share of false alarms is not possible",
-            where="--alpha",
-            found=f"{alpha:g}",
-            expected=f"{LEAST_ALPHA:g} to {MOST_ALPHA:g}, such as {WATCH_ALPHA:g}",
-        )
 
 
 def names_of(session: Session) -> Names:

@@ -29,12 +29,18 @@ __all__ = [
     "MechanismDocument",
     "ParameterTable",
     "catalogue",
+    "check_plausible",
     "checked_machine",
     "load_mechanism",
     "machine_from_document",
     "mechanism_text",
     "with_exact_scales",
 ]
+
+
+LARGEST_DEVIATION_SHARE = 0.25
+"""Of a machine's size. The distance of two points that are each uncertain by more would be known to
+hardly more than its order; the tolerances of real drawings are a hundredth of it at most."""
 
 
 def catalogue() -> dict[str, Path]:
@@ -120,7 +126,28 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
             next_step="Write each length with its unit, such as 269.3 mm, or divide them by 1000;"
             " in a session also the camera's pose, and head the columns of joints.csv leg1 [mm]",
         )
+    for name in ("center", "offset", "radius", "arm"):
+        value = getattr(checked.tolerance, name)
+        check_plausible(value, machine, document.where(*keys, "tolerance", name), "a tolerance")
     return machine
+
+
+def check_plausible(value: float, machine: Machine, where: str, what: str) -> None:
+    """Raise InputError for a deviation, m, with which nothing would be known of a machine's size;
+    as a rule it was meant in millimetres. where : its place in a file. what : what it is called.
+    """
+    most = LARGEST_DEVIATION_SHARE * machine.size
+    if value <= most:
+        return
+    raise InputError(
+        f"{what} of the machine's own size tells nothing",
+        where=where,
+        found=f"{value:g} m",
+        expected=f"at most {most:.2g} m, a quarter of the machine's size",
+        next_step=f"Write it with its unit, such as {value:g} mm, or in metres"
+        if value <= 1e3 * most
+        else None,
+    )
 
 
 def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:

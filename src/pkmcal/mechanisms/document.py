@@ -165,17 +165,21 @@ class Leg(Schema):
     tubes: tuple[Tube, ...] = ()
 
 
+TOLERANCE_RANGE = Field(ge=1e-12)
+"""m; nothing is made better, and it would be exact. The most depends on the machine's size."""
+
+
 class DrawingTolerance(Schema):
     """Standard deviations of the drawing's values, metres; of axes and angles, radians; of scales,
     parts of one, where 0 is exact.
     """
 
-    center: Annotated[Metres, Field(gt=0)] = 0.002
-    offset: Annotated[Metres, Field(gt=0)] = 0.002
-    radius: Annotated[Metres, Field(gt=0)] = 0.0001
-    axis: Annotated[Radians, Field(gt=0, lt=1)] = 0.005
-    arm: Annotated[Metres, Field(gt=0)] = 0.001
-    angle: Annotated[Radians, Field(gt=0, lt=1)] = 0.02
+    center: Annotated[Metres, TOLERANCE_RANGE] = 0.002
+    offset: Annotated[Metres, TOLERANCE_RANGE] = 0.002
+    radius: Annotated[Metres, TOLERANCE_RANGE] = 0.0001
+    axis: Annotated[Radians, Field(ge=1e-12, lt=1)] = 0.005
+    arm: Annotated[Metres, TOLERANCE_RANGE] = 0.001
+    angle: Annotated[Radians, Field(ge=1e-12, lt=1)] = 0.02
     scale: Annotated[Share, Field(ge=0, lt=0.1)] | None = None
 
 

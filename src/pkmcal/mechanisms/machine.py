@@ -144,6 +144,29 @@ class Machine:
         """The same machine with other parameter values (P,)."""
         return replace(self, values=np.array(values, dtype=float))
 
+    @cached_property
+    def size(self) -> float:
+        """The largest of its lengths, coordinates and readings' ranges, m."""
+        lengths = self.values[np.array(self.parameters.units) == "m"]
+        ranges = self.joint_ranges[np.array(self.joint_units) == "m"].ravel()
+        home = self.document.home.position if self.document.home else ()
+        each = np.abs(np.concatenate([lengths, ranges[np.isfinite(ranges)], home]))
+        return float(each.max(initial=0.0))
+
+    def check_free(self, where: str) -> None:
+        """Raise InputError where nothing is left to be estimated but radii, which move nothing.
+
+        where : the mechanism file's field, for the message.
+        """
+        if any(self.parameters.kinds[k] != "radius" for k in self.parameters.first_of_free()):
+            return
+        raise InputError(
+            "every parameter that moves the platform is fixed, so there is nothing to calibrate",
+            where=where,
+            expected="at least one that is free",
+            next_step="Remove names under fixed in the mechanism file",
+        )
+
     def base_centers(self) -> Array:
         """Limbs' ends on the base side, (L, 3) m, base frame: joint centres, or, where a crank
         or slider moves them, where they are at mid-range.

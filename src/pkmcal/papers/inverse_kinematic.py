@@ -255,6 +255,12 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
             next_step="observe: board at a station, or use the method bundle",
         )
     poses = poses.select(rows)
+    if poses.rows.min() < 6:
+        raise InputError(
+            what="the inverse-kinematic method needs whole poses",
+            found="points or heights, which tell no rotation",
+            next_step="measure rotations as well, or use the method bundle",
+        )
     problem, state = pose_problem(
         machine,
         replace(measurements, poses=poses),

@@ -85,7 +85,14 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
 
     Its covariance is that of the equations, with the drawing's tolerances where nothing else is
     known: platform joints that were not measured are no better known for being left alone.
+    Raises ResultError without edges of legs, and where a station sees too few of them.
     """
+    if not len(measurements.edges):
+        raise ResultError(
+            what="the linear solution needs photographs of the legs, and no edge of one was"
+            " measured",
+            next_step="photograph the legs, or use the joint method (bundle)",
+        )
     base = base_together(machine, measurements)
     poses = machine.with_values(base.theta).forward_result(measurements.joints, machine.home())
     state = with_boards(measurements, base.theta, base.T_camera_base, poses.T_base_platform)

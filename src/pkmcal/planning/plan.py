@@ -31,6 +31,7 @@ from pkmcal.planning.information import CandidateRows, Candidates, information_o
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import length, motor_distances, shortest_way
 from pkmcal.planning.subject import Subject
+from pkmcal.ranges import check_number
 from pkmcal.simulation.placement import StationPlace, usable
 
 PLAN_CANDIDATES = 400
@@ -179,14 +180,14 @@ def plan_measurements(
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
+    rig.machine.check_free("fixed")
     if index not in PLAN_INDICES:
         raise InputError(
             "there is no such index", where="--index", found=index, expected=", ".join(PLAN_INDICES)
         )
-    if count < 2:
-        raise InputError(
-            "a plan needs two configurations or more", where="--configurations", found=str(count)
-        )
+    check_number("plan", "configurations", count, "--configurations")
+    check_number("plan", "places", free_places, "--places")
+    check_number("plan", "best_of", best_of, "--best-of")
     if rig.machine.layout.n_internal:
         raise InputError(
             f"mechanism {rig.machine.name!r} has side bars that turn on hinges, and how far they"

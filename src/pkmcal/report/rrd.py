@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError
-from pkmcal.files import check_writable, staged_file
+from pkmcal.files import check_writable, resolved, staged_file
 from pkmcal.report.recording import Logged, recorded
 from pkmcal.wording import install_step
 
@@ -55,7 +55,7 @@ def write_rrd(calibration: Calibration, path: Path | str) -> None:
     stream = rr.RecordingStream(RERUN_APPLICATION)
     with staged_file(path) as part:
         stream.save(part, default_blueprint=_blueprint(session.station_names))
-        stream.send_recording_name(session.folder.resolve().name)
+        stream.send_recording_name(resolved(session.folder).name)
         for one in recorded(calibration):
             what = _archetype(rr, one)
             if one.at is not None:

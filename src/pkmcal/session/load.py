@@ -6,6 +6,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,13 +33,14 @@ from pkmcal.files import (
     no_such,
     read_csv,
     read_yaml,
+    resolved,
     shown,
     validated_document,
     wanted_file,
     written_unit,
 )
 from pkmcal.geometry.rigid import pose
-from pkmcal.mechanisms import Machine, catalogue, load_mechanism
+from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
@@ -142,12 +144,12 @@ class Session:
             count(len(self.station_names), "station"),
             count(self.images_taken, "photograph"),
         )
-        return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
+        return f"<Session {resolved(self.folder).name}: {self.machine.name}, {', '.join(parts)}>"
 
     @property
     def called(self) -> str:
         """``session mine`` by its folder, or by the one around it where it is called session."""
-        folder = self.folder.resolve()
+        folder = resolved(self.folder)
         return f"session {(folder if folder.name != 'session' else folder.parent).name}"
 
     @property
@@ -281,6 +283,8 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     if measured:
         _check_paths(document, schema, table)
     _check_distinct(document, stations)
+    _check_tables_distinct(folder, document, schema)
+    _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and schema.stations:
         warnings += _unphotographed(table, stations, tuple(trackers))
@@ -577,10 +581,11 @@ def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
 
 def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
     """The same photographs under two stations are a line copied and not changed."""
-    owners: dict[tuple[Path, str], str] = {}
+    owners: dict[tuple[str, str], str] = {}
     for station in stations:
         for photo in station.photographs:
-            others = {owners.setdefault((photo.path, w), station.name) for w in station.observe}
+            path = os.path.realpath(photo.path)
+            others = {owners.setdefault((path, w), station.name) for w in station.observe}
             for other in others - {station.name}:
                 raise InputError(
                     f"station {station.name} has the photographs of station {other}",
@@ -588,6 +593,33 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                     found=photo.path.name,
                     expected="its own photographs; a station is one camera in one place",
                 )
+
+
+def _check_tables_distinct(folder: Path, document: Document, schema: SessionDocument) -> None:
+    """The same table under two stations would be measured twice."""
+    owners: dict[str, str] = {}
+    for name, station in schema.trackers.items():
+        table = station.tracker.poses
+        other = owners.setdefault(os.path.realpath(folder / table), name)
+        if other != name:
+            raise InputError(
+                f"station {name} has the table of station {other}",
+                where=document.where("stations", name, "tracker", "poses"),
+                found=table,
+                expected="its own table; a station is one instrument in one place",
+            )
+
+
+def _check_noise(document: Document, schema: SessionDocument, machine: Machine) -> None:
+    """Raise InputError for a noise in metres that is no smaller than the machine's parts."""
+    places: list[tuple[tuple[str, ...], float]] = [
+        (("stations", name, "tracker", "noise", "position"), station.tracker.noise.position)
+        for name, station in schema.trackers.items()
+    ]
+    if "m" in machine.joint_units:
+        places.append((("joints", "noise"), schema.joints.noise))
+    for keys, value in places:
+        check_plausible(value, machine, document.where(*keys), "a standard deviation")
 
 
 def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
-from pkmcal.errors import InputError
+from pkmcal.ranges import check_number
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import StudyProgress, StudyResult, batches, run_all
@@ -227,8 +227,8 @@ def study(
         vary = [f"{name}={','.join(map(str, values))}" for name, values in each.items()]
     elif isinstance(vary, str):
         vary = [vary]
-    if runs < 2:
-        raise InputError("a study needs two runs at least", found=str(runs))
+    check_number("study", "runs", runs)
+    check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
     begun = subject_of(subject)
     varied = parsed(begun, vary)

@@ -7,7 +7,7 @@ from threading import Lock
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import with_numbers, write_bytes
+from pkmcal.files import resolved, with_numbers, write_bytes
 from pkmcal.session.load import SESSION_FILE_NAME, Station
 from pkmcal.view.overlay import place_of
 
@@ -16,7 +16,7 @@ class PoseFile:
     """session.yaml as it was read when the page was opened, and written since."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = (folder / SESSION_FILE_NAME).resolve()
+        self._path = resolved(folder / SESSION_FILE_NAME)
         self._known = self._path.read_bytes()
         self._lock = Lock()
 

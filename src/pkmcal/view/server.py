@@ -9,7 +9,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import json_value
+from pkmcal.files import json_value, resolved
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
 from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
@@ -169,7 +169,7 @@ def view_page_html(viewed: Viewed) -> str:
     ]
     template = environment().from_string(_template("view.html.j2"))
     return template.render(
-        name=session.folder.resolve().name,
+        name=resolved(session.folder).name,
         folder=session.folder,
         n_legs=session.machine.n_legs,
         stations=stations,

@@ -1,0 +1,118 @@
+"""Every numeric option of every command, and every number of the public functions, has a range."""
+
+import inspect
+from importlib import import_module
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+from typer.models import ArgumentInfo
+
+import pkmcal
+from conftest import run
+from pkmcal.commands.cli import COMMANDS_IN_ORDER
+from pkmcal.errors import InputError
+from pkmcal.ranges import RANGES, Range, check_number
+from pkmcal.simulation import Sensor
+
+
+def options():
+    """(command, name, flag, default, whether it is required) of every option and argument."""
+    for command in COMMANDS_IN_ORDER:
+        function = getattr(import_module(f"pkmcal.commands.{command}"), command)
+        hints = get_type_hints(function, include_extras=True)
+        for name, parameter in inspect.signature(function).parameters.items():
+            kind, *_ = get_args(hints[name])
+            kinds = {kind, *get_args(kind)}
+            flags = getattr(hints[name].__metadata__[0], "param_decls", None)
+            flag = flags[-1] if flags else f"--{name.replace('_', '-')}"
+            yield command, name, flag, kinds, hints[name].__metadata__[0], parameter.default
+
+
+OPTIONS = [(command, name, flag) for command, name, flag, kinds, *_ in options()
+           if kinds & {int, float}]  # fmt: skip
+BAD = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", str(10**9), str(10**30), "x", "")
+
+
+def arguments(command):
+    """Words for what a command needs; none of it is there."""
+    words = []
+    for owner, _, flag, _, info, default in options():
+        if owner == command and default is inspect.Parameter.empty:
+            words += ["no-such"] if isinstance(info, ArgumentInfo) else [flag, "c"]
+    return words
+
+
+def test_every_numeric_option_is_in_the_table():
+    assert len(OPTIONS) > 35
+    assert {(command, name) for command, name, _ in OPTIONS} <= {
+        (command, name) for command, each in RANGES.items() for name in each
+    }
+    for command, name, _, kinds, _, default in options():
+        if kinds & {int, float} and default is not inspect.Parameter.empty:
+            check_number(command, name, default)
+
+
+@pytest.mark.parametrize(("command", "name", "flag"), OPTIONS)
+def test_options_out_of_their_range_are_refused_first(command, name, flag):
+    allowed = RANGES[command][name]
+    for text in BAD:
+        try:
+            value = float(text)
+        except ValueError:
+            value = np.nan
+        if allowed.least <= value <= allowed.most and not (
+            allowed.above and value == allowed.least
+        ):
+            continue
+        done = run(command, *arguments(command), f"{flag}={text}")
+        assert done.code == 2
+        assert flag in done.err
+        assert "defect" not in done.err
+
+
+def test_ends_of_a_range_belong_to_it_unless_it_begins_above():
+    Range(0, 2).check(0, "x")
+    Range(0, 2).check(np.float64(2), "x")
+    Range(0, 2, whole=True).check(np.int64(2), "x")
+    for allowed, value in (
+        (Range(0, 2, above=True), 0), (Range(0, 2), 2.1), (Range(0, 2), np.nan), (Range(0, 2), "1"),
+        (Range(0, 2), True), (Range(0, 2), None), (Range(0, 2, whole=True), 1.5),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            allowed.check(value, "x")
+        assert caught.value.where == "x"
+
+
+ODD = (np.nan, np.inf, -np.inf, -1, 1e308, 10**12, "1", True, [1])
+
+
+@pytest.mark.parametrize("value", ODD, ids=repr)
+@pytest.mark.parametrize("name", [n for n in RANGES["simulate"] if n not in ("noise", "blur")])
+def test_numbers_of_simulate(tmp_path, name, value):
+    if RANGES["simulate"][name].least == 0 and name == "seed" and value == 10**12:
+        return
+    given = [value, 0.0] if name == "shake" else value
+    if name == "stations" and isinstance(value, str | list):
+        return  # where they stand
+    with pytest.raises(InputError):
+        pkmcal.simulate(tmp_path / "x", "3-rpr", **{name: given})
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1e308])
+@pytest.mark.parametrize("name", ["blur", "read_noise"])
+def test_numbers_of_a_sensor(tmp_path, name, value):
+    with pytest.raises(InputError, match="cannot be used"):
+        pkmcal.simulate(tmp_path / "x", "3-rpr", sensor=Sensor(**{name: value}))
+
+
+@pytest.mark.parametrize("value", [np.nan, -1, 10**12, 2.5, "3", True], ids=repr)
+def test_numbers_of_the_other_functions(tmp_path, value):
+    for call in (
+        lambda: pkmcal.calibrate(tmp_path, holdout=value),
+        lambda: pkmcal.plan("3-rpr", count=value),
+        lambda: pkmcal.study("3-rpr", runs=value),
+    ):
+        with pytest.raises(InputError, match="cannot be used"):
+            call()
