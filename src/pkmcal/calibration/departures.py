@@ -8,23 +8,37 @@ measurements and in which words it is told; here they are put together and teste
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.model_errors import (
+    ModelError,
+    discrepancy_components,
+    model_errors,
+    with_discrepancy,
+)
 from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import Information
+from pkmcal.identify.discrepancy import discrepancy_of, no_discrepancy
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import MOST_DEPARTURES_SOUGHT, Departures, Freed, Score
+from pkmcal.identify.score import (
+    MOST_DEPARTURES_SOUGHT,
+    Departures,
+    Freed,
+    RandomEffects,
+    Score,
+)
 from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
-from pkmcal.mechanisms.closure import scales
+from pkmcal.mechanisms.closure import scales as scales_of
 from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
@@ -80,20 +94,34 @@ class Departed:
         return f"{self.what}; {moves}, {self.tool:.2g} standard deviations. {self.todo}."
 
 
-def unmodelled_departures(
+class Unmodelled(NamedTuple):
+    """What the data show that the model does not have.
+
+    departures : violations that have a name, the surest first. errors : components of the model
+    discrepancy beside them. estimate : whose covariance contains the discrepancy.
+    """
+
+    departures: tuple[Departed, ...]
+    errors: tuple[ModelError, ...]
+    estimate: Estimate
+
+
+def unmodelled(
     session: Session,
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
     ended: tuple[Assembled, Information],
-) -> tuple[Departed, ...]:
-    """What the data show that the model does not have, the surest first.
+) -> Unmodelled:
+    """What the data show that the model does not have.
 
-    ended : the estimate's problem at its end, :func:`pkmcal.identify.bundle.as_ended`.
+    A violation is named only if it explains more than the discrepancy does: what is found at first
+    is tested once more beside the discrepancy. ended : the estimate's problem at its end,
+    :func:`pkmcal.identify.bundle.as_ended`.
     """
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     layout = estimate.machine.layout
-    present = scales(layout, estimate.machine.values) / scales(
+    present = scales_of(layout, estimate.machine.values) / scales_of(
         layout, session.machine.parameters.drawing
     )
     first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
@@ -113,35 +141,62 @@ def unmodelled_departures(
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    tests = Departures(*ended, [one.effect for one in listed], number.tolist(), singles=True)
     known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    found = [*tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known]), *known]
+    seen = np.flatnonzero(ended[0].seen)
+
+    def declared(k: int) -> Departure:
+        if k < len(listed):
+            return listed[k]
+        row, m = divmod(k - len(listed), len(columns))
+        wrong = readings.wrong_reading(columns[m], units[m], session.configurations[seen[row]])
+        one = np.zeros((*measurements.joints.shape, 1))
+        one[seen[row], m] = 1.0
+        return replace(wrong, effect=Effect(readings=one))
+
+    def tested(beside: RandomEffects | None) -> tuple[Departures, list[tuple[int, Score]]]:
+        effects = [one.effect for one in listed]
+        tests = Departures(*ended, effects, number.tolist(), singles=True, beside=beside)
+        found = tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known])
+        return tests, [*found, *known]
+
+    tests, found = tested(None)
+    discrepancy = no_discrepancy(ended[1])
+    if not only_heights(estimate):
+        scales = estimate.statistics.reading_scale, estimate.statistics.pose_scale
+        discrepancy = discrepancy_of(
+            *ended,
+            discrepancy_components(measurements, estimate),
+            [declared(k).effect for k, _ in found],
+            scales,
+        )
+    if discrepancy.found and found:
+        tests, found = tested(discrepancy.random)
+    before = tool_of(session, estimate)
+    estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
+    tool = tool_of(session, estimate) if discrepancy.found else before
+    errors = model_errors(discrepancy, tool, before, units[0])
     if not found:
-        return ()
-    used = estimate.configurations
-    machine = estimate.machine
-    tool = tool_error(
+        return Unmodelled((), errors, estimate)
+    fits = tests.fitted([k for k, _ in found])
+    last = len(fits) - len(tubes)
+    fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    departures = tuple(
+        _departed(declared(k), score, fit, tool)
+        for (k, score), fit in zip(found, fits, strict=True)
+    )
+    return Unmodelled(departures, errors, estimate)
+
+
+def tool_of(session: Session, estimate: Estimate) -> ToolError:
+    """The tool at the session's poses."""
+    used, machine = estimate.configurations, estimate.machine
+    return tool_error(
         session.machine,
         machine,
         free_of_gauge(machine, estimate.covariance),
         estimate.state.T_base_platform[used],
         session.joints[used],
         legs_seen=estimate.edge_weights.size > 0,
-    )
-
-    def declared(k: int) -> Departure:
-        if k < len(listed):
-            return listed[k]
-        row, m = divmod(k - len(listed), len(columns))
-        name = session.configurations[np.flatnonzero(ended[0].seen)[row]]
-        return readings.wrong_reading(columns[m], units[m], name)
-
-    fits = tests.fitted([k for k, _ in found])
-    last = len(fits) - len(tubes)
-    fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
-    return tuple(
-        _departed(declared(k), score, fit, tool)
-        for (k, score), fit in zip(found, fits, strict=True)
     )
 
 

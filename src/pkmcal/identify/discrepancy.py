@@ -1,0 +1,343 @@
+"""Model discrepancy: what the model leaves out, as random effects with estimated scales.
+
+A *component* is a family of functions that could be missing from the model: errors of the readings
+that vary smoothly over the workspace, say. Each function is a column G of derivatives of all rows,
+in standard deviations, and its coefficient is random, ``w ~ N(0, s^2 L L^T)`` with a known L.
+
+Evidence
+--------
+With J the Jacobian at the solution, r its residuals and ``H = (I - J J^+) G`` what the unknowns
+leave of the columns, ``h = H^T r`` and ``M = H^T H``,
+
+    h ~ N(0, M + s^2 M L L^T M)
+
+so s has a likelihood of its own, the restricted one (Patterson and Thompson 1971). A component is
+believed where its likelihood ratio is beyond what chance gives at a level that all components
+share; half of a chi-square variable of one degree of freedom, since s cannot be negative (Self and
+Liang 1987). Components are taken up one after the other, the one with the largest ratio first, each
+beside those before it, and beside the model violations that have names.
+
+Where the estimate has enlarged the noise of readings or poses, the discrepancy may be what enlarged
+it: the two are compared by the restricted likelihood of both, and a component of the readings, or
+poses, needs no further evidence, for that something is left out is known already.
+
+Covariance
+----------
+The discrepancy has moved the unknowns by ``J^+ G w``. With m and C the mean and the covariance of w
+given the data, the mean square of that is
+
+    J^+ G (m m^T + C) (J^+ G)^T
+
+and is added to the unknowns' covariance. Functions that the data see count as they are seen. Those
+that the unknowns absorb keep the scale that the visible ones have (Kennedy and O'Hagan 2001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.assembly import Assembled
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside, shared_basis
+from pkmcal.measurements import Effect
+from pkmcal.solver.elimination import divisions
+from pkmcal.solver.ranks import normal_root
+
+
+@dataclass(frozen=True)
+class DiscrepancyOptions:
+    """Constants of the search.
+
+    false_alarm : chance at which any component is found where there is none. noise_factors :
+    factors tried on an enlarged noise, from what was stated to what is in use. most : components
+    taken up at most. scales : tried for each component. rank : share of the largest squared column
+    below which nothing is left of one.
+    """
+
+    false_alarm: float = 0.005
+    noise_factors: int = 5
+    most: int = 4
+    scales: int = 121
+    rank: float = 1e-10
+
+
+@dataclass(frozen=True)
+class Component:
+    """A family of functions with one scale.
+
+    code : for programs. effect : what the k functions do to the measurements. roots : the L (k, l)
+    to choose from, of functions with a mean square of one over the session's configurations.
+    inflates : kind of rows whose noise such an error enlarges, as READING_ROWS_KIND.
+    """
+
+    code: str
+    effect: Effect
+    roots: tuple[Array, ...]
+    inflates: int | None = None
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
+    logarithm of the likelihood ratio against no such component.
+    """
+
+    code: str
+    scale: float
+    ratio: float
+    root: Array
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What the data show of the components.
+
+    found : those, the surest first. shared : (na, na) what is added to the covariance of the
+    shared unknowns. random : the found components' effects.
+    """
+
+    found: tuple[Scaled, ...]
+    shared: Array
+    random: RandomEffects
+
+
+@dataclass(frozen=True)
+class _Products:
+    """Products of the columns that the unknowns leave: squared (c, c) M, value (c,) h; gain (na, c)
+    J^+ G of the shared unknowns. whole : (c, c) of the columns themselves. likelihood : restricted,
+    without any component.
+    """
+
+    squared: Array
+    value: Array
+    gain: Array
+    whole: Array
+    likelihood: float
+
+    def beside(self, fixed: slice) -> _Products:
+        """The same beside columns whose coefficients are free."""
+        half = normal_root(self.squared[fixed, fixed], 1e-12, loose=False)
+        across = self.squared[:, fixed] @ half
+        return replace(
+            self,
+            squared=self.squared - across @ across.T,
+            value=self.value - across @ (half.T @ self.value[fixed]),
+        )
+
+
+def no_discrepancy(info: Information) -> Discrepancy:
+    """None at all."""
+    na = info.problem.unknowns.count
+    return Discrepancy((), np.zeros((na, na)), RandomEffects((), np.zeros((0, 0))))
+
+
+def discrepancy_of(
+    assembled: Assembled,
+    info: Information,
+    components: Sequence[Component],
+    named: Sequence[Effect] = (),
+    enlarged: tuple[float, float] = (1.0, 1.0),
+    options: DiscrepancyOptions = DiscrepancyOptions(),  # noqa: B008
+) -> Discrepancy:
+    """The discrepancy at a solution; the problem's first run.
+
+    named : effects of the model violations that were found otherwise. enlarged : factors in use on
+    the stated noise of the readings and of the poses.
+    """
+    effects = [*(one.effect for one in components), *named]
+    ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
+    parts = [slice(*ends[k : k + 2]) for k in range(len(components))]
+    fixed = slice(ends[len(components)], ends[-1])
+    at_solution = _products(assembled, info, effects)
+    kinds = (READING_ROWS_KIND, POSE_ROWS_KIND)
+    kind, factor = max(zip(kinds, enlarged, strict=True), key=lambda pair: pair[1])
+    tried = [at_solution.beside(fixed)]
+    if factor > 1:
+        for share in np.geomspace(1 / factor, 1, options.noise_factors)[:-1].tolist():
+            other = _with_noise(assembled, kind, share)
+            tried.append(_products(other, Information(other.problem, info.state), effects))
+            tried[-1] = tried[-1].beside(fixed)
+    without = max(one.likelihood for one in tried)
+    best: tuple[float, _Search] | None = None
+    for products in tried:
+        search = _Search(products, components, parts, options)
+        search.run(kind if factor > 1 else None)
+        if best is None or products.likelihood + search.gain > best[0]:
+            best = products.likelihood + search.gain, search
+    if best is None or not best[1].found or best[0] <= without:
+        return no_discrepancy(info)
+    search = best[1]
+    # scales by the noise that fits best, gains by the weights with which the estimate was made
+    gain = at_solution.gain[:, : fixed.start] @ search.root
+    spread = gain @ search.second_moment @ gain.T
+    every = tuple(one.effect for one in components)
+    return Discrepancy(tuple(search.found), spread, RandomEffects(every, search.root))
+
+
+class _Search:
+    """Components taken up one after the other.
+
+    root : (c, l) prior root of all columns that are taken up. gain : of the log likelihood.
+    """
+
+    def __init__(
+        self,
+        products: _Products,
+        components: Sequence[Component],
+        parts: Sequence[slice],
+        options: DiscrepancyOptions,
+    ) -> None:
+        self.products, self.components, self.parts = products, components, parts
+        self.options = options
+        self.found: list[Scaled] = []
+        self.gain = 0.0
+        self.root = np.zeros((parts[-1].stop if parts else 0, 0))
+
+    def run(self, enlarged: int | None) -> None:
+        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        from scipy.special import chdtri
+
+        level = self.options.false_alarm / max(len(self.components), 1)
+        beyond = float(chdtri(1.0, 2 * level))
+        while len(self.found) < self.options.most:
+            squared, value = self._left()
+            taken = {one.code for one in self.found}
+            best: Scaled | None = None
+            for one, part in zip(self.components, self.parts, strict=True):
+                if one.code in taken:
+                    continue
+                for root in one.roots:
+                    scale, ratio = self._scale(
+                        root.T @ squared[part, part] @ root,
+                        root.T @ value[part],
+                        root.T @ self.products.whole[part, part] @ root,
+                    )
+                    least = 0.0 if one.inflates == enlarged and enlarged is not None else beyond
+                    if ratio > least and (best is None or ratio > best.ratio):
+                        best = Scaled(one.code, scale, ratio, root)
+            if best is None:
+                return
+            self.found.append(best)
+            self.gain += best.ratio / 2
+            (k,) = (k for k, one in enumerate(self.components) if one.code == best.code)
+            more = np.zeros((len(self.root), best.root.shape[1]))
+            more[self.parts[k]] = best.scale * best.root
+            self.root = np.concatenate([self.root, more], axis=1)
+
+    def _left(self) -> tuple[Array, Array]:
+        """M and h of all columns beside the noise that the taken ones are."""
+        n = len(self.root)
+        squared, value = self.products.squared[:n, :n], self.products.value[:n]
+        across = squared @ self.root
+        inverse = self._posterior
+        return squared - across @ inverse @ across.T, value - across @ (
+            inverse @ (self.root.T @ value)
+        )
+
+    @property
+    def _posterior(self) -> Array:
+        """(l, l) covariance of the taken coefficients, in their prior deviations."""
+        n = len(self.root)
+        information = self.root.T @ self.products.squared[:n, :n] @ self.root
+        return np.linalg.inv(np.eye(len(information)) + information)
+
+    @property
+    def second_moment(self) -> Array:
+        """(l, l) mean square of the taken coefficients given the data, in prior deviations."""
+        covariance = self._posterior
+        mean = -covariance @ (self.root.T @ self.products.value[: len(self.root)])
+        return np.outer(mean, mean) + covariance
+
+    def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
+        """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
+        m, vectors = np.linalg.eigh((squared + squared.T) / 2)
+        seen = m > self.options.rank * float(np.trace(whole))
+        m, z = m[seen], vectors[:, seen].T @ value
+        if not m.size:
+            return 0.0, 0.0
+        # from where the best seen function is hardly seen to where the least seen one is all
+        square = np.geomspace(1e-3 / m[-1], max(1e3 / m[0], 1e-2 / m[-1]), self.options.scales)
+        load = square[:, None] * m
+        ratio = np.sum(z**2 / m * load / (1 + load) - np.log1p(load), axis=1)
+        best = int(np.argmax(ratio))
+        return (float(np.sqrt(square[best])), float(ratio[best])) if ratio[best] > 0 else (0.0, 0.0)
+
+
+def _with_noise(assembled: Assembled, kind: int, factor: float) -> Assembled:
+    """The problem with the noise of readings, or poses, times a factor."""
+    problem = assembled.problem
+    if kind == READING_ROWS_KIND:
+        problem = replace(problem, joint_noise=problem.joint_noise * factor)
+    else:
+        poses = problem.pose_data
+        problem = replace(problem, pose_data=replace(poses, weight=poses.weight / factor**2))
+    return replace(assembled, problem=problem)
+
+
+def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]) -> _Products:
+    """Products of the effects' columns, and the restricted likelihood without them."""
+    problem, basis = assembled.problem, shared_basis(info)
+    columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
+    n, count = sum(effect.count for effect in effects), problem.unknowns.count
+    squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
+    known, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
+    for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+        linear = piece.linear
+        rows, residuals = eliminated_beside(linear, columns(cut, linear))
+        own, extra = rows[..., :count] @ basis, rows[..., count:].reshape(-1, n)
+        own, residuals = own.reshape(-1, basis.shape[1]), residuals.ravel()
+        if not cut.start:
+            own = np.concatenate([own, linear.shared_by @ basis])
+            extra = np.pad(extra, ((0, len(linear.shared_by)), (0, 0)))
+            residuals = np.append(residuals, linear.shared_value[0])
+        squared += extra.T @ extra
+        by_basis += extra.T @ own
+        value += extra.T @ residuals
+        known += own.T @ residuals
+        left += float(residuals @ residuals)
+        diagonal = np.einsum("bkii->bki", piece.reduced.r)
+        own_scale += float(np.sum(np.log(np.maximum(np.abs(diagonal), 1e-300))))
+    # of the restricted likelihood: the noise's own scale, then the unknowns', then the residuals
+    scale = own_scale + _log_scale(info) + _log_noise(assembled)
+    return _Products(
+        squared - by_basis @ by_basis.T,
+        value - by_basis @ known,
+        basis @ by_basis.T,
+        squared,
+        -scale - (left - float(known @ known)) / 2,
+    )
+
+
+def _log_scale(info: Information) -> float:
+    """Half of the logarithm of the determinant of the shared unknowns' information, where known."""
+    rows = info.rows[0][0]
+    length = np.linalg.norm(rows, axis=0)
+    used = length > 0
+    s = np.linalg.svd(rows[:, used] / length[used], compute_uv=False)
+    s = s[s > 1e-12 * s[0]]
+    return float(np.sum(np.log(s)) + np.sum(np.log(length[used])))
+
+
+def _log_noise(assembled: Assembled) -> float:
+    """Logarithm of the noise of all readings and poses, up to a constant."""
+    problem = assembled.problem
+    readings = problem.blocks.present.shape[0] * problem.layout.n_readings
+    out = readings * float(np.log(problem.joint_noise[0]))
+    kind = problem.kinds.poses
+    used = kind.present & (kind.weight[0] > 0)
+    return out - float(np.sum(0.5 * kind.count[used] * np.log(kind.weight[0][used])))
+
+
+def _as_motion(assembled: Assembled, effect: Effect) -> Effect:
+    """A station that stands elsewhere from some configuration on, as a motion by configuration."""
+    if effect.station is None:
+        return effect
+    unknowns = assembled.problem.unknowns
+    motion = np.zeros((unknowns.n_stations, len(assembled.seen), 6, 6))
+    motion[effect.station, effect.since :] = np.eye(6)
+    return Effect(motion=motion)
