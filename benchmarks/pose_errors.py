@@ -67,7 +67,8 @@ class Deformed:
 
     readings : (K, m) added to what is read. base : (K, 4, 4) motion of the base against the stations.
     camera : (K, 6) motion of the first station, left perturbation. bend : (K, L, n, 3) m,
-    displacement of the axis of each leg at n places from A to B, base frame. radius : (L, n) m.
+    displacement of the axis of each leg at n places from A to B, base frame. radius : (L, n) m. lens :
+    by station, true intrinsics over the stated ones.
     """
 
     readings: np.ndarray
@@ -75,6 +76,7 @@ class Deformed:
     camera: np.ndarray
     bend: np.ndarray
     radius: np.ndarray
+    lens: dict[int, dict[str, float]] = field(default_factory=dict)
 
 
 class Scene(NamedTuple):
@@ -237,6 +239,17 @@ def creeping(metres: float) -> Error:
     return make
 
 
+def lens(stations: range, **factors: float) -> Error:
+    """Stations whose true intrinsics are others than their file's, by factors."""
+
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+        way = rng.choice([-1, 1])
+        for k in stations:
+            d.lens[k] = {name: 1 + way * (x - 1) for name, x in factors.items()}
+
+    return make
+
+
 def _bow(d: Deformed) -> np.ndarray:
     t = np.linspace(0, 1, d.bend.shape[2])
     return 4 * t * (1 - t)
@@ -262,6 +275,14 @@ ERRORS: dict[str, tuple[Error, tuple[str, ...]]] = {
     "base tilts by .3 mrad": (flex(3e-4), ("legs", "poses")),
     "station creeps by .3 mm": (creeping(3e-4), ("legs", "poses")),
 }
+"""Errors that depend on the pose, or on time, and who observes them."""
+LENSES: dict[str, tuple[Error, tuple[str, ...]]] = {
+    "pixel aspect .3 %": (lens(range(STATIONS), fx=1.0015, fy=0.9985), ("legs",)),
+    "focal .3 % at one station": (lens(range(1), fx=1.003, fy=1.003), ("legs",)),
+    "centre .5 % at one station": (lens(range(1), cx=1.005), ("legs",)),
+}
+"""Lenses that are not as their file says."""
+ERRORS |= LENSES
 
 
 class Made(NamedTuple):
@@ -309,7 +330,10 @@ def made(error: str, observer: str, seed: int, folder: Path) -> Made:
         T = truth.T_camera_base[s] @ d.base[rows]
         if s == 0:
             T = perturb(T, d.camera[rows])
-        edges, pixels = edges_of(camera, scene, d, T, rows, rng)
+        factors = [d.lens.get(s, {}).get(name, 1.0) for name in ("fx", "fy", "cx", "cy")]
+        rest = np.ones(len(camera.parameters) - 4)
+        true = replace(camera, parameters=camera.parameters * np.append(factors, rest))
+        edges, pixels = edges_of(camera, true, scene, d, T, rows, rng)
         sets.append(replace(edges, station=np.full(len(edges), s)))
         points.append(pixels)
     edges, points = concatenate(sets), np.concatenate(points)
@@ -321,9 +345,12 @@ def made(error: str, observer: str, seed: int, folder: Path) -> Made:
 
 
 def edges_of(
-    camera: Any, scene: Scene, d: Deformed, T: np.ndarray, rows: np.ndarray, rng: Any
+    camera: Any, true: Any, scene: Scene, d: Deformed, T: np.ndarray, rows: np.ndarray, rng: Any
 ) -> tuple[Any, np.ndarray]:
-    """Edges of the photographs of one station, and (N, n, 2) pixels along each."""
+    """Edges of the photographs of one station, and (N, n, 2) pixels along each.
+
+    true : the camera that took them, for which the session states another.
+    """
     tubes = tubes_of(scene.machine)
     radius = scene.machine.values[tubes.radius]
     a, b = apply(T[:, None], scene.a[rows]), apply(T[:, None], scene.b[rows])
@@ -349,8 +376,7 @@ def edges_of(
 
     bend = np.einsum("kij,knj->kni", T[k, :3, :3], of(d.bend[rows[k], e.leg]))
     thick = of(d.radius[e.leg][..., None])
-    rays = p + bend + thick * e.normal[:, None]
-    rays = rays / np.sqrt(dot(rays, rays))[..., None]
+    rays = camera.ray(true.project(p + bend + thick * e.normal[:, None]))
     turned = np.einsum("nki,nij->nkj", rays, e.basis)
     off = np.einsum("nki,ni->nk", rays, e.normal)
     turn = np.stack([-np.linalg.lstsq(A, y, rcond=None)[0] for A, y in zip(turned, off, strict=True)])

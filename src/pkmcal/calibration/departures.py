@@ -128,6 +128,7 @@ def unmodelled(
     families = [
         *readings.reading_departures(measurements.joints, columns, units, present[first]),
         list(_lenses(session, observation, measurements)),
+        list(_lenses_of_stations(session, observation, measurements)),
         list(_boards(session, measurements)),
         list(_tripods(session, measurements)),
     ]
@@ -218,15 +219,48 @@ def _lenses(
     session: Session, observation: Observation, measured: Measurements
 ) -> Iterator[Departure]:
     """A camera that is not as its file says, by the departures that its model declares."""
+    if measured.intrinsics_factor.shape[-1]:
+        return  # they are estimated already
     changed = CameraChange.of(session, observation, measured)
     if changed is None:
-        return  # they are estimated already
+        return
     files = {station.camera_file: station.camera for station in session.stations}
     for file, camera in files.items():
         own = np.array([station.camera_file == file for station in session.stations])
         for part in camera.departures():
             effect = changed.effect(own, part.columns)
             yield Departure(part.kind, file, _of_lens(part.says, file), effect)
+
+
+def _lenses_of_stations(
+    session: Session, observation: Observation, measured: Measurements
+) -> Iterator[Departure]:
+    """A station whose camera is another than that of the other stations with the same file; not of
+    images by hand, whose focal lengths are estimated one by one.
+    """
+    files = [station.camera_file for station in session.stations]
+    shared = [
+        files.count(station.camera_file) > 1 and not station.handheld
+        for station in session.stations
+    ]
+    changed = CameraChange.of(session, observation, measured) if any(shared) else None
+    for s in np.flatnonzero(shared).tolist() if changed is not None else ():
+        station, own = session.stations[s], np.arange(len(files)) == s
+        for part in station.camera.departures():
+            says = _of_lens_at(part.says, station.name, station.camera_file)
+            effect = changed.effect(own, part.columns)
+            yield Departure(f"station's {part.kind}", station.name, says, effect)
+
+
+def _of_lens_at(
+    says: Callable[[Array, Array], str], station: str, file: str
+) -> Callable[[Array, Array], tuple[str, str]]:
+    return lambda value, sigma: (
+        f"The camera of {station} is not that of the other stations, which share {file}:"
+        f" {says(value, sigma)}",
+        f"Calibrate the camera of {station} by itself with `pkmcal camera`, and give the station a"
+        " file of its own",
+    )
 
 
 @dataclass(frozen=True)
@@ -244,9 +278,9 @@ class CameraChange:
     def of(
         cls, session: Session, observation: Observation, measured: Measurements
     ) -> CameraChange | None:
-        """Nothing where no camera is held: what is estimated is not asked about."""
+        """Nothing where there is no camera."""
         cameras = [station.camera for station in session.stations]
-        if measured.intrinsics_factor.shape[-1] or not cameras:
+        if not cameras:
             return None
         edges = edges_by_camera(observation, cameras)
         poses = np.zeros((len(measured.poses), 6, edges.shape[-1]))

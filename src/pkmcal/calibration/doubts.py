@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import CameraRefinement
 from pkmcal.calibration.recognise import frozen_in
-from pkmcal.cameras.contract import USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
+from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
 from pkmcal.identify.assembly import assemble, batch_of
@@ -482,6 +482,7 @@ def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
     usual = ", ".join(
         (
             f"focal lengths to {USUAL_FOCAL:.1%}",
+            f"their ratio to {USUAL_ASPECT:.1%}",
             f"the centre to {USUAL_CENTRE:.0%} of the width",
             f"distortion to {USUAL_DISTORTION:g}",
         )

@@ -29,7 +29,7 @@ from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Effect, Measurements
 from pkmcal.wording import amount
 
-CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0)
+CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
 """Distances over which errors of neighbouring poses are alike, in the root mean square distance of
 the session's poses from their middle; the last one leaves functions that are nearly straight."""
 MOST_FUNCTIONS = 40
