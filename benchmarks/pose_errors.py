@@ -4,12 +4,12 @@
 
 Simulated sessions of a hexapod, each of a machine and stations of its own, without rendered images:
 ``legs`` by the edges of its legs (three stations, twelve configurations each, edges with noise and
-shading as fitted edges have them), ``poses`` by a tracker (thirty poses). Each error of ERRORS moves
-readings, edges or poses as the physics of it does. Reported for each: how many results are refused,
-how many carry a warning, how many are accepted without one; how many of the accepted ones, with a
-warning or without, are off by more than three stated standard deviations; the error of the tool over
-the session's poses, root mean square, in standard deviations, and the factor on the standard
-deviation over that of the same session without the error. "none" are right sessions.
+shading as fitted edges have them), ``poses`` by a tracker (thirty poses). Each error of ERRORS
+moves readings, edges or poses as the physics of it does. Reported for each: how many results are
+refused, how many carry a warning, how many are accepted without one; how many of the accepted ones,
+with a warning or without, are off by more than three stated standard deviations; the error of the
+tool over the session's poses, root mean square, in standard deviations, and the median of those.
+"none" are right sessions.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pkmcal.calibration.calibrate import calibrate_measurements
 from pkmcal.calibration.gather import measurements_of, refinement_of
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.cylinders import contour_point, line_through, tangent_basis
-from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose, rotation, rotation_vector
+from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation, rotation_vector
 from pkmcal.identify.tool import tool_error
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA, Observation, concatenate
 from pkmcal.mechanisms import load_mechanism, mechanism_text
@@ -65,10 +65,10 @@ RADII_ALONG = 48
 class Deformed:
     """What an error changes of a true session of K configurations and L legs.
 
-    readings : (K, m) added to what is read. base : (K, 4, 4) motion of the base against the stations.
-    camera : (K, 6) motion of the first station, left perturbation. bend : (K, L, n, 3) m,
-    displacement of the axis of each leg at n places from A to B, base frame. radius : (L, n) m. lens :
-    by station, true intrinsics over the stated ones.
+    readings : (K, m) added to what is read. base : (K, 4, 4) motion of the base against the
+    stations. camera : (K, 6) motion of the first station, left perturbation. bend : (K, L, n, 3) m,
+    displacement of the axis of each leg at n places from A to B, base frame. radius : (L, n) m.
+    lens : by station, true intrinsics over the stated ones.
     """
 
     readings: np.ndarray
@@ -109,7 +109,7 @@ Error = Callable[[Scene, Deformed, np.random.Generator], None]
 def lag(share: float) -> Error:
     """Readings that lag behind by a share of the last step."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         d.readings -= share * np.diff(s.q, axis=0, prepend=s.q[:1])
 
     return make
@@ -118,7 +118,7 @@ def lag(share: float) -> Error:
 def backlash(metres: float) -> Error:
     """Play of all motors, each up to twice as much."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         each = metres * rng.uniform(0, 2, s.q.shape[1])
         d.readings += each / 2 * np.sign(np.diff(s.q, axis=0, prepend=s.q[:1]))
 
@@ -128,7 +128,7 @@ def backlash(metres: float) -> Error:
 def cyclic(metres: float, pitch: float) -> Error:
     """Screws whose lead varies once a turn."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         phase = rng.uniform(0, 2 * np.pi, s.q.shape[1])
         d.readings += metres * np.sin(2 * np.pi * s.q / pitch + phase)
 
@@ -138,7 +138,7 @@ def cyclic(metres: float, pitch: float) -> Error:
 def sag(metres: float) -> Error:
     """Legs that shorten under the platform's weight, more where they carry more."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         d.readings += metres * (s.load - s.load.mean(axis=0))
 
     return make
@@ -147,7 +147,7 @@ def sag(metres: float) -> Error:
 def compliance(metres: float) -> Error:
     """Droop of commanded axes: the arm sinks with the square of its reach."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         where = s.poses[:, :3, 3] - s.a.mean(axis=(0, 1))
         reach = np.sum(where[:, :2] ** 2, axis=1)
         commanded = s.poses.copy()
@@ -161,7 +161,7 @@ def compliance(metres: float) -> Error:
 def droop(metres: float) -> Error:
     """Legs that bend under their own weight, more where they lie flatter and are longer."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         u = line_through(s.a, s.b)[0]
         down = np.array([0, 0, -1.0])
         across = down - dot(u, down)[..., None] * u
@@ -174,7 +174,7 @@ def droop(metres: float) -> Error:
 def bow(metres: float) -> Error:
     """Legs that are bent for good, each its own way about its length."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         u = line_through(s.a, s.b)[0]
         side = np.cross(u, [0, 0, 1.0])
         side /= np.linalg.norm(side, axis=-1)[..., None]
@@ -188,7 +188,7 @@ def bow(metres: float) -> Error:
 def taper(metres: float) -> Error:
     """Legs that are thicker at one end, all alike."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         d.radius += metres * (np.linspace(0, 1, d.radius.shape[1]) - 0.5) * rng.choice([-1, 1])
 
     return make
@@ -197,7 +197,7 @@ def taper(metres: float) -> Error:
 def warming(metres: float) -> Error:
     """Legs that grow with time, each up to twice as much."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         d.readings -= metres * rng.uniform(0, 2, s.q.shape[1]) * s.time[:, None]
 
     return make
@@ -206,7 +206,7 @@ def warming(metres: float) -> Error:
 def loose(metres: float) -> Error:
     """Joints with play, that lie as the legs' forces and chance have them."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         ends = metres * rng.standard_normal((2, *s.a.shape)) / np.sqrt(3)
         u = line_through(s.a, s.b)[0]
         ends[1] += metres * np.tanh(2 * (s.load - np.median(s.load)))[..., None] * u
@@ -220,7 +220,7 @@ def loose(metres: float) -> Error:
 def flex(radians: float) -> Error:
     """A base that tilts on its feet with where the platform's weight is."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         where = s.poses[:, :2, 3] - s.poses[:, :2, 3].mean(axis=0)
         where /= np.sqrt(np.mean(np.sum(where**2, axis=1)))
         turn = radians * np.stack([-where[:, 1], where[:, 0], 0 * where[:, 0]], axis=-1)
@@ -232,7 +232,7 @@ def flex(radians: float) -> Error:
 def creeping(metres: float) -> Error:
     """A camera or tracker that sinks and turns slowly."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         way = rng.standard_normal(6) * np.repeat([metres / 3, metres], 3)
         d.camera += s.time[:, None] * way
 
@@ -242,7 +242,7 @@ def creeping(metres: float) -> Error:
 def lens(stations: range, **factors: float) -> Error:
     """Stations whose true intrinsics are others than their file's, by factors."""
 
-    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
         way = rng.choice([-1, 1])
         for k in stations:
             d.lens[k] = {name: 1 + way * (x - 1) for name, x in factors.items()}
@@ -360,9 +360,7 @@ def edges_of(
     u = line_through(start, end)[0]
     length = np.sqrt(dot(end - start, end - start))
     along = e.span[:, :1] + (e.span[:, 1:] - e.span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
-    by_tube = {
-        (leg, tube): r for leg, tube, r in zip(tubes.leg, tubes.tube, radius, strict=True)
-    }
+    by_tube = {(leg, tube): r for leg, tube, r in zip(tubes.leg, tubes.tube, radius, strict=True)}
     r = np.array([by_tube[pair] for pair in zip(e.leg, e.tube, strict=True)])
     p = contour_point(start[:, None], u[:, None], e.normal[:, None], r[:, None], along)
     t = np.clip(along / length[:, None], 0, 1) * (RADII_ALONG - 1)
@@ -379,11 +377,15 @@ def edges_of(
     rays = camera.ray(true.project(p + bend + thick * e.normal[:, None]))
     turned = np.einsum("nki,nij->nkj", rays, e.basis)
     off = np.einsum("nki,ni->nk", rays, e.normal)
-    turn = np.stack([-np.linalg.lstsq(A, y, rcond=None)[0] for A, y in zip(turned, off, strict=True)])
+    turn = np.stack(
+        [-np.linalg.lstsq(A, y, rcond=None)[0] for A, y in zip(turned, off, strict=True)]
+    )
     normal = e.normal + np.einsum("nij,nj->ni", e.basis, turn)
     normal /= np.linalg.norm(normal, axis=-1)[:, None]
     by_shift, by_tilt = moved_outward(camera, normal, e.basis, rays)
-    line = np.unique(np.stack([e.leg, e.tube, e.side], axis=1), axis=0, return_inverse=True)[1].ravel()
+    line = np.unique(np.stack([e.leg, e.tube, e.side], axis=1), axis=0, return_inverse=True)[
+        1
+    ].ravel()
     shade = SHADING_SIGMA * rng.standard_normal(line.max() + 1)[line]
     shade += OWN_SHADING * rng.standard_normal(len(line))
     normal = normal + np.einsum("nij,nj->ni", e.basis, by_shift * shade[:, None])
@@ -398,11 +400,15 @@ def edges_of(
     return edges, camera.project(rays)
 
 
-def write_texts(folder: Path, drawing: Any, truth: Any, camera: Any, readings: Any, observer: str) -> None:
+def write_texts(
+    folder: Path, drawing: Any, truth: Any, camera: Any, readings: Any, observer: str
+) -> None:
     """Files of a session; of images there are blank ones, which nothing reads."""
     (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
     rows = [["configuration", *drawing.joint_names]]
-    rows += [[n, *map(repr, v)] for n, v in zip(truth.configurations, readings.tolist(), strict=True)]
+    rows += [
+        [n, *map(repr, v)] for n, v in zip(truth.configurations, readings.tolist(), strict=True)
+    ]
     with (folder / "joints.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     stations: dict[str, Any] = {}
@@ -462,9 +468,7 @@ def calibrated(one: Made, folder: Path) -> Any:
 
     if one.measurements is None:
         return calibrate(folder)
-    return calibrate_measurements(
-        one.session, one.observation, one.measurements, one.T_camera_base
-    )
+    return calibrate_measurements(one.session, one.observation, one.measurements, one.T_camera_base)
 
 
 def judged(result: Any, scene: Scene) -> Outcome:
@@ -515,9 +519,13 @@ def main() -> None:
             for observer in observers:
                 if options.observer not in (None, observer):
                     continue
-                found = list(pool.map(outcome, *zip(*[(error, observer, k) for k in seeds], strict=True)))
+                found = list(
+                    pool.map(outcome, *zip(*[(error, observer, k) for k in seeds], strict=True))
+                )
                 count = [sum(x.what == w for x in found) for w in ("refused", "warned", "silent")]
-                beyond = [sum(x.what == w and x.z > FAR for x in found) for w in ("warned", "silent")]
+                beyond = [
+                    sum(x.what == w and x.z > FAR for x in found) for w in ("warned", "silent")
+                ]
                 far += beyond[1]
                 z = np.array([x.z for x in found if x.what != "refused"])
                 middle, worst = (np.median(z), z.max()) if z.size else (np.nan, np.nan)
@@ -526,7 +534,9 @@ def main() -> None:
                       f"{beyond[1]:12}{middle:10.2f}{worst:9.2f}{sigma:10.4f}", flush=True)  # fmt: skip
                 if options.list:
                     for k, x in zip(seeds, found, strict=True):
-                        print(f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {' | '.join(x.findings)[:400]}")
+                        print(
+                            f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {' | '.join(x.findings)[:400]}"
+                        )
     print(f"silent beyond {FAR:g}: {far}; {time.perf_counter() - begin:.0f} s")
 
 

@@ -30,7 +30,7 @@ from pkmcal.calibration.doubts import (
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.model_errors import ModelError
+from pkmcal.calibration.model_errors import ModelError, sentences
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
@@ -368,10 +368,11 @@ def _judge(
             *noise_doubt(session, found.estimate),
             *found.turns.doubts,
             *chance_doubt(found.turns),
-            *(one.sentence for one in (*departed, *errors) if one.against),
+            *(one.sentence for one in departed if one.against),
         ),
         cautions=(
-            *(one.sentence for one in (*departed, *errors) if not one.against),
+            *(one.sentence for one in departed if not one.against),
+            *sentences(errors),
             *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed or errors)),
             *lens_told(found.turns.cameras),

@@ -27,7 +27,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Effect, Measurements
-from pkmcal.wording import amount
+from pkmcal.wording import amount, joined
 
 CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
 """Distances over which errors of neighbouring poses are alike, in the root mean square distance of
@@ -44,9 +44,9 @@ class ModelError:
     """A component of the discrepancy that the data show.
 
     code : such as readings.workspace. scale : its standard deviation, m or rad of what it acts on.
-    ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m, standard deviation
-    of the platform's position, root mean square over the session's poses, with all components and
-    without any.
+    unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
+    standard deviation of the platform's position, root mean square over the session's poses, with
+    all components and without any.
     """
 
     code: str
@@ -55,11 +55,6 @@ class ModelError:
     tool: float
     tool_before: float
     unit: str
-
-    @property
-    def against(self) -> bool:
-        """Whether the result should not be used for it."""
-        return False
 
     def document(self) -> dict[str, Any]:
         """For programs."""
@@ -71,18 +66,8 @@ class ModelError:
             "sigma_tool_before": self.tool_before,
         }
 
-    @property
-    def sentence(self) -> str:
-        """For a verdict."""
-        subject, remedy = WORDS[self.code]
-        return (
-            f"The model leaves out errors of {amount(self.scale, self.unit)} (standard deviation)"
-            f" {subject}. Standard deviations contain what they may have done: the tool's is"
-            f" {amount(self.tool, 'm')} in place of {amount(self.tool_before, 'm')}. {remedy}."
-        )
 
-
-WORDS = {
+SUBJECTS = {
     "readings.workspace": (
         "in the readings that vary smoothly over the workspace",
         "Look for what gives way under load or droops, or measure the platform itself",
@@ -109,6 +94,20 @@ WORDS = {
     ),
 }
 """By component: where the errors are, and what helps."""
+
+
+def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
+    """One for the verdict, of all components, the largest by evidence first; none without any."""
+    if not errors:
+        return ()
+    first = errors[0]
+    parts = [f"{amount(one.scale, one.unit)} {SUBJECTS[one.code][0]}" for one in errors]
+    return (
+        f"The model leaves out errors of {joined(parts)} (standard deviations). Those of the"
+        " result contain what they may have done: the tool's is"
+        f" {amount(first.tool, 'm')} in place of {amount(first.tool_before, 'm')}."
+        f" {SUBJECTS[first.code][1]}.",
+    )
 
 
 def discrepancy_components(measurements: Measurements, estimate: Estimate) -> list[Component]:

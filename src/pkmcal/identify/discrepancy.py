@@ -48,6 +48,10 @@ from pkmcal.measurements import Effect
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.ranks import normal_root
 
+COLUMNS_BY_UNKNOWNS = 4
+"""Columns of all components in times of the unknowns': rows are gone through in so much smaller
+pieces, which take no more memory."""
+
 
 @dataclass(frozen=True)
 class DiscrepancyOptions:
@@ -142,7 +146,7 @@ def discrepancy_of(
     components: Sequence[Component],
     named: Sequence[Effect] = (),
     enlarged: tuple[float, float] = (1.0, 1.0),
-    options: DiscrepancyOptions = DiscrepancyOptions(),  # noqa: B008
+    options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
@@ -286,7 +290,9 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
     n, count = sum(effect.count for effect in effects), problem.unknowns.count
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
     known, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
-    for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+    configurations, n_rows = problem.extent
+    for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
+        piece = Information(problem.among(cut), problem.state_among(info.state, cut))
         linear = piece.linear
         rows, residuals = eliminated_beside(linear, columns(cut, linear))
         own, extra = rows[..., :count] @ basis, rows[..., count:].reshape(-1, n)

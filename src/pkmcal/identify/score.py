@@ -312,9 +312,7 @@ def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects
     columns = columns_of(assembled, info.state, beside.effects)
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
-    for cut, piece in zip(
-        divisions(*assembled.problem.extent), info.pieces(), strict=True
-    ):
+    for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
         rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ beside.root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
