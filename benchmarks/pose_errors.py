@@ -118,7 +118,7 @@ def lag(share: float) -> Error:
 def backlash(metres: float) -> Error:
     """Play of all motors, each up to twice as much."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         each = metres * rng.uniform(0, 2, s.q.shape[1])
         d.readings += each / 2 * np.sign(np.diff(s.q, axis=0, prepend=s.q[:1]))
 
@@ -128,7 +128,7 @@ def backlash(metres: float) -> Error:
 def cyclic(metres: float, pitch: float) -> Error:
     """Screws whose lead varies once a turn."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         phase = rng.uniform(0, 2 * np.pi, s.q.shape[1])
         d.readings += metres * np.sin(2 * np.pi * s.q / pitch + phase)
 
@@ -174,7 +174,7 @@ def droop(metres: float) -> Error:
 def bow(metres: float) -> Error:
     """Legs that are bent for good, each its own way about its length."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         u = line_through(s.a, s.b)[0]
         side = np.cross(u, [0, 0, 1.0])
         side /= np.linalg.norm(side, axis=-1)[..., None]
@@ -188,7 +188,7 @@ def bow(metres: float) -> Error:
 def taper(metres: float) -> Error:
     """Legs that are thicker at one end, all alike."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(_s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         d.radius += metres * (np.linspace(0, 1, d.radius.shape[1]) - 0.5) * rng.choice([-1, 1])
 
     return make
@@ -197,7 +197,7 @@ def taper(metres: float) -> Error:
 def warming(metres: float) -> Error:
     """Legs that grow with time, each up to twice as much."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         d.readings -= metres * rng.uniform(0, 2, s.q.shape[1]) * s.time[:, None]
 
     return make
@@ -206,7 +206,7 @@ def warming(metres: float) -> Error:
 def loose(metres: float) -> Error:
     """Joints with play, that lie as the legs' forces and chance have them."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         ends = metres * rng.standard_normal((2, *s.a.shape)) / np.sqrt(3)
         u = line_through(s.a, s.b)[0]
         ends[1] += metres * np.tanh(2 * (s.load - np.median(s.load)))[..., None] * u
@@ -232,7 +232,7 @@ def flex(radians: float) -> Error:
 def creeping(metres: float) -> Error:
     """A camera or tracker that sinks and turns slowly."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         way = rng.standard_normal(6) * np.repeat([metres / 3, metres], 3)
         d.camera += s.time[:, None] * way
 
@@ -242,7 +242,7 @@ def creeping(metres: float) -> Error:
 def lens(stations: range, **factors: float) -> Error:
     """Stations whose true intrinsics are others than their file's, by factors."""
 
-    def make(s: Scene, d: Deformed, _rng: np.random.Generator) -> None:
+    def make(_s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         way = rng.choice([-1, 1])
         for k in stations:
             d.lens[k] = {name: 1 + way * (x - 1) for name, x in factors.items()}
@@ -423,7 +423,10 @@ def write_texts(
             stations[name] = {
                 "camera": "camera.yaml", "images": f"images/{name}/{{configuration}}.png",
                 "observe": "legs",
-                "pose": {key: [float(x) for x in getattr(rough, key)] for key in ("position", "look_at", "up")},
+                "pose": {
+                    key: [float(x) for x in getattr(rough, key)]
+                    for key in ("position", "look_at", "up")
+                },
             }  # fmt: skip
             (folder / "images" / name).mkdir(parents=True)
             for k in truth.photographs[truth.photographs[:, 0] == s, 1].tolist():
@@ -452,8 +455,8 @@ def write_poses(folder: Path, scene: Scene, d: Deformed, T: np.ndarray, rng: Any
 
 class Outcome(NamedTuple):
     """What became of a session. what : refused, warned or silent. z : error of the tool in standard
-    deviations, root mean square over the poses. sigma : m, that standard deviation. findings : codes
-    and sentences.
+    deviations, root mean square over the poses. sigma : m, that standard deviation. findings :
+    sentences.
     """
 
     what: str
@@ -511,8 +514,8 @@ def main() -> None:
     seeds = range(options.first, options.first + options.sessions)
     far = 0
     with ProcessPoolExecutor(options.workers) as pool:
-        print(f"{'':34}{'refused':>8}{'warned':>8}{'silent':>8}{'warned > 3':>12}{'silent > 3':>12}"
-              f"{'median z':>10}{'worst z':>9}{'sigma mm':>10}")  # fmt: skip
+        titles = ("refused", "warned", "silent", "warned > 3", "silent > 3", "median z", "worst z")
+        print(f"{'':36}" + "".join(f"{title:>11}" for title in (*titles, "sigma mm")))
         for error, (_, observers) in ERRORS.items():
             if options.only and not any(word in error for word in options.only):
                 continue
@@ -530,13 +533,13 @@ def main() -> None:
                 z = np.array([x.z for x in found if x.what != "refused"])
                 middle, worst = (np.median(z), z.max()) if z.size else (np.nan, np.nan)
                 sigma = np.nanmedian([x.sigma for x in found] + [np.nan]) * 1e3
-                print(f"{error + ', ' + observer:34}{count[0]:8}{count[1]:8}{count[2]:8}{beyond[0]:12}"
-                      f"{beyond[1]:12}{middle:10.2f}{worst:9.2f}{sigma:10.4f}", flush=True)  # fmt: skip
+                numbers = "".join(f"{k:11}" for k in (*count, *beyond))
+                print(f"{error + ', ' + observer:36}{numbers}{middle:11.2f}{worst:11.2f}"
+                      f"{sigma:11.4f}", flush=True)  # fmt: skip
                 if options.list:
                     for k, x in zip(seeds, found, strict=True):
-                        print(
-                            f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {' | '.join(x.findings)[:400]}"
-                        )
+                        said = " | ".join(x.findings)[:400]
+                        print(f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {said}")
     print(f"silent beyond {FAR:g}: {far}; {time.perf_counter() - begin:.0f} s")
 
 

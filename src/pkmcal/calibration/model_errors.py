@@ -228,7 +228,7 @@ def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Com
 
 
 def _motion_in_station(T: Array) -> Array:
-    """(6, 6) left perturbation of T_camera_base by one (omega, tau) of the base in its own frame."""
+    """(6, 6) left perturbation of T_camera_base by (omega, tau) of the base in its own frame."""
     turn, place = T[:3, :3], T[:3, 3]
     return np.block([[turn, np.zeros((3, 3))], [skew(place) @ turn, turn]])
 
