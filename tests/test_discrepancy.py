@@ -217,6 +217,12 @@ def test_smooth_functions_are_orthonormal_and_have_unit_size():
     assert shares == sorted(shares)
 
 
+def test_one_pose_has_no_smooth_functions():
+    functions, roots = smooth_functions(np.zeros((5, 6)))
+    assert functions.shape == (5, 0)
+    assert roots == ()
+
+
 def seen_through(calibrated, change, stations):
     """What is not modelled where some stations' images were taken by a camera whose parameters
     differ by ``change`` (n,) from the file's.

@@ -244,7 +244,9 @@ def _lenses_of_stations(
         for station in session.stations
     ]
     changed = CameraChange.of(session, observation, measured) if any(shared) else None
-    for s in np.flatnonzero(shared).tolist() if changed is not None else ():
+    if changed is None:
+        return
+    for s in np.flatnonzero(shared).tolist():
         station, own = session.stations[s], np.arange(len(files)) == s
         for part in station.camera.departures():
             says = _of_lens_at(part.says, station.name, station.camera_file)

@@ -36,7 +36,7 @@ MOST_FUNCTIONS = 40
 """Smooth functions of the pose: in six dimensions straight and square ones are 27."""
 LANDMARK_POSES = 200
 """Poses, evenly of all, by which the functions are made where there are more."""
-PLACES_ALONG_TUBE = 9
+PLACES_ALONG_EDGE_SPAN = 9
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,8 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
         out[used] = np.einsum("kp,mn->kmpn", functions, each).reshape(len(functions), m, -1)
         return out
 
+    if not basis.shape[1]:  # all of one pose
+        return
     yield Component(
         "readings.workspace",
         Effect(readings=by_motor(basis)),
@@ -172,8 +174,10 @@ def smooth_functions(points: Array) -> tuple[Array, tuple[Array, ...]]:
     middle = np.eye(len(marks)) - 1 / len(marks)
     values, vectors = np.linalg.eigh(middle @ kernel(marks, CORRELATION_LENGTHS[0]) @ middle)
     order = np.argsort(-values)[:MOST_FUNCTIONS]
-    order = order[values[order] > 1e-6 * max(float(values.max()), 1e-300)]
+    order = order[values[order] > 1e-6 * max(float(values.max()), 1e-6)]
     turn = middle @ vectors[:, order] / np.sqrt(values[order])
+    if not order.size:
+        return np.zeros((len(points), 0)), ()
     functions = kernel(points, CORRELATION_LENGTHS[0]) @ turn
     functions = functions - functions.mean(axis=0)
     q, r = np.linalg.qr(functions)
@@ -242,7 +246,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     T = state.T_camera_base[edges.station]
     a, b = (apply(T, x[edges.configuration, edges.leg]) for x in (ends.a, ends.b))
     u = line_through(a, b)[0]
-    part = np.linspace(0, 1, PLACES_ALONG_TUBE)
+    part = np.linspace(0, 1, PLACES_ALONG_EDGE_SPAN)
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * part
     radius = machine.values[machine.layout.radius_of(edges.leg, edges.tube)]
     points = contour_point(
@@ -280,7 +284,8 @@ def with_discrepancy(
     return replace(
         estimate,
         joint_covariance=joint,
-        data_share=data_share(machine, estimate.state.theta, joint[:n, :n], gauge),
+        # what is left out may make a value less sure than the drawing alone has it
+        data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
         edge_shift_sigma=np.sqrt(estimate.edge_shift_sigma**2 + optics[:, 0, 0]),
         intrinsics_covariance=estimate.intrinsics_covariance
         + factor @ optics[:, 1:, 1:] @ factor.mT,
