@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.departures import unmodelled
+from pkmcal.calibration.departures import model_violations
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.model_errors import (
     CORRELATION_LENGTHS,
@@ -27,11 +27,11 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.measurements import Effect
 from test_departures import measured, scales
 
-SEEN = 14
+FEW = 14
 """Configurations of sessions that dense algebra takes whole."""
 
 
-def ended(seed, change=None, count=30):
+def session_estimate(seed, change=None, count=30):
     """Drawing, measurements, estimate and its problem at its end, of a session whose readings a
     function has changed.
     """
@@ -47,7 +47,7 @@ def scales_in_use(estimate):
     return estimate.statistics.reading_scale, estimate.statistics.pose_scale
 
 
-def found_in(data, estimate, named=()):
+def discrepancy_in(data, estimate, named=()):
     return discrepancy_of(
         *as_ended(data, estimate),
         discrepancy_components(data, estimate),
@@ -74,15 +74,17 @@ def dense(assembled, info, effects):
 def test_scale_and_covariance_are_those_of_dense_algebra():
     """Against the restricted likelihood of all rows at once, and the gain of least squares."""
     rng = np.random.default_rng(5)
-    functions = rng.standard_normal((SEEN, 6, 3))
-    _, data, estimate, _ = ended(5, lambda _: 3e-4 * functions @ [0.5, -1.0, 0.4], count=SEEN)
+    functions = rng.standard_normal((FEW, 6, 3))
+    _, data, estimate, _ = session_estimate(
+        5, lambda _: 3e-4 * functions @ [0.5, -1.0, 0.4], count=FEW
+    )
     data = replace(data, joint_noise=estimate.statistics.reading_scale * data.joint_noise)
     estimate = replace(estimate, statistics=replace(estimate.statistics, reading_scale=1.0))
     assembled, info = as_ended(data, estimate)
     root = np.array([[1.0, 0, 0], [0.5, 1, 0], [0, 0, 2.0]])
     one = Component("functions", Effect(readings=functions), (root,))
     result = discrepancy_of(assembled, info, [one])
-    (scaled,) = result.found
+    (scaled,) = result.scales
 
     J, r, G = dense(assembled, info, [one.effect])
     length = np.maximum(np.linalg.norm(J, axis=0), 1e-30)
@@ -110,9 +112,9 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
 
 def test_scores_beside_random_effects_are_those_of_correlated_noise():
     rng = np.random.default_rng(6)
-    _, data, estimate, _ = ended(6, lambda q: 2e-3 * q * (np.arange(6) == 1), count=SEEN)
+    _, data, estimate, _ = session_estimate(6, lambda q: 2e-3 * q * (np.arange(6) == 1), count=FEW)
     assembled, info = as_ended(data, estimate)
-    random = Effect(readings=rng.standard_normal((SEEN, 6, 2)))
+    random = Effect(readings=rng.standard_normal((FEW, 6, 2)))
     root = 2e-4 * np.array([[1.0, 0.0], [0.3, 0.7]])
     tests = [Effect(readings=by) for by in scales(data)[:2]]
     beside = RandomEffects((random,), root)
@@ -149,13 +151,13 @@ def tool_in_sigmas(truth, estimate, joints):
 
 def test_legs_that_give_way_are_found_and_contained():
     """By a right session's own estimate as truth: readings that are short by the legs' load."""
-    drawing, data, right, true = ended(1)
+    drawing, data, right, true = session_estimate(1)
     sag = 2e-4 * loads(drawing, data, right)
     truth = right.machine, right.state.T_base_platform
     data = replace(data, joints=true + sag)
     estimate = bundle(drawing, data, right.state)
-    result = found_in(data, estimate)
-    assert result.found[0].code == "readings.workspace"
+    result = discrepancy_in(data, estimate)
+    assert result.scales[0].code == "readings.workspace"
     contained = with_discrepancy(data, estimate, as_ended(data, estimate)[1].problem, result)
     before, after = (tool_in_sigmas(truth, x, true) for x in (estimate, contained))
     assert before > 3
@@ -168,31 +170,31 @@ def test_readings_that_lag_are_told_by_their_steps():
     def change(q):
         return -lag * np.diff(q, axis=0, prepend=q[:1])
 
-    _, data, estimate, _ = ended(2, change)
-    result = found_in(data, estimate)
-    assert result.found[0].code == "readings.step"
+    _, data, estimate, _ = session_estimate(2, change)
+    result = discrepancy_in(data, estimate)
+    assert result.scales[0].code == "readings.step"
     step = np.std(change(data.joints))
-    assert step / 3 < result.found[0].scale < 3 * step
+    assert step / 3 < result.scales[0].scale < 3 * step
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_right_session_has_no_discrepancy(seed):
-    _, data, estimate, _ = ended(seed)
-    assert found_in(data, estimate).found == ()
+    _, data, estimate, _ = session_estimate(seed)
+    assert discrepancy_in(data, estimate).scales == ()
 
 
 @pytest.mark.slow
 def test_right_sessions_seldom_have_one():
-    found = [found_in(*ended(seed)[1:3]).found for seed in range(100, 140)]
+    found = [discrepancy_in(*session_estimate(seed)[1:3]).scales for seed in range(100, 140)]
     assert sum(map(bool, found)) <= 2
 
 
 def test_noisy_readings_are_noise_and_hardly_more():
     """White noise that is stated a tenth: the smooth part adds little to the covariance."""
     rng = np.random.default_rng(0)
-    _, data, estimate, _ = ended(9, lambda q: 3e-5 * rng.standard_normal(q.shape))
+    _, data, estimate, _ = session_estimate(9, lambda q: 3e-5 * rng.standard_normal(q.shape))
     assert estimate.statistics.reading_scale > 3
-    result = found_in(data, estimate)
+    result = discrepancy_in(data, estimate)
     contained = with_discrepancy(data, estimate, as_ended(data, estimate)[1].problem, result)
     offsets = estimate.machine.parameters.of_kind("offset")
     more, before = (np.diag(x.covariance)[offsets].sum() for x in (contained, estimate))
@@ -223,7 +225,7 @@ def test_one_pose_has_no_smooth_functions():
     assert roots == ()
 
 
-def seen_through(calibrated, change, stations):
+def through_lens(calibrated, change, stations):
     """What is not modelled where some stations' images were taken by a camera whose parameters
     differ by ``change`` (n,) from the file's.
     """
@@ -239,13 +241,13 @@ def seen_through(calibrated, change, stations):
     estimate = bundle(session.machine, measurements, calibrated.estimate.state)
     observation = replace(observation, edges=edges)
     end = as_ended(measurements, estimate)
-    return unmodelled(session, observation, measurements, estimate, end)
+    return model_violations(session, observation, measurements, estimate, end)
 
 
 def test_pixels_that_are_not_square_are_named(calibrated):
     camera = calibrated.session.stations[0].camera
     stations = list(range(len(calibrated.session.stations)))
-    found = seen_through(calibrated, 0.006 * camera.aspect_part, stations)
+    found = through_lens(calibrated, 0.006 * camera.aspect_part, stations)
     first = found.departures[0]
     assert (first.kind, first.of) == ("pixel aspect", "cameras/camera.yaml")
     assert abs(first.value[0] - 0.006) < 4 * first.sigma[0]
@@ -253,7 +255,7 @@ def test_pixels_that_are_not_square_are_named(calibrated):
 
 def test_a_station_with_another_lens_than_its_file_is_named(calibrated):
     camera = calibrated.session.stations[1].camera
-    found = seen_through(calibrated, 0.02 * camera.aspect_part, [1])
+    found = through_lens(calibrated, 0.02 * camera.aspect_part, [1])
     first = found.departures[0]
     name = calibrated.session.station_names[1]
     assert (first.kind, first.of) == ("station's pixel aspect", name)
@@ -266,7 +268,7 @@ def test_a_right_session_has_no_errors_left_out(calibrated):
 
 
 def test_components_act_in_the_readings_units():
-    _, data, estimate, _ = ended(3)
+    _, data, estimate, _ = session_estimate(3)
     components = discrepancy_components(data, estimate)
     codes = [one.code for one in components]
     assert len(set(codes)) == len(codes)

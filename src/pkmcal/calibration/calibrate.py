@@ -14,7 +14,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
 from pkmcal.calibration.chance import by_chance, chance_doubt
-from pkmcal.calibration.departures import Departed, unmodelled
+from pkmcal.calibration.departures import Departed, model_violations
 from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
     as_stated,
@@ -352,7 +352,7 @@ def _judge(
     errors: tuple[ModelError, ...] = ()
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = found.turns
-        departed, errors, estimate = unmodelled(
+        departed, errors, estimate = model_violations(
             session, turns.observation, turns.measurements, found.estimate, ended
         )
         found = found._replace(estimate=estimate)

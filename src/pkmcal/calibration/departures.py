@@ -94,7 +94,7 @@ class Departed:
         return f"{self.what}; {moves}, {self.tool:.2g} standard deviations. {self.todo}."
 
 
-class Unmodelled(NamedTuple):
+class ModelViolations(NamedTuple):
     """What the data show that the model does not have.
 
     departures : violations that have a name, the surest first. errors : components of the model
@@ -106,13 +106,13 @@ class Unmodelled(NamedTuple):
     estimate: Estimate
 
 
-def unmodelled(
+def model_violations(
     session: Session,
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
     ended: tuple[Assembled, Information],
-) -> Unmodelled:
+) -> ModelViolations:
     """What the data show that the model does not have.
 
     A violation is named only if it explains more than the discrepancy does: what is found at first
@@ -170,14 +170,14 @@ def unmodelled(
             [declared(k).effect for k, _ in found],
             scales,
         )
-    if discrepancy.found and found:
+    if discrepancy.scales and found:
         tests, found = tested(discrepancy.random)
     before = tool_of(session, estimate)
     estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
-    tool = tool_of(session, estimate) if discrepancy.found else before
+    tool = tool_of(session, estimate) if discrepancy.scales else before
     errors = model_errors(discrepancy, tool, before, units[0])
     if not found:
-        return Unmodelled((), errors, estimate)
+        return ModelViolations((), errors, estimate)
     fits = tests.fitted([k for k, _ in found])
     last = len(fits) - len(tubes)
     fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
@@ -185,7 +185,7 @@ def unmodelled(
         _departed(declared(k), score, fit, tool)
         for (k, score), fit in zip(found, fits, strict=True)
     )
-    return Unmodelled(departures, errors, estimate)
+    return ModelViolations(departures, errors, estimate)
 
 
 def tool_of(session: Session, estimate: Estimate) -> ToolError:

@@ -221,8 +221,8 @@ def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Com
     yield Component("base.workspace", Effect(motion=motion), (np.eye(motion.shape[-1]),))
     parts: list[Array] = []
     for s in stations:
-        seen = [x.configuration[x.station == s] for x in (measurements.edges, measurements.poses)]
-        if len(np.unique(np.concatenate(seen))) > 1:
+        taken = [x.configuration[x.station == s] for x in (measurements.edges, measurements.poses)]
+        if len(np.unique(np.concatenate(taken))) > 1:
             part = np.zeros((len(stations), n, 6, 6))
             part[s] = np.sqrt(2) * functions_of_time(n)[:, :1, None] * unit
             parts.append(part)
@@ -273,7 +273,7 @@ def with_discrepancy(
     measurements: Measurements, estimate: Estimate, problem: Problem, discrepancy: Discrepancy
 ) -> Estimate:
     """The estimate whose covariances contain the discrepancy; problem : as the estimate ended."""
-    if not discrepancy.found:
+    if not discrepancy.scales:
         return estimate
     machine, shared, u = estimate.machine, discrepancy.shared, problem.unknowns
     gauge = default_gauge(machine)
@@ -311,5 +311,5 @@ def model_errors(
             without,
             unit if one.code.startswith("readings") else "m",
         )
-        for one in discrepancy.found
+        for one in discrepancy.scales
     )

@@ -55,18 +55,19 @@ pieces, which take no more memory."""
 
 @dataclass(frozen=True)
 class DiscrepancyOptions:
-    """Constants of the search.
+    """Constants of the search."""
 
-    false_alarm : chance at which any component is found where there is none. noise_factors :
-    factors tried on an enlarged noise, from what was stated to what is in use. most : components
-    taken up at most. scales : tried for each component. rank : share of the largest squared column
-    below which nothing is left of one.
-    """
-
+    # chance at which any component is found in a session that has none
     false_alarm: float = 0.005
+    # factor on a stated noise from which the discrepancy may be what enlarged it
+    enlarged: float = 1.2
+    # factors tried then, from what was stated to what is in use
     noise_factors: int = 5
+    # components in one session at most; more are a session with other troubles
     most: int = 4
+    # scales tried for each component, geometrically between hardly visible and nothing else visible
     scales: int = 121
+    # part of a squared column that has to be left beside the unknowns; less is rounding
     rank: float = 1e-10
 
 
@@ -86,7 +87,7 @@ class Component:
 
 
 @dataclass(frozen=True)
-class Scaled:
+class ComponentScale:
     """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
     logarithm of the likelihood ratio against no such component.
     """
@@ -101,11 +102,11 @@ class Scaled:
 class Discrepancy:
     """What the data show of the components.
 
-    found : those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : the found components' effects.
+    scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
+    shared unknowns. random : their effects.
     """
 
-    found: tuple[Scaled, ...]
+    scales: tuple[ComponentScale, ...]
     shared: Array
     random: RandomEffects
 
@@ -160,27 +161,27 @@ def discrepancy_of(
     at_solution = _products(assembled, info, effects)
     kinds = (READING_ROWS_KIND, POSE_ROWS_KIND)
     kind, factor = max(zip(kinds, enlarged, strict=True), key=lambda pair: pair[1])
-    tried = [at_solution.beside(fixed)]
-    if factor > 1:
+    candidates = [at_solution.beside(fixed)]
+    if factor > options.enlarged:
         for share in np.geomspace(1 / factor, 1, options.noise_factors)[:-1].tolist():
             other = _with_noise(assembled, kind, share)
-            tried.append(_products(other, Information(other.problem, info.state), effects))
-            tried[-1] = tried[-1].beside(fixed)
-    without = max(one.likelihood for one in tried)
+            candidates.append(_products(other, Information(other.problem, info.state), effects))
+            candidates[-1] = candidates[-1].beside(fixed)
+    without = max(one.likelihood for one in candidates)
     best: tuple[float, _Search] | None = None
-    for products in tried:
+    for products in candidates:
         search = _Search(products, components, parts, options)
-        search.run(kind if factor > 1 else None)
+        search.run(kind if factor > options.enlarged else None)
         if best is None or products.likelihood + search.gain > best[0]:
             best = products.likelihood + search.gain, search
-    if best is None or not best[1].found or best[0] <= without:
+    if best is None or not best[1].scales or best[0] <= without:
         return no_discrepancy(info)
     search = best[1]
     # scales by the noise that fits best, gains by the weights with which the estimate was made
     gain = at_solution.gain[:, : fixed.start] @ search.root
     spread = gain @ search.second_moment @ gain.T
     every = tuple(one.effect for one in components)
-    return Discrepancy(tuple(search.found), spread, RandomEffects(every, search.root))
+    return Discrepancy(tuple(search.scales), spread, RandomEffects(every, search.root))
 
 
 class _Search:
@@ -198,7 +199,7 @@ class _Search:
     ) -> None:
         self.products, self.components, self.parts = products, components, parts
         self.options = options
-        self.found: list[Scaled] = []
+        self.scales: list[ComponentScale] = []
         self.gain = 0.0
         self.root = np.zeros((parts[-1].stop if parts else 0, 0))
 
@@ -208,12 +209,12 @@ class _Search:
 
         level = self.options.false_alarm / max(len(self.components), 1)
         beyond = float(chdtri(1.0, 2 * level))
-        while len(self.found) < self.options.most:
+        while len(self.scales) < self.options.most:
             squared, value = self._left()
-            taken = {one.code for one in self.found}
-            best: Scaled | None = None
+            codes = {one.code for one in self.scales}
+            best: ComponentScale | None = None
             for one, part in zip(self.components, self.parts, strict=True):
-                if one.code in taken:
+                if one.code in codes:
                     continue
                 for root in one.roots:
                     scale, ratio = self._scale(
@@ -223,10 +224,10 @@ class _Search:
                     )
                     least = 0.0 if one.inflates == enlarged and enlarged is not None else beyond
                     if ratio > least and (best is None or ratio > best.ratio):
-                        best = Scaled(one.code, scale, ratio, root)
+                        best = ComponentScale(one.code, scale, ratio, root)
             if best is None:
                 return
-            self.found.append(best)
+            self.scales.append(best)
             self.gain += best.ratio / 2
             (k,) = (k for k, one in enumerate(self.components) if one.code == best.code)
             more = np.zeros((len(self.root), best.root.shape[1]))
@@ -260,8 +261,8 @@ class _Search:
     def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
         """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
         m, vectors = np.linalg.eigh((squared + squared.T) / 2)
-        seen = m > self.options.rank * float(np.trace(whole))
-        m, z = m[seen], vectors[:, seen].T @ value
+        visible = m > self.options.rank * float(np.trace(whole))
+        m, z = m[visible], vectors[:, visible].T @ value
         if not m.size:
             return 0.0, 0.0
         # from where the best seen function is hardly seen to where the least seen one is all
@@ -289,7 +290,7 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
     columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
     n, count = sum(effect.count for effect in effects), problem.unknowns.count
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
-    known, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
+    in_basis, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
     for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
         piece = Information(problem.among(cut), problem.state_among(info.state, cut))
@@ -304,7 +305,7 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
         squared += extra.T @ extra
         by_basis += extra.T @ own
         value += extra.T @ residuals
-        known += own.T @ residuals
+        in_basis += own.T @ residuals
         left += float(residuals @ residuals)
         diagonal = np.einsum("bkii->bki", piece.reduced.r)
         own_scale += float(np.sum(np.log(np.maximum(np.abs(diagonal), 1e-300))))
@@ -312,10 +313,10 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
     scale = own_scale + _log_scale(info) + _log_noise(assembled)
     return _Products(
         squared - by_basis @ by_basis.T,
-        value - by_basis @ known,
+        value - by_basis @ in_basis,
         basis @ by_basis.T,
         squared,
-        -scale - (left - float(known @ known)) / 2,
+        -scale - (left - float(in_basis @ in_basis)) / 2,
     )
 
 
