@@ -15,7 +15,9 @@ so s has a likelihood of its own, the restricted one (Patterson and Thompson 197
 believed where its likelihood ratio is beyond what chance gives at a level that all components
 share; half of a chi-square variable of one degree of freedom, since s cannot be negative (Self and
 Liang 1987). Components are taken up one after the other, the one with the largest ratio first, each
-beside those before it, and beside the model violations that have names.
+beside those before it. Model violations that have names take part, each a component of its own: one
+that explains more than smooth functions do is taken up before them, one that explains less is left
+without anything to explain.
 
 Where the estimate has enlarged the noise of readings or poses, the discrepancy may be what enlarged
 it: the two are compared by the restricted likelihood of both, and a component of the readings, or
@@ -46,8 +48,9 @@ from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside, shared_basis
 from pkmcal.measurements import Effect
 from pkmcal.solver.elimination import divisions
-from pkmcal.solver.ranks import normal_root
 
+NAMED = "named."
+"""Begins the codes of violations that have names elsewhere."""
 COLUMNS_BY_UNKNOWNS = 4
 """Columns of all components in times of the unknowns': rows are gone through in so much smaller
 pieces, which take no more memory."""
@@ -124,16 +127,6 @@ class _Products:
     whole: Array
     likelihood: float
 
-    def beside(self, fixed: slice) -> _Products:
-        """The same beside columns whose coefficients are free."""
-        half = normal_root(self.squared[fixed, fixed], 1e-12, loose=False)
-        across = self.squared[:, fixed] @ half
-        return replace(
-            self,
-            squared=self.squared - across @ across.T,
-            value=self.value - across @ (half.T @ self.value[fixed]),
-        )
-
 
 def no_discrepancy(info: Information) -> Discrepancy:
     """None at all."""
@@ -151,37 +144,38 @@ def discrepancy_of(
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
-    named : effects of the model violations that were found otherwise. enlarged : factors in use on
+    named : effects of the model violations that were found otherwise, which take part with a scale
+    each: what they explain better is theirs, and not in the result. enlarged : factors in use on
     the stated noise of the readings and of the poses.
     """
-    effects = [*(one.effect for one in components), *named]
+    rivals = [
+        Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
+    ]
+    every = [*components, *rivals]
+    effects = [one.effect for one in every]
     ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
-    parts = [slice(*ends[k : k + 2]) for k in range(len(components))]
-    fixed = slice(ends[len(components)], ends[-1])
+    parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
     at_solution = _products(assembled, info, effects)
     kinds = (READING_ROWS_KIND, POSE_ROWS_KIND)
     kind, factor = max(zip(kinds, enlarged, strict=True), key=lambda pair: pair[1])
-    candidates = [at_solution.beside(fixed)]
+    noises = [at_solution]
     if factor > options.enlarged:
         for share in np.geomspace(1 / factor, 1, options.noise_factors)[:-1].tolist():
             other = _with_noise(assembled, kind, share)
-            candidates.append(_products(other, Information(other.problem, info.state), effects))
-            candidates[-1] = candidates[-1].beside(fixed)
-    without = max(one.likelihood for one in candidates)
-    best: tuple[float, _Search] | None = None
-    for products in candidates:
-        search = _Search(products, components, parts, options)
+            noises.append(_products(other, Information(other.problem, info.state), effects))
+    searches = [_Search(products, every, parts, options) for products in noises]
+    for search in searches:
         search.run(kind if factor > options.enlarged else None)
-        if best is None or products.likelihood + search.gain > best[0]:
-            best = products.likelihood + search.gain, search
-    if best is None or not best[1].scales or best[0] <= without:
+    best = max(searches, key=lambda one: one.products.likelihood + one.gain)
+    scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
+    if not scales:
         return no_discrepancy(info)
-    search = best[1]
     # scales by the noise that fits best, gains by the weights with which the estimate was made
-    gain = at_solution.gain[:, : fixed.start] @ search.root
-    spread = gain @ search.second_moment @ gain.T
-    every = tuple(one.effect for one in components)
-    return Discrepancy(tuple(search.scales), spread, RandomEffects(every, search.root))
+    smooth = ~np.any(best.root[ends[len(components)] :], axis=0)
+    root = best.root[: ends[len(components)], smooth]
+    gain = at_solution.gain[:, : ends[len(components)]] @ root
+    spread = gain @ best.second_moment[np.ix_(smooth, smooth)] @ gain.T
+    return Discrepancy(scales, spread, RandomEffects(tuple(effects[: len(components)]), root))
 
 
 class _Search:
@@ -209,7 +203,8 @@ class _Search:
 
         level = self.options.false_alarm / max(len(self.components), 1)
         beyond = float(chdtri(1.0, 2 * level))
-        while len(self.scales) < self.options.most:
+        named = sum(one.code.startswith(NAMED) for one in self.components)
+        while len(self.scales) < self.options.most + named:
             squared, value = self._left()
             codes = {one.code for one in self.scales}
             best: ComponentScale | None = None
