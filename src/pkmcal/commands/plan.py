@@ -92,7 +92,7 @@ def plan(
 
     from pkmcal.cameras import load_camera
     from pkmcal.commands.simulate import parsed_size
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.planning.plan import plan_measurements as run
     from pkmcal.planning.subject import as_it_stands, of_machine
@@ -106,7 +106,7 @@ def plan(
     console.check_positive("--corner-noise", corner_noise, 100)
     console.check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
-    folder = out or (Path("plan") if session is None else session / "plan")
+    folder = out or default_output((session or Path()) / "plan")
     files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}
     over = check_own_folder(
         folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"
