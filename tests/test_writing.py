@@ -1,30 +1,35 @@
 """Outputs: whole or not at all, and nothing left behind."""
 
-import contextlib
+import errno
+import json
 import os
 import pickle
 import shutil
 import stat
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from faults import fault
-from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import (
     check_own_folder,
     check_writable,
+    default_output,
+    entries,
+    output_lock,
     read_text,
     staged_folder,
     write_bytes,
     write_folder,
     write_text,
 )
-from pkmcal.files.writing import COMMITTED_FOLDER
+from pkmcal.files.replacing import COMMITTED_FOLDER
 
 
 def everything_in(folder):
@@ -71,7 +76,7 @@ def test_a_folder_that_refuses(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", refuse)
     message = fault(check_writable, tmp_path / "out")
     assert "cannot be written (Permission denied)" in message
-    assert "Choose another folder" in message
+    assert "Change the permissions" in message
 
 
 def test_a_new_folder_appears_at_once(tmp_path):
@@ -123,11 +128,15 @@ def test_a_clash_is_noticed_before_anything_is_moved(tmp_path):
 
 
 KILLED = """
-import itertools, os, pickle, shutil, signal, sys
+import itertools, json, os, pickle, shutil, signal, sys
+from contextlib import suppress
 from pathlib import Path
 import pkmcal.calibration.calibrate
+from pkmcal.calibration.results import check_output
 from pkmcal.commands import calibrate, cli
 from pkmcal.commands import finish as end
+from pkmcal.errors import InputError
+from pkmcal.files import read_text, write_folder
 
 session, new, keep, made = map(Path, sys.argv[1:])
 found = pickle.loads(made.read_bytes())
@@ -149,6 +158,14 @@ def count_down(event, values):
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+def readable():
+    # Whether what stands there is read, or said to be unfinished.
+    with suppress(InputError):
+        read_text(out / "calibration.json")
+        return True
+    return False
+
+
 def again_and_again(outcome, folder, files, over):
     # Calibration and page are made once, and written again and again, with less and less time.
     global left
@@ -156,6 +173,7 @@ def again_and_again(outcome, folder, files, over):
     made = end.contents(outcome, files)
     made["report.html"] = made["report.html"][:10_000]
     end.contents = lambda *_: made
+    read = []
     for left in itertools.count():
         shutil.rmtree(out)
         shutil.copytree(old, out)
@@ -166,8 +184,19 @@ def again_and_again(outcome, folder, files, over):
             os._exit(0)
         if os.waitpid(child, 0)[1] == 0:
             break
-        shutil.copytree(out, keep / f"{left:03d}")
+        state = keep / f"{left:03d}"
+        shutil.copytree(out, state / "killed")
+        read.append(readable())
+        shutil.copytree(out, state / "read")
+        check_output(out)  # the next command that writes there begins so
+        shutil.copytree(out, state / "finished")
+        write_folder(out, dict.fromkeys(made, "2"), check_output(out))
+        shutil.copytree(out, state / "next")
+    shutil.rmtree(out)
+    shutil.copytree(old, out)
+    write(outcome, folder, files, over)
     shutil.copytree(out, new)
+    (keep / "old" / "readable").write_text(json.dumps(read))
 
 
 calibrate.write_outcome = again_and_again
@@ -193,24 +222,27 @@ def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     before, after = contents_of(keep / "old"), contents_of(new)
+    readable = json.loads(before.pop("readable"))
     assert not before.items() & after.items()
     assert set(before) - set(after) == {"camera-front.yaml"}
     states = [path for path in sorted(keep.iterdir()) if path.name != "old"]
-    seen = []
-    for state in states:
-        again = tmp_path / f"again-{state.name}"
-        shutil.copytree(state, again)
-        with contextlib.suppress(InputError):
-            load(state)  # whoever reads finds one of the two
-        visible = {k: v for k, v in contents_of(state).items() if not k.startswith(".stage.")}
+    finished = []
+    for state, read in zip(states, readable, strict=True):
+        killed, looked = contents_of(state / "killed"), contents_of(state / "read")
+        assert looked == killed  # whoever reads changes nothing
+        visible = {k: v for k, v in killed.items() if not k.startswith(".stage.")}
+        # and finds the one or the other, or is told
+        assert (visible in (before, after)) == read
+        assert any((state / "read" / COMMITTED_FOLDER).glob("*")) != read
+        # the next run begins with the one or the other, keeps its files and nothing of this one
+        visible = contents_of(state / "finished")
+        visible = {k: v for k, v in visible.items() if not k.startswith(".stage.")}
         assert visible in (before, after)
-        seen.append(visible == after)
-        # and the next run is not kept from working, nor keeps anything of this one
-        write_folder(again, dict.fromkeys(after, "2"), check_output(again))
-        assert contents_of(again) == dict.fromkeys(after, b"2")
-    # Old ones, then new ones; some of the new ones were finished by who read them.
-    assert seen == sorted(seen)
-    assert 5 < seen.index(True) < len(seen) - 3
+        finished.append(visible == after)
+        assert contents_of(state / "next") == dict.fromkeys(after, b"2")
+    assert finished == sorted(finished)  # old ones, then new ones
+    assert 5 < finished.index(True) < len(finished) - 3
+    assert {*readable} == {False, True}
 
 
 def contents_of(folder):
@@ -222,22 +254,53 @@ def contents_of(folder):
 
 
 def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path):
-    for name in (".stage.0123456789ab.part", ".probe.0123456789ab.part"):
-        (tmp_path / name / "new").mkdir(parents=True)
+    (tmp_path / ".probe.0123456789ab.part").mkdir()
     assert check_own_folder(tmp_path, ["a"], "a trial") == []
     write_folder(tmp_path, {"a": "1"})
     assert everything_in(tmp_path) == ["a"]
 
 
-STAGED = """
-import os, signal, sys
-from pkmcal.files import staged_folder
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_what_only_looks_like_a_stage_stays(tmp_path, kind):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a").touch()
+    name = tmp_path / ".stage.0123456789ab.part"
+    if kind == "file":
+        name.touch()
+    elif kind == "folder":
+        shutil.copytree(tmp_path / "mine", name)
+    else:
+        name.symlink_to(tmp_path / "mine")
+    before = everything_in(tmp_path)
+    write_text(tmp_path / "b", "1")
+    assert everything_in(tmp_path) == sorted([*before, "b"])
 
-with staged_folder(sys.argv[1]) as stage:
-    (stage / "photograph").write_bytes(b"1")
-    print("written", flush=True)
-    sys.stdin.read()
+
+STAGED = """
+import sys
+from pkmcal.files import staged_file, staged_folder
+
+if sys.argv[2] == "file":
+    with staged_file(sys.argv[1]) as part:
+        part.write_bytes(b"1")
+        print("written", flush=True)
+        sys.stdin.read()
+else:
+    with staged_folder(sys.argv[1]) as stage:
+        (stage / "photograph").write_bytes(b"1")
+        print("written", flush=True)
+        sys.stdin.read()
 """
+
+
+def begun(path, what="folder"):
+    """A process that has written to `path` all that it wants to, and waits."""
+    run = subprocess.Popen(
+        [sys.executable, "-c", STAGED, path, what],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stdout.readline() == "written\n"
+    return run
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGKILL")
@@ -248,12 +311,7 @@ def test_the_next_run_clears_what_a_killed_one_left_and_no_other(tmp_path, there
     def begin(name):
         if there:
             (tmp_path / name).mkdir()
-        run = subprocess.Popen(
-            [sys.executable, "-c", STAGED, tmp_path / name],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert run.stdout.readline() == "written\n"
-        return run
+        return begun(tmp_path / name)
 
     def stages():
         return list(tmp_path.rglob("photograph"))
@@ -272,6 +330,19 @@ def test_the_next_run_clears_what_a_killed_one_left_and_no_other(tmp_path, there
     assert everything_in(tmp_path / "two") == ["photograph"]
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGKILL")
+def test_what_a_killed_save_of_a_file_left_is_cleared_and_no_other(tmp_path):
+    killed, alive = begun(tmp_path / "one", "file"), begun(tmp_path / "two", "file")
+    killed.kill()
+    killed.communicate()
+    assert len(list(tmp_path.iterdir())) == 2
+    write_text(tmp_path / "three", "3")
+    assert sorted(path.name[:4] for path in tmp_path.iterdir()) == [".two", "thre"]
+    alive.communicate("")
+    assert alive.returncode == 0
+    assert everything_in(tmp_path) == ["three", "two"]
+
+
 def test_of_an_earlier_result_no_file_stays(tmp_path):
     (tmp_path / "mine").write_text("1")
     write_folder(tmp_path, {"a": "1", "b": "1"})
@@ -279,16 +350,251 @@ def test_of_an_earlier_result_no_file_stays(tmp_path):
     assert everything_in(tmp_path) == ["b", "mine"]
 
 
-def test_a_replacement_that_cannot_be_finished_is_told(tmp_path, monkeypatch):
-    write_text(tmp_path / COMMITTED_FOLDER / "new" / "a", "1")
+# ------------------------------------------------------------------ replacements cut short
 
+
+OLD, NEW = dict.fromkeys("abc", "old"), {**dict.fromkeys("acd", "new"), "sub/e": "new"}
+
+
+def texts_of(folder):
+    return {name: content.decode() for name, content in contents_of(folder).items()}
+
+
+def cut_short(folder, monkeypatch):
+    """Replace OLD by NEW, and be stopped after the commit and the first move."""
+    write_folder(folder, OLD)
+    replace, count = Path.replace, iter(range(9))
+
+    def counted(path, target):
+        if next(count) == 2:
+            raise KeyboardInterrupt
+        return replace(path, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", counted)
+        with pytest.raises(KeyboardInterrupt):
+            write_folder(folder, NEW, over=["b"])
+    assert (folder / COMMITTED_FOLDER).is_dir()
+    assert "new" in texts_of(folder).values()
+
+
+@pytest.fixture
+def interrupted(tmp_path, monkeypatch):
+    """A folder whose files were being replaced when the process ended."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "out"
+    cut_short(folder, monkeypatch)
+    return folder
+
+
+def test_a_replacement_cut_short_is_finished_by_the_next_that_writes_there(interrupted):
+    assert COMMITTED_FOLDER in fault(read_text, interrupted / "a")
+    assert entries(interrupted) == ["a", "c", "d", "sub"]
+    assert texts_of(interrupted) == NEW
+
+
+def test_a_replacement_cut_short_again_is_finished_all_the_same(interrupted, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "replace", refuse)
-        assert "cannot be moved to their place (Permission denied)" in fault(
-            read_text, tmp_path / "a"
-        )
-    assert read_text(tmp_path / "a") == "1"
-    assert everything_in(tmp_path) == ["a"]
+        assert "cannot be moved to their place (Permission denied)" in fault(entries, interrupted)
+    entries(interrupted)
+    assert texts_of(interrupted) == NEW
+
+
+def left_alone(folder):
+    """Whether neither readers nor writers follow what lies in COMMITTED_FOLDER, and say so."""
+    before = contents_of(folder.parent)
+    refused = [
+        fault(read_text, folder / "a"),
+        fault(entries, folder),
+        fault(write_folder, folder, {"a": "newer"}),
+    ]
+    after = {k: v for k, v in contents_of(folder.parent).items() if not k.startswith("cache/")}
+    return all(COMMITTED_FOLDER in text for text in refused) and after.items() <= before.items()
+
+
+def moved(folder):
+    elsewhere = folder.with_name("elsewhere")
+    folder.rename(elsewhere)
+    return elsewhere
+
+
+def with_other_content(folder):
+    (folder / COMMITTED_FOLDER / "new" / "d").write_text("other")
+
+
+def with_one_more(folder):
+    journal = folder / COMMITTED_FOLDER / "journal"
+    journal.write_text(journal.read_text().replace('["b"]', '["b", "a"]'))
+
+
+def with_a_link_for_a_file(folder):
+    (folder.parent / "secret").write_text("new")
+    (folder / COMMITTED_FOLDER / "new" / "d").unlink()
+    (folder / COMMITTED_FOLDER / "new" / "d").symlink_to(folder.parent / "secret")
+
+
+def with_a_link_for_a_folder(folder):
+    (folder.parent / "home").mkdir()
+    (folder.parent / "home" / "e").write_text("mine")
+    (folder / "sub").symlink_to(folder.parent / "home")
+
+
+def with_a_link_for_itself(folder):
+    elsewhere = folder.with_name("elsewhere")
+    (folder / COMMITTED_FOLDER).rename(elsewhere)
+    (folder / COMMITTED_FOLDER).symlink_to(elsewhere)
+
+
+def unsigned(folder):
+    (folder / COMMITTED_FOLDER / "journal").unlink()
+
+
+CHANGES = (
+    moved, with_other_content, with_one_more, with_a_link_for_a_file, with_a_link_for_a_folder,
+    with_a_link_for_itself, unsigned,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_replacement_that_was_changed_is_not_finished(interrupted, change):
+    assert left_alone(change(interrupted) or interrupted)
+
+
+def test_another_users_replacement_is_not_finished(interrupted, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache" / "another"))
+    assert left_alone(interrupted)
+
+
+def test_where_no_key_can_be_kept_files_are_replaced_all_the_same(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "cache"))
+    write_folder(tmp_path / "out", OLD)
+    write_folder(tmp_path / "out", NEW, over=["b"])
+    assert texts_of(tmp_path / "out") == NEW
+    cut_short(tmp_path / "again", monkeypatch)
+    assert COMMITTED_FOLDER in fault(entries, tmp_path / "again")
+
+
+def test_a_reader_waits_for_who_moves_files(interrupted):
+    with ThreadPoolExecutor(1) as pool, output_lock(interrupted):
+        read = pool.submit(read_text, interrupted / "a")
+        time.sleep(0.2)
+        assert not read.done()
+        entries(interrupted)
+    assert read.result() == "new"
+
+
+def test_the_journals_key_is_the_users_alone(interrupted, tmp_path):
+    keys = [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+    assert [stat.S_IMODE(path.stat().st_mode) for path in keys] == [0o600] * len(keys)
+    assert keys
+
+
+# ------------------------------------------------------------------ links, names, refusals
+
+
+def test_no_file_goes_through_a_link_in_an_output(tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "sub").symlink_to(tmp_path / "home")
+    assert "a link stands where a folder should go" in fault(
+        write_folder, tmp_path / "out", {"a": "1", "sub/b": "1"}
+    )
+    assert everything_in(tmp_path) == ["home", "out", "out/sub"]
+
+
+def test_a_link_in_a_files_place_is_replaced_and_not_followed(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "out").mkdir()
+    for name in "ab":
+        (tmp_path / "out" / name).symlink_to(tmp_path / "mine")
+    write_folder(tmp_path / "out", {"a": "new"})
+    write_text(tmp_path / "out" / "b", "new")
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert texts_of(tmp_path / "out") == {"a": "new", "b": "new"}
+    assert not any(path.is_symlink() for path in (tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("name", ["../a", "sub/../../a", "/a", "", "."])
+def test_no_name_leads_out_of_an_output(tmp_path, name):
+    assert "no file can have this name" in fault(write_folder, tmp_path / "out", {name: "1"})
+    assert everything_in(tmp_path) == []
+
+
+def test_an_output_that_nobody_named_is_no_link(tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "calibration").symlink_to(tmp_path / "home")
+    assert "Name the folder to write to with -o" in fault(default_output, tmp_path / "calibration")
+    assert default_output(tmp_path / "home") == tmp_path / "home"
+    write_folder(tmp_path / "calibration", {"a": "1"})  # one that is named may be a link
+    assert everything_in(tmp_path / "home") == ["a"]
+
+
+@pytest.mark.parametrize("there", ["itself", "nothing"])
+def test_an_output_that_links_to_nothing_is_refused_before_the_work(tmp_path, there):
+    (tmp_path / "out").symlink_to("out" if there == "itself" else "nothing")
+    assert "a link to what is not there" in fault(check_writable, tmp_path / "out" / "deeper")
+
+
+@pytest.mark.parametrize(
+    ("number", "word"),
+    [
+        (errno.ENOSPC, "Free space"), (errno.EDQUOT, "Free space"), (errno.EROFS, "only be read"),
+        (errno.EACCES, "permissions"), (errno.EPERM, "permissions"), (errno.EIO, "another folder"),
+    ],
+)  # fmt: skip
+def test_what_to_do_follows_from_what_was_refused(tmp_path, monkeypatch, number, word):
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    for write in (write_text, lambda path, text: write_folder(path, {"a": text})):
+        with pytest.raises(InputError) as caught:
+            write(tmp_path / "out", "1")
+        assert word in caught.value.next_step
+        assert ("permissions" in caught.value.next_step) == (word == "permissions")
+    assert everything_in(tmp_path) == []
+
+
+# ------------------------------------------------------------------ several at once
+
+
+AT_ONCE = """
+import os, pickle, sys
+from dataclasses import replace
+from pathlib import Path
+from pkmcal.report.calibration import save
+
+out, made = map(Path, sys.argv[1:3])
+calibration = pickle.loads(made.read_bytes())
+save(calibration, out.with_name("trial"))  # whatever is made once
+start, go = os.pipe()
+children = []
+for number in range(int(sys.argv[3])):
+    child = os.fork()
+    if child == 0:
+        os.close(go)
+        os.read(start, 1)  # until all are there
+        save(replace(calibration, seed=number), out)
+        os._exit(0)
+    children.append(child)
+os.close(go)
+sys.exit(sum(os.waitpid(child, 0)[1] != 0 for child in children))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_of_calibrations_that_end_at_once_none_is_lost(calibrated, tmp_path):
+    made, out = tmp_path / "calibrated.pickle", tmp_path / "outputs" / "new"
+    made.write_bytes(pickle.dumps(calibrated))
+    done = subprocess.run(
+        [sys.executable, "-c", AT_ONCE, out, made, "4"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    results = [path for path in out.parent.iterdir() if path.name != "trial"]
+    assert sorted(load(path).seed for path in results) == [0, 1, 2, 3]
+    assert out in results

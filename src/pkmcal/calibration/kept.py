@@ -38,8 +38,8 @@ def keep_earlier(
     written = datetime.fromtimestamp((folder / document).stat().st_mtime)
     stem = f"{folder.name}-{written:%Y-%m-%dT%H%M}"
     number, place = 1, folder.with_name(stem)
-    while entries(place) or place.is_file():
-        if _copied(folder, names, place):
+    while place.is_symlink() or place.is_file() or entries(place):
+        if not place.is_symlink() and _copied(folder, names, place):
             return place
         number += 1
         place = folder.with_name(f"{stem}-{number}")

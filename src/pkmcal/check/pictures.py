@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.check.look import Look, StationLook
-from pkmcal.files import staged_folder
+from pkmcal.files import place_below, staged_folder
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.drawn import Drawn, Picture, Spot, machine_laid_over
@@ -96,7 +96,7 @@ def picture_names(look: Look) -> dict[tuple[int, int], str]:
     for s, station in enumerate(look.stations):
         photographs = look.session.stations[station.photographs.station].photographs
         for k in range(len(photographs)):
-            out[s, k] = f"{station.name}-{photographs[k].path.stem}.png"
+            out[s, k] = re.sub(r"[/\\]", "-", f"{station.name}-{photographs[k].path.stem}.png")
     return out
 
 
@@ -109,7 +109,7 @@ def write_pictures(look: Look, folder: Path) -> None:
             done, packed = cv2.imencode(".png", picture(look, look.stations[s], k))
             if not done:
                 raise OSError(f"{name} could not be encoded as PNG")
-            (stage / name).write_bytes(packed.tobytes())
+            place_below(stage, name).write_bytes(packed.tobytes())
 
 
 def picture(look: Look, station: StationLook, k: int) -> Any:

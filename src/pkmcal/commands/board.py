@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,9 @@ def board(
     source = file / "board.yaml" if file.is_dir() else file
     target = out or source.with_suffix(".pdf")
     pdf, name = sheet_pdf(load_board(source, label=str(source)), paper)
-    if target.exists() and (target.is_dir() or b"/Producer (pkmcal)" not in target.read_bytes()):
+    there = os.path.lexists(target)
+    regular = target.is_file() and not target.is_symlink()
+    if there and not (regular and b"/Producer (pkmcal)" in target.read_bytes()):
         raise InputError(
             "this is not a board that pkmcal wrote, and stays as it is",
             where=str(target),

@@ -57,6 +57,7 @@ def calibrate(
     from pkmcal.calibration.calibrate import calibrate_session as run
     from pkmcal.calibration.kept import keep_earlier
     from pkmcal.calibration.results import check_output
+    from pkmcal.files import default_output, output_lock
     from pkmcal.report.calibration import outcome_of
     from pkmcal.report.rrd import check_rrd, write_rrd
     from pkmcal.session.load import load_session
@@ -65,8 +66,8 @@ def calibrate(
         check_rrd(rrd)
 
     loaded = load_session(session, model)
-    folder = out or loaded.folder / "calibration"
-    over = check_output(folder, force=force)
+    folder = out or default_output(loaded.folder / "calibration")
+    check_output(folder, force=force)
     with console.progress(quiet or as_json) as told:
         found = run(
             loaded,
@@ -78,8 +79,10 @@ def calibrate(
         )
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
-        kept = None if force else keep_earlier(folder, outcome.texts)
-        write_outcome(outcome, folder, CALIBRATION_FILES, over)
+        with output_lock(folder):  # another run may have written there meanwhile
+            over = check_output(folder, force=force)
+            kept = None if force else keep_earlier(folder, outcome.texts)
+            write_outcome(outcome, folder, CALIBRATION_FILES, over)
         files = dict(CALIBRATION_FILES)
         if rrd is not None:
             write_rrd(found, rrd)

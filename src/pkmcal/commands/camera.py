@@ -17,6 +17,7 @@ CAMERA_FILES = {
     "camera.yaml": "the camera, for a session's cameras/",
     "camera.json": "everything, with covariances",
 }
+CAMERA_FOLDER = Path("camera")
 OTHER_CAMERA_FILES = {
     "opencv": "camera.opencv.yaml",
     "ros": "camera.ros.yaml",
@@ -48,7 +49,7 @@ def camera(
         Literal["auto", "pinhole", "fisheye", "unified"],
         typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors)."),
     ] = "auto",
-    out: Annotated[Path, console.folder("Where the results go.")] = Path("camera"),
+    out: Annotated[Path, console.folder("Where the results go.")] = CAMERA_FOLDER,
     to: Annotated[
         list[CameraFileForm] | None,
         typer.Option(metavar="NAME", help="Write it for opencv, ros or kalibr as well."),
@@ -60,7 +61,7 @@ def camera(
 
     from pkmcal.boards.board import load_board
     from pkmcal.boards.camera import calibrate_photographs
-    from pkmcal.files import check_writable
+    from pkmcal.files import check_writable, default_output
     from pkmcal.report.camera import outcome_of
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():
@@ -68,7 +69,7 @@ def camera(
     else:
         paths, there = photographs(images), board or board_file_of(images)
     described = load_board(board or there)
-    check_writable(out)
+    check_writable(default_output(out) if out == CAMERA_FOLDER else out)
     others = [(OTHER_CAMERA_FILES[form.value], form.value) for form in to or []]
     with console.progress(as_json) as told:
         told(f"Looking for the board in {len(paths)} photographs", 0.1)

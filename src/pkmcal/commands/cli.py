@@ -169,11 +169,13 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
         )
         return said, said.exit_code
     if isinstance(error, OSError):  # no space, no permission, a disk taken away
+        from pkmcal.files import next_step_after
+
         reason = (error.strerror or str(error) or type(error).__name__).lower()
         said = InputError(
             f"the operating system refused: {reason}",
             where=str(error.filename) if error.filename else None,
-            next_step="Make room, change the permissions, or name another folder",
+            next_step=next_step_after(error),
         )
         return said, said.exit_code
     defect = PkmcalError(

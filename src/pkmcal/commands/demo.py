@@ -97,9 +97,9 @@ def demo(
 
 def _make_room(out: Path) -> None:
     """Remove an earlier demonstration; anything else in the folder is somebody's."""
-    from pkmcal.files import entries, remove_folder
+    from pkmcal.files import default_output, entries, remove_folder
 
-    standing = entries(out)
+    standing = entries(default_output(out) if out == DEMO_FOLDER else out)
     if not standing:
         return
     ours = {DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME}

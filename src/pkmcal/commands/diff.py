@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +36,7 @@ def diff(
     from threadpoolctl import threadpool_limits
 
     from pkmcal.calibration.kept import keep_earlier
-    from pkmcal.files import check_own_folder, json_text, resolved
+    from pkmcal.files import check_own_folder, default_output, json_text, output_lock
     from pkmcal.judge.difference import difference
     from pkmcal.report.difference import outcome_of
 
@@ -48,10 +49,13 @@ def diff(
     folder = out or Path("diff")
     if out is None:
         if saved is not None:
-            beside, here = resolved(saved.path).parent.parent / "diff", Path.cwd()
+            # without following links, which may lead out of somebody else's folder
+            beside, here = Path(os.path.normpath(saved.path.absolute())), Path.cwd()
+            beside = beside.parent.parent / "diff"
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
-        check_own_folder(folder, DIFFERENCE_FILES, "a difference")
+        check_own_folder(default_output(folder), DIFFERENCE_FILES, "a difference")
     outcome = outcome_of(found)
     texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
-    kept = None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
-    return finish(outcome, folder, DIFFERENCE_FILES, kept=kept, as_json=as_json)
+    with output_lock(folder):  # another run may have written there meanwhile
+        kept = None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
+        return finish(outcome, folder, DIFFERENCE_FILES, kept=kept, as_json=as_json)

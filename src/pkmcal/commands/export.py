@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,10 +44,11 @@ def export(
     from pkmcal.calibration.source import load_source
     from pkmcal.export.contract import exporter_of, write_export
     from pkmcal.export.contract import make_export as run
+    from pkmcal.files import default_output
 
     exporter_of(to)
     source = load_source(calibration, session)
-    folder = out or _beside(calibration, to)
+    folder = out or default_output(_beside(calibration, to))
     made = run(source, to, force=force)
     write_export(made, folder)
     if as_json:
@@ -57,13 +59,13 @@ def export(
 
 
 def _beside(calibration: str, to: str) -> Path:
-    """Beside a calibration's folder, or here for a machine that is only a file or a name."""
-    from pkmcal.files import resolved
-
+    """Beside a calibration's folder, or here for a machine that is only a file or a name. Links are
+    not followed: they may lead out of somebody else's folder.
+    """
     path = Path(calibration)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
     if (folder / "calibration.json").is_file():
-        return resolved(folder).parent / f"export-{to}"
+        return Path(os.path.normpath(folder.absolute())).parent / f"export-{to}"
     return Path(f"export-{to}")
 
 

@@ -107,13 +107,13 @@ def plan(
     """The next configurations worth measuring."""
     from pkmcal.api.plan import plan as run
     from pkmcal.commands.simulate import parsed_size
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import session_folder
     from pkmcal.simulation.demo import camera_of_size
 
     session = session_folder(subject)
-    folder = out or (Path("plan") if session is None else session / "plan")
+    folder = out or default_output((session or Path()) / "plan")
     files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}
     over = check_own_folder(
         folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"

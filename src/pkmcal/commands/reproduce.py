@@ -10,6 +10,8 @@ import typer
 
 from pkmcal.commands import console
 
+REPRODUCTION_FOLDER = Path("reproduction")
+
 
 class Paper(StrEnum):
     """A paper that can be reproduced."""
@@ -32,12 +34,12 @@ def reproduce(
     photographs: Annotated[
         bool, typer.Option("--photographs", help="Measure Table 1 on rendered photographs.")
     ] = False,
-    out: Annotated[Path, console.folder("Where the pages go.")] = Path("reproduction"),
+    out: Annotated[Path, console.folder("Where the pages go.")] = REPRODUCTION_FOLDER,
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
     from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, contents
-    from pkmcal.files import check_own_folder, write_folder
+    from pkmcal.files import check_own_folder, default_output, write_folder
     from pkmcal.studies.reproduction import Options
     from pkmcal.studies.reproduction import reproduce_paper as computed
 
@@ -49,6 +51,8 @@ def reproduce(
         for paper in Paper
     }
     ours = {name for names in files.values() for name in names}
+    if out == REPRODUCTION_FOLDER:
+        default_output(out)
     check_own_folder(out, ours, "reproductions", "earlier reproductions")
     wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
     with console.progress(as_json) as told:

@@ -87,7 +87,7 @@ def servo(
     from pkmcal.control.simulation import LoopSettings
     from pkmcal.control.source import legs_of_text, load_plant, pose_of_text
     from pkmcal.control.study import Plan, study_servoing
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.report.servo import outcome_of
     from pkmcal.simulation.edges import EdgeNoise
 
@@ -112,7 +112,7 @@ def servo(
         for text, where in ((start, "--start"), (goal, "--goal"))
     )
     plan = Plan(loop, runs, seed, hand_position, float(np.deg2rad(hand_rotation)), first, last)
-    folder = out or Path("servo")
+    folder = out or default_output(Path("servo"))
     check_own_folder(folder, SERVO_FILES, "a study of servoing", "an earlier study")
     numbers = None if legs is None else legs_of_text(legs)
     scene = load_plant(

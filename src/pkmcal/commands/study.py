@@ -11,6 +11,7 @@ from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
 from pkmcal.errors import InputError
 
+STUDY_FOLDER = Path("study")
 RUN_ROWS_DESCRIPTION = "one row a run"
 
 
@@ -33,17 +34,18 @@ def study(
         console.number("study", "runs", "N", "Simulations of each combination."),
     ] = 100,
     seed: console.Seed = 0,
-    out: Annotated[Path, console.folder("Results, and what is finished.")] = Path("study"),
+    out: Annotated[Path, console.folder("Results, and what is finished.")] = STUDY_FOLDER,
     table: Annotated[Literal["csv", "parquet"], typer.Option(help="Of the table of runs.")] = "csv",
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster's, to work there.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask cluster's, to work there; it is trusted."),
     ] = None,
     as_json: console.Json = False,
 ) -> int:
     """Tell by simulation how accurate calibrations would be."""
     from importlib.util import find_spec
 
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.studies.findings import study as simulated
     from pkmcal.studies.store import BATCHES_FOLDER
     from pkmcal.studies.study_report import outcome_of
@@ -62,6 +64,8 @@ def study(
         name: RUN_ROWS_DESCRIPTION,
     }
     ours = {"study.html", "study.json", "study.csv", "study.parquet", BATCHES_FOLDER}
+    if out == STUDY_FOLDER:
+        default_output(out)
     over = check_own_folder(out, ours, "a study", "an earlier study")
     try:
         with console.progress(as_json) as told:

@@ -27,13 +27,13 @@ def validate(
     as_json: console.Json = False,
 ) -> int:
     """Errors on data that the calibration did not see."""
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.judge.validate import validate_calibration as run
     from pkmcal.report.validation import outcome_of
     from pkmcal.session.load import load_session
 
     loaded = load_session(session)
-    folder = out or loaded.folder / "validation"
+    folder = out or default_output(loaded.folder / "validation")
     check_own_folder(folder, VALIDATION_FILES, "a validation")
     with console.progress(as_json) as told:
         found = run(calibration, loaded, regions=regions, seed=seed, progress=told)

@@ -34,13 +34,13 @@ def watch(
     as_json: console.Json = False,
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
-    from pkmcal.files import check_own_folder
+    from pkmcal.files import check_own_folder, default_output
     from pkmcal.judge.watch import watch_machine as run
     from pkmcal.report.watch import outcome_of
     from pkmcal.session.load import load_session
 
     loaded = load_session(session)
-    folder = out or loaded.folder / "watch"
+    folder = out or default_output(loaded.folder / "watch")
     check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")
     with console.progress(as_json) as told:
         found = run(

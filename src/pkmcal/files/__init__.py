@@ -19,6 +19,7 @@ from pkmcal.files.documents import (
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import IMAGE_FILE_ENDINGS, stated_size
+from pkmcal.files.locks import output_lock
 from pkmcal.files.quantities import (
     LARGEST_UNITLESS_LENGTH,
     Metres,
@@ -30,6 +31,7 @@ from pkmcal.files.quantities import (
     no_such,
     written_unit,
 )
+from pkmcal.files.refusals import next_step_after
 from pkmcal.files.regular import check_regular, resolved
 from pkmcal.files.schema import Schema, validated_document
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
@@ -37,8 +39,9 @@ from pkmcal.files.writing import (
     alone_in,
     check_own_folder,
     check_writable,
+    default_output,
     entries,
-    finish_replacement,
+    place_below,
     remove_folder,
     staged_file,
     staged_folder,
@@ -67,13 +70,16 @@ __all__ = [
     "check_writable",
     "closest",
     "csv_text",
+    "default_output",
     "entries",
     "field_path",
-    "finish_replacement",
     "json_text",
     "json_value",
+    "next_step_after",
     "no_such",
+    "output_lock",
     "parse_yaml",
+    "place_below",
     "read_csv",
     "read_exif",
     "read_json",

@@ -13,25 +13,27 @@ from pathlib import Path
 def remembered(name: str) -> bytes | None:
     """What is kept under a name; None for nothing."""
     try:
-        return (_folder() / name).read_bytes()
+        return (cache_folder() / name).read_bytes()
     except OSError:
         return None
 
 
 def remember(name: str, content: bytes) -> None:
-    """Keep it, whole or not at all."""
-    place = _folder()
+    """Keep it, whole or not at all, for this user alone to read: code is kept, and a key."""
+    place = cache_folder()
     new = place / f"{name}.{os.getpid()}"
     with suppress(OSError):
         place.mkdir(parents=True, exist_ok=True, mode=0o700)
         try:
+            new.touch(mode=0o600)
             new.write_bytes(content)
             new.replace(place / name)
         finally:
             new.unlink(missing_ok=True)
 
 
-def _folder() -> Path:
+def cache_folder() -> Path:
+    """The user's cache folder; it may not exist yet."""
     from platformdirs import user_cache_path
 
     return user_cache_path("pkmcal", appauthor=False)

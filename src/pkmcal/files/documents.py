@@ -16,7 +16,7 @@ import yaml
 
 from pkmcal.errors import InputError, legible
 from pkmcal.files.regular import check_regular
-from pkmcal.files.writing import finish_replacement
+from pkmcal.files.replacing import check_replaced
 
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
@@ -48,7 +48,7 @@ def text_blocks(path: Path, label: str) -> Iterator[str]:
 def _raw_blocks(path: Path, label: str) -> Iterator[bytes]:
     """A file's bytes, cut behind line ends of any kind."""
     try:
-        finish_replacement(path.parent)
+        check_replaced(path.parent)
         check_regular(path, label)
         with path.open("rb") as stream:
             rest: list[bytes] = []

@@ -1,33 +1,36 @@
-"""Outputs appear whole or not at all: written beside their place, then moved there. Of processes
-that work in one folder, one at a time may where that is asked for.
+"""Outputs appear whole or not at all: written beside their place, then moved there.
+
+What is written lies in a stage, a hidden folder of one process, until it is complete. Nothing is
+written through a link that stands inside an output.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import platform
 import re
 import secrets
 import shutil
-import sys
 from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import BinaryIO
+from hashlib import blake2b
+from pathlib import Path, PurePath
 
 from pkmcal.errors import InputError
+from pkmcal.files.locks import FOLDER_LOCK_FILE, NO_FOLLOW, lock, output_lock
+from pkmcal.files.refusals import next_step_after
+from pkmcal.files.replacing import (
+    COMMITTED_FOLDER,
+    NEW_FILES_FOLDER,
+    commit_replacement,
+    files_below,
+    finish_replacement,
+)
 from pkmcal.wording import listed
 
-COMMITTED_FOLDER = ".pkmcal-replacing"
-"""Inside a folder: all that was written for it, complete, on the way to its place."""
 WRITING_STAGE_NAME, WRITING_PROBE_NAME = "stage", "probe"
-_NEW, _GONE = "new", "gone"
-"""In a stage: the files as they will stand, and empty ones that name those which go."""
-_HELD = "held"
-"""In a stage, beside them: a file that its process has locked for as long as it lives."""
-FOLDER_LOCK_FILE = "lock"
-"""An empty file in a folder in which one process at a time works; it stays there."""
+_COMPLETE = "complete"
+"""In a stage: what becomes COMMITTED_FOLDER."""
 _LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
 """Names of `_beside`."""
 
@@ -41,6 +44,13 @@ def check_writable(folder: Path | str) -> None:
     folder = Path(folder)
     standing = folder
     while not standing.exists() and standing != standing.parent:
+        if standing.is_symlink():
+            raise InputError(
+                "outputs cannot go here: this is a link to what is not there",
+                where=str(standing),
+                found=str(standing.readlink()),
+                expected="a folder",
+            )
         standing = standing.parent
     if not standing.is_dir():
         raise InputError(
@@ -50,9 +60,26 @@ def check_writable(folder: Path | str) -> None:
     probe = _beside(standing / WRITING_PROBE_NAME)
     try:
         probe.mkdir()
-        probe.rmdir()
+        with suppress(FileNotFoundError):  # cleared away by another process
+            probe.rmdir()
     except OSError as error:
         raise _unwritable(folder, error) from None
+
+
+def default_output(folder: Path) -> Path:
+    """`folder`, in which results go that the user gave no place for.
+
+    Raises `InputError` where it is a link: it may be part of somebody else's session, and then
+    leads to any place of this computer.
+    """
+    if folder.is_symlink():
+        raise InputError(
+            "the folder for results is a link, which is followed only where you name it",
+            where=str(folder),
+            found=f"a link to {folder.readlink()}",
+            next_step="Name the folder to write to with -o",
+        )
+    return folder
 
 
 def check_own_folder(
@@ -79,13 +106,19 @@ def check_own_folder(
 
 
 def entries(folder: Path) -> list[str]:
-    """Sorted names in a folder, none where there is no folder; what a run that was killed left
-    there is none of them.
+    """Sorted names in an output folder that is going to be written to, none where there is none.
+
+    Finishes a replacement in which a process of this user was killed. Stages are not among the
+    names.
     """
     if not folder.is_dir():
         return []
     finish_replacement(folder)
-    return sorted(e.name for e in folder.iterdir() if not _LEFT_OVER.fullmatch(e.name))
+    return sorted(
+        entry.name
+        for entry in folder.iterdir()
+        if entry.name != COMMITTED_FOLDER and not _LEFT_OVER.fullmatch(entry.name)
+    )
 
 
 def write_folder(
@@ -98,7 +131,19 @@ def write_folder(
     with staged_folder(folder, over) as stage:
         for name, text in texts.items():
             content = text.encode("utf-8") if isinstance(text, str) else text
-            (stage / name).write_bytes(content)
+            path = place_below(stage, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+
+
+def place_below(folder: Path, name: str) -> Path:
+    """The place of a file in a folder, by a name that may be made of a session's own words.
+
+    Raises `InputError` where it would lie outside the folder.
+    """
+    if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not PurePath(name).name:
+        raise InputError("no file can have this name", where=str(folder), found=name)
+    return folder / name
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -115,19 +160,18 @@ def write_bytes(path: Path | str, content: bytes) -> None:
 @contextmanager
 def staged_file(path: Path | str) -> Generator[Path]:
     """Give a name to write to; on leaving without an error, that file is at `path`. The folder is
-    made where missing.
+    made where missing, and a link at `path` replaced.
     """
     path = Path(path)
-    part = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        _to_disk(part)
-        part.replace(path)
+        with _stage(path) as stage:
+            part = stage / path.name
+            yield part
+            _to_disk(part)
+            part.replace(path)
     except OSError as error:
         raise _unwritable(path, error) from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -135,47 +179,34 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
     """Give an empty folder to write into; on leaving without an error, all of it is in `folder`.
 
     over : names of files in `folder` that go, unless they were written again. Others stay.
-    A new folder appears in one step. What is to go into one that is there already is put into it
-    under the name COMMITTED_FOLDER, in one step, and moved to its place from there. A run that is
-    killed leaves the old files before that step, and after it COMMITTED_FOLDER, from which
-    `finish_replacement` goes on: the next time that anything here is read or written. On an error
-    nothing changes.
+    A new folder appears in one step. What is to go into one that is there already is committed in
+    one step (:mod:`pkmcal.files.replacing`), and moved to its place from there. On an error nothing
+    changes.
     """
     folder = Path(folder)
     check_writable(folder)
     finish_replacement(folder)
     # Inside a folder that exists, because that may be a mount of its own, where moves would copy.
-    stage = _beside(folder / WRITING_STAGE_NAME) if folder.is_dir() else _beside(folder)
-    new, gone = stage / _NEW, stage / _GONE
-    for place in {stage.parent, folder.parent}:
-        _clear_abandoned(place)
-    held: BinaryIO | None = None
+    beside = folder / WRITING_STAGE_NAME if folder.is_dir() else folder
     try:
-        new.mkdir(parents=True)
-        gone.mkdir()
-        held = _hold(stage)
-        yield new
-        written = _files(new)
-        for path in written:
-            _to_disk(path)
-        if folder.exists():
-            _check_clash(new, folder)
-            for name in over:
-                if new / name not in written and (folder / name).is_file():
-                    (gone / name).touch()
-            held.close()
-            (stage / _HELD).unlink()
-            stage.replace(folder / COMMITTED_FOLDER)
-            finish_replacement(folder)
-        else:
-            new.replace(folder)
-        _sweep(folder)
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        _clear_abandoned(folder.parent)
+        with _stage(beside) as stage:
+            new = stage / _COMPLETE / NEW_FILES_FOLDER
+            new.mkdir(parents=True)
+            yield new
+            written = files_below(new)
+            for path in written:
+                _to_disk(path)
+            with output_lock(folder):
+                finish_replacement(folder)
+                if folder.exists():
+                    gone = [n for n in over if new / n not in written and (folder / n).is_file()]
+                    commit_replacement(stage / _COMPLETE, folder, gone)
+                else:
+                    new.replace(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None
-    finally:
-        if held is not None:
-            held.close()
-        shutil.rmtree(stage, ignore_errors=True)
 
 
 @contextmanager
@@ -184,62 +215,34 @@ def alone_in(folder: Path, what: str) -> Generator[None]:
 
     what : what works there, such as "study". Raises InputError where another one does.
     """
-    check_writable(folder)
+    check_writable(default_output(folder))
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / FOLDER_LOCK_FILE).open("ab") as stream:
-        if _lock(stream.fileno()) is False:
+    path = folder / FOLDER_LOCK_FILE
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | NO_FOLLOW, 0o666)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    try:
+        if lock(file) is False:
             raise InputError(
                 f"another {what} works in this folder",
                 where=str(folder),
                 next_step="Wait until it has ended, or name another folder with -o",
             )
         yield
+    finally:
+        os.close(file)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder in one step, so that no part of it is ever taken for the whole."""
-    left = _beside(folder)
-    folder.replace(left)
-    shutil.rmtree(left)
-
-
-def finish_replacement(folder: Path) -> None:
-    """Finish a replacement of files in `folder` in which a run was killed, if there is one.
-
-    Several processes may do so at once, and it may be killed as well: what is moved is moved.
-    Raises `InputError` where that is not allowed here.
+    """Remove a folder in one step, so that no part of it is ever taken for the whole; of a link,
+    nothing but the link.
     """
-    committed = folder / COMMITTED_FOLDER
-    if not committed.is_dir():
+    if folder.is_symlink():
+        folder.unlink()
         return
-    new, gone = committed / _NEW, committed / _GONE
-    try:
-        for mark in _files(gone):
-            (folder / mark.relative_to(gone)).unlink(missing_ok=True)
-            mark.unlink(missing_ok=True)
-        for path in _files(new):
-            target = folder / path.relative_to(new)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with suppress(FileNotFoundError):  # another process was faster
-                path.replace(target)
-    except OSError as error:
-        raise InputError(
-            f"new files cannot be moved to their place ({error.strerror or error})",
-            where=str(folder),
-            found=f"what a run that was cut short left in {COMMITTED_FOLDER}",
-            next_step="Close programs that hold these files, make the folder writable, and run"
-            " this again",
-        ) from None
-    # Folder by folder, so that files which another process commits meanwhile are safe.
-    for path in sorted(committed.rglob("*"), reverse=True):
-        with suppress(OSError):
-            path.rmdir()
-    with suppress(OSError):
-        committed.rmdir()
-
-
-def _files(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.rglob("*")) if not path.is_dir()]
+    with _stage(folder) as stage:
+        folder.replace(stage / _COMPLETE)
 
 
 def _to_disk(path: Path) -> None:
@@ -248,78 +251,72 @@ def _to_disk(path: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def _check_clash(new: Path, folder: Path) -> None:
-    """Look for what would stop a move before the first, so that the folder stays as it was."""
-    for path in new.rglob("*"):
-        target = folder / path.relative_to(new)
-        if path.is_dir() and target.exists() and not target.is_dir():
-            raise NotADirectoryError(20, "a file stands where a folder should go", str(target))
-        if target.is_dir() and not path.is_dir():
-            raise IsADirectoryError(21, "a folder stands where a file should go", str(target))
+@contextmanager
+def _stage(path: Path) -> Generator[Path]:
+    """Give a new folder beside `path`, and remove it, with all in it, on leaving.
 
-
-def _sweep(folder: Path) -> None:
-    """Remove what runs that were killed left of their attempts; of two that work at once, the
-    first to finish wins.
+    A file in it is locked as long as this process lives, so that others can tell.
     """
-    for place, names in (
-        (folder, (WRITING_STAGE_NAME, WRITING_PROBE_NAME)),
-        (folder.parent, (folder.name, WRITING_PROBE_NAME)),
-    ):
-        for path in list(place.iterdir()):
-            left = _LEFT_OVER.fullmatch(path.name)
-            if left and left["name"] in names and path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-
-
-def _hold(stage: Path) -> BinaryIO:
-    """A stage's file, locked, and the computer's name written into it when it is."""
-    held = (stage / _HELD).open("wb", buffering=0)
-    _lock(held.fileno())
-    held.write(_computer())
-    return held
-
-
-def _lock(file: int) -> bool | None:
-    """Lock an open file, by its descriptor, for as long as this process lives, however it ends;
-    False where another process has it.
-
-    None where the file system has no locks at all, as some of a network have none.
-    """
+    _clear_abandoned(path.parent)
+    stage, held = _locked_stage(path)
     try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        held = error.errno in (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK)
-        return False if held else None
-    return True
+        yield stage
+    finally:
+        os.close(held)
+        _remove_stage(stage)
 
 
-def _computer() -> bytes:
-    """Not all file systems of a network tell one computer what another has locked."""
-    return platform.node().encode() or b"?"
+def _locked_stage(path: Path) -> tuple[Path, int]:
+    """A new folder beside `path`, and the open file in it that is locked."""
+    while True:
+        stage = _beside(path)
+        stage.mkdir()
+        # Until its file is locked, another process may take the stage for an abandoned one.
+        with suppress(FileNotFoundError):
+            held = os.open(stage / _lock_file(), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+            if lock(held) is not False and (stage / _lock_file()).exists():
+                return stage, held
+            os.close(held)
+
+
+def _remove_stage(stage: Path) -> None:
+    """Remove a stage, its locked file last: what a kill leaves of it is still known for a stage."""
+    with suppress(OSError):
+        for path in stage.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.name != _lock_file():
+                path.unlink()
+        (stage / _lock_file()).unlink()
+        stage.rmdir()
 
 
 def _clear_abandoned(place: Path) -> None:
     """Remove stages in a folder whose process has ended before it was done, whatever they were
     for: an hour's photographs may lie in one. Those of which that is not certain stay.
     """
-    stages: list[Path] = []
-    with suppress(OSError):  # no such folder yet, or one whose names may not be listed
-        stages = [path for path in place.iterdir() if _LEFT_OVER.fullmatch(path.name)]
-    for stage in stages:
+    try:
+        found = [entry for entry in os.scandir(place) if _LEFT_OVER.fullmatch(entry.name)]
+    except OSError:  # no such folder yet, or one whose names may not be listed
+        return
+    for stage in (Path(entry.path) for entry in found if entry.is_dir(follow_symlinks=False)):
+        with suppress(OSError):
+            stage.rmdir()  # with nothing in it, as a probe
         with suppress(OSError):  # no stage, or one that another process removes
-            with (stage / _HELD).open("r+b") as held:  # empty: not locked yet
-                ours = held.read() == _computer() and held.seek(0) == 0
-                abandoned = ours and _lock(held.fileno())
+            held = os.open(stage / _lock_file(), os.O_RDWR | NO_FOLLOW)
+            try:
+                abandoned = lock(held)
+            finally:
+                os.close(held)
             if abandoned:
-                shutil.rmtree(stage, ignore_errors=True)
+                _remove_stage(stage)
+
+
+def _lock_file() -> str:
+    """The name of a stage's locked file. It tells this computer from others: not all file systems
+    of a network tell one computer what another has locked.
+    """
+    return f"locked-by-{blake2b(platform.node().encode(), digest_size=6).hexdigest()}"
 
 
 def _beside(path: Path) -> Path:
@@ -331,5 +328,5 @@ def _unwritable(path: Path, error: OSError) -> InputError:
     return InputError(
         f"cannot be written ({error.strerror or error})",
         where=str(path),
-        next_step="Choose another folder, or change its permissions",
+        next_step=next_step_after(error),
     )

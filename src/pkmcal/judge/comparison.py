@@ -206,10 +206,12 @@ def finite_rms(values: Array) -> float:
 def weighed_mean_and_rms(values: Array, sigma: Array) -> tuple[Array, Array]:
     """Mean and root mean square over n configurations of values (n, ...), weighed by their noise.
 
-    sigma : of the same shape; a pose that is hardly seen hardly counts. NaN is left out.
+    sigma : of the same shape; a pose that is hardly seen hardly counts. NaN is left out; of nothing
+    else, mean and root mean square are NaN.
     """
     weight = np.where(np.isfinite(values), sigma**-2.0, 0.0)
     values, total = np.nan_to_num(values), weight.sum(axis=0)
+    total = np.where(total > 0, total, np.nan)
     mean = np.sum(weight * values, axis=0) / total
     return mean, np.sqrt(np.sum(weight * values**2, axis=0) / total)
 

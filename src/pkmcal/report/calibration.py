@@ -21,7 +21,7 @@ from pkmcal.calibration.results import (
 )
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
-from pkmcal.files import write_folder
+from pkmcal.files import output_lock, write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
@@ -96,14 +96,14 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
     An earlier result in it is kept beside it, under its date, in the folder that is returned;
     ``force`` replaces it. Raises InputError where the folder holds anything else.
     """
-    over = check_output(folder, force=force)
+    folder = Path(folder)
+    check_output(folder, force=force)
     found = outcome_of(calibration)
-    kept = None if force else keep_earlier(Path(folder), found.texts)
-    write_folder(
-        Path(folder),
-        {CALIBRATION_REPORT_FILE: page.page_html(found, datetime.now()), **found.texts},
-        over,
-    )
+    texts = {CALIBRATION_REPORT_FILE: page.page_html(found, datetime.now()), **found.texts}
+    with output_lock(folder):  # another process may have written there meanwhile
+        over = check_output(folder, force=force)
+        kept = None if force else keep_earlier(folder, found.texts)
+        write_folder(folder, texts, over)
     return kept
 
 

@@ -68,8 +68,6 @@ class Store:
                     )
             else:
                 write_text(path, json_text(own))
-            for left in folder.glob(".*.part"):  # of a process that was killed while it wrote
-                left.unlink(missing_ok=True)
             yield cls(folder)
 
     def load(self, cell: int, number: int, batch: Batch) -> SolvedBatch | None:

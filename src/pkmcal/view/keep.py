@@ -16,15 +16,16 @@ class PoseFile:
     """session.yaml as it was read when the page was opened, and written since."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = resolved(folder / SESSION_FILE_NAME)
+        self._path = resolved(folder) / SESSION_FILE_NAME
         self._known = self._path.read_bytes()
         self._lock = Lock()
 
     def write(self, station: Station, T_camera_base: Array) -> str:
         """Write a station's pose; returns what was written, in words.
 
-        Raises InputError for a camera that is held by hand, for a file that somebody else has
-        changed meanwhile, and where the pose cannot be changed by itself.
+        Raises InputError for a camera that is held by hand, for a file that is a link, as in
+        somebody else's session, or that somebody else has changed meanwhile, and where the pose
+        cannot be changed by itself.
         """
         keys = ("stations", station.entry, "pose")
         if station.handheld:
@@ -34,6 +35,13 @@ class PoseFile:
                 next_step="Every such photograph is placed when you calibrate",
             )
         with self._lock:
+            if self._path.is_symlink():
+                raise InputError(
+                    "this file is a link to another one, and nothing is written through links",
+                    where=str(self._path),
+                    found=f"a link to {self._path.readlink()}",
+                    next_step="Nothing was written. Put a copy of the file in the link's place",
+                )
             try:
                 now = self._path.read_bytes()
             except OSError as error:

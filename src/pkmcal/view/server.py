@@ -9,7 +9,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import json_value, resolved
+from pkmcal.files import json_value, next_step_after, resolved
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
 from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
@@ -123,7 +123,11 @@ async def _answered(work: Callable[[], Any]) -> Response:
         return JSONResponse(error.as_dict(), 422)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        said = InputError(f"the operating system refused: {reason}", where=error.filename)
+        said = InputError(
+            f"the operating system refused: {reason}",
+            where=error.filename,
+            next_step=next_step_after(error),
+        )
         return JSONResponse(said.as_dict(), 422)
     except Exception as error:  # noqa: BLE001 - the last resort, as at the command line
         said = PkmcalError(

@@ -1,0 +1,22 @@
+"""What a person can do where the operating system refuses to write."""
+
+from __future__ import annotations
+
+import errno
+
+_NEXT_STEPS = {
+    errno.ENOSPC: "Free space on this disk, or name a folder on another one",
+    errno.EDQUOT: "Free space of your quota on this disk, or name a folder on another one",
+    errno.EFBIG: "Name a folder on a file system that takes files of this size",
+    errno.EROFS: "This file system can only be read: name a folder on another one",
+    errno.EACCES: "Change the permissions of this folder, or name another one",
+    errno.EPERM: "Change the permissions of this folder, or name another one",
+    errno.ENAMETOOLONG: "Name it more briefly",
+    errno.EMFILE: "Close files, or raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "Close other programs, which have too many files open",
+}
+
+
+def next_step_after(error: OSError) -> str:
+    """The sentence for a message's ``next_step``, without its full stop."""
+    return _NEXT_STEPS.get(error.errno or 0, "Name another folder")
