@@ -9,6 +9,7 @@ import resource
 import shutil
 import signal
 import sys
+import unicodedata
 import warnings
 from collections import Counter
 from contextlib import redirect_stdout
@@ -30,6 +31,11 @@ INTERNALS = re.compile(
     r"|pydantic|Errno|validation error|\bstr\b|KeyError|IndexError|TypeError|ValueError|imdecode"
 )
 """What no person should be shown."""
+INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
+"""Categories of characters that a terminal obeys or does not show."""
+ODD_FOLDER_NAME = os.fsdecode(b"a\xff\x1b[31m\n# \xe2\x80\xaeb")
+ODD_FOLDERS_EACH = 5
+"""Of so many cases one stands in a folder of such a name."""
 PROGRESS = re.compile(r"[A-Z].* \(\d+%, \d+ s\)")
 """What a long command says off a terminal."""
 PLACE = re.compile(
@@ -40,7 +46,7 @@ PLACE = re.compile(
 place of its own, or a photograph's name; or what kind of machine it is that a command does not
 take."""
 
-ELSEWHERE = re.compile(r"(^|: )/[\w/.-]+(, line \d+|: )")
+ELSEWHERE = re.compile(r"(^|: )/[\w/.\\\[# -]+(, line \d+|: )")
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,8 @@ class Result:
 
 def run(number: int, bases: Path, scratch: Path, keep: bool = False) -> Result:
     """Make a case, run its command, judge what it left."""
-    place = scratch / f"case-{number}"
+    odd = number % ODD_FOLDERS_EACH == 0
+    place = scratch / (f"case-{number}" + ODD_FOLDER_NAME * odd)
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     try:
@@ -177,12 +184,11 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
     found = INTERNALS.search(out + err)
     if found:
         faults.append(f"internals: {found[0]}")
+    hidden = {c for c in out + err if unicodedata.category(c) in INVISIBLE and c != "\n"}
+    if hidden:
+        faults.append(f"characters that cannot be seen: {sorted(hidden)!a}")
     errors = _errors(case, code, out, err, faults)
-    for sentence in errors:
-        if len(sentence) > LONGEST:
-            faults.append(f"an error of {len(sentence)} characters")
-        if re.search(r"[\x00-\x08\x0b-\x1f\x7f\u202e]", sentence):
-            faults.append("control characters in an error")
+    faults += [f"an error of {len(each)} characters" for each in errors if len(each) > LONGEST]
     faults += _written(case, code, before, after)
     refused = bool(errors) and code == 2
     has_file, has_field = True, True

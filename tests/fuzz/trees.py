@@ -92,7 +92,8 @@ TEXTS = (
     "cameras", "joints.csv", "session.yaml", "\u0085", "\u2028", "e\u0301", "\ufeff", "'", '"', "#",
     "legs[1].base.center.z", "legs[0]", "legs[999].x", "legs[*].base.center",
     "-legs[1].base.center", "gough-stewart", "gough-stewrat", "h4", "file:///etc/passwd", "CON",
-    "http://localhost/x.yaml",
+    "http://localhost/x.yaml", "a\u200bb", "a\u009b2Jb", "a\u2066b", "a\nM502", "a */ b --> c",
+    "a\r\n# b",
 )  # fmt: skip
 """Written in the place of a text."""
 DEEP = 60

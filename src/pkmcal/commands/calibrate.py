@@ -38,7 +38,7 @@ def calibrate(
     ] = False,
     holdout: Annotated[
         int,
-        console.number("calibrate", "holdout", "N", "Leave N poses out, and predict them."),
+        console.number_option("calibrate", "holdout", "N", "Leave N poses out, and predict them."),
     ] = 0,
     force: Annotated[
         bool,

@@ -30,7 +30,7 @@ ToldProgress = Callable[[str, float], None]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
-def number(command: str, name: str, metavar: str, described: str, *flags: str) -> Any:
+def number_option(command: str, name: str, metavar: str, described: str, *flags: str) -> Any:
     """A numeric option with its range in :data:`pkmcal.ranges.RANGES`, which its help tells.
 
     described : its help. flags : as they are written; ``--name`` unless given.

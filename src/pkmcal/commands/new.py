@@ -42,7 +42,7 @@ def new(
     ] = False,
     places: Annotated[
         int | None,
-        console.number("new", "places", "N", "Places that the camera stands in; 1."),
+        console.number_option("new", "places", "N", "Places that the camera stands in; 1."),
     ] = None,
     printer: Annotated[
         Path | None,

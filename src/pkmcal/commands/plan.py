@@ -36,7 +36,7 @@ def plan(
     out: Annotated[Path | None, console.folder("SESSION/plan, or plan, unless given.")] = None,
     configurations: Annotated[
         int,
-        console.number(
+        console.number_option(
             "plan",
             "configurations",
             "N",
@@ -51,10 +51,11 @@ def plan(
     ] = "tool",
     places: Annotated[
         int | None,
-        console.number("plan", "places", "N", "Choose N places of the camera as well."),
+        console.number_option("plan", "places", "N", "Choose N places of the camera as well."),
     ] = None,
     best_of: Annotated[
-        int | None, console.number("plan", "best_of", "N", "Choose N of the session's stations.")
+        int | None,
+        console.number_option("plan", "best_of", "N", "Choose N of the session's stations."),
     ] = None,
     after: Annotated[
         Path | None,
@@ -89,17 +90,20 @@ def plan(
         ),
     ] = None,
     edge_noise: Annotated[
-        float, console.number("plan", "edge_noise", "PX", "Of an edge, where no photograph tells.")
+        float,
+        console.number_option("plan", "edge_noise", "PX", "Of an edge, where no photograph tells."),
     ] = NOMINAL_EDGE_SIGMA,
     corner_noise: Annotated[
         float,
-        console.number(
+        console.number_option(
             "plan", "corner_noise", "PX", "Of a board's corner, where no photograph tells."
         ),
     ] = NOMINAL_CORNER_SIGMA,
     joint_noise: Annotated[
         float,
-        console.number("plan", "joint_noise", "M", "Of a MACHINE: noise of a reading, m or rad."),
+        console.number_option(
+            "plan", "joint_noise", "M", "Of a MACHINE: noise of a reading, m or rad."
+        ),
     ] = UNTOLD_READING_NOISE,
     seed: console.Seed = 0,
     as_json: console.Json = False,

@@ -26,7 +26,7 @@ def reproduce(
         list[Paper] | None,
         typer.Argument(metavar="[a|b|c]...", help="Which papers; all unless given."),
     ] = None,
-    runs: Annotated[int, console.number("reproduce", "runs", "N", "Simulated runs.")] = 100,
+    runs: Annotated[int, console.number_option("reproduce", "runs", "N", "Simulated runs.")] = 100,
     seed: console.Seed = 0,
     long: Annotated[
         bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")

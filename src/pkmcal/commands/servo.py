@@ -38,35 +38,37 @@ def servo(
         str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
     ] = None,
     runs: Annotated[
-        int, console.number("servo", "runs", "N", "Ways to go, of every estimate.")
+        int, console.number_option("servo", "runs", "N", "Ways to go, of every estimate.")
     ] = 60,
     gain: Annotated[
-        float, console.number("servo", "gain", "G", "Part of the error corrected in a second.")
+        float,
+        console.number_option("servo", "gain", "G", "Part of the error corrected in a second."),
     ] = 1.0,
-    rate: Annotated[float, console.number("servo", "rate", "HZ", "Images a second.")] = 25.0,
+    rate: Annotated[float, console.number_option("servo", "rate", "HZ", "Images a second.")] = 25.0,
     delay: Annotated[
-        int, console.number("servo", "delay", "N", "Images from exposure to motion.")
+        int, console.number_option("servo", "delay", "N", "Images from exposure to motion.")
     ] = 1,
     noise: Annotated[
-        float, console.number("servo", "noise", "PX", "Noise of an edge, shift and tilt.")
+        float, console.number_option("servo", "noise", "PX", "Noise of an edge, shift and tilt.")
     ] = 0.02,
     joint_noise: Annotated[
-        float, console.number("servo", "joint_noise", "M", "Noise of a reading, m or rad.")
+        float, console.number_option("servo", "joint_noise", "M", "Noise of a reading, m or rad.")
     ] = 3e-6,
     speed: Annotated[
         float | None,
-        console.number("servo", "speed", "V", "Fastest drive, m/s or rad/s."),
+        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s."),
     ] = None,
     duration: Annotated[
-        float | None, console.number("servo", "duration", "S", "Seconds of a run; 10 / gain.")
+        float | None,
+        console.number_option("servo", "duration", "S", "Seconds of a run; 10 / gain."),
     ] = None,
     hand_position: Annotated[
         float,
-        console.number("servo", "hand_position", "M", "Error of the hand-placed camera, m."),
+        console.number_option("servo", "hand_position", "M", "Error of the hand-placed camera, m."),
     ] = 0.03,
     hand_rotation: Annotated[
         float,
-        console.number(
+        console.number_option(
             "servo", "hand_rotation", "DEG", "Error of the hand-placed camera's direction, degrees."
         ),
     ] = 3.0,

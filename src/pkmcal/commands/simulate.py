@@ -30,29 +30,33 @@ def simulate(
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of a photograph.")] = "800x600",
     stations: Annotated[
-        int, console.number("simulate", "stations", "N", "Places of the camera.")
+        int, console.number_option("simulate", "stations", "N", "Places of the camera.")
     ] = 3,
     configurations: Annotated[
-        int, console.number("simulate", "configurations", "N", "Photographs from each place.")
+        int,
+        console.number_option("simulate", "configurations", "N", "Photographs from each place."),
     ] = 15,
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
     repeats: Annotated[
-        int, console.number("simulate", "repeats", "N", "Photographs of each configuration.")
+        int, console.number_option("simulate", "repeats", "N", "Photographs of each configuration.")
     ] = 1,
     tolerance: Annotated[
         float,
-        console.number("simulate", "tolerance", "X", "True values' deviation, in tolerances."),
+        console.number_option(
+            "simulate", "tolerance", "X", "True values' deviation, in tolerances."
+        ),
     ] = 1.0,
     joint_noise: Annotated[
-        float, console.number("simulate", "joint_noise", "M", "Noise of a reading, m or rad.")
+        float,
+        console.number_option("simulate", "joint_noise", "M", "Noise of a reading, m or rad."),
     ] = 3e-6,
     noise: Annotated[
-        float, console.number("simulate", "noise", "GREY", "Noise of a pixel, grey levels.")
+        float, console.number_option("simulate", "noise", "GREY", "Noise of a pixel, grey levels.")
     ] = 0.9,
     blur: Annotated[
-        float, console.number("simulate", "blur", "PX", "Blur of the lens, pixels.")
+        float, console.number_option("simulate", "blur", "PX", "Blur of the lens, pixels.")
     ] = 0.6,
     board: Annotated[
         bool, typer.Option("--board", help="A board on the base, which joins the stations.")

@@ -31,7 +31,7 @@ def study(
     ] = None,
     runs: Annotated[
         int,
-        console.number("study", "runs", "N", "Simulations of each combination."),
+        console.number_option("study", "runs", "N", "Simulations of each combination."),
     ] = 100,
     seed: console.Seed = 0,
     out: Annotated[Path, console.folder("Results, and what is finished.")] = STUDY_FOLDER,

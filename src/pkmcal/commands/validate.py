@@ -21,7 +21,8 @@ def validate(
     ],
     out: Annotated[Path | None, console.folder("SESSION/validation unless given.")] = None,
     regions: Annotated[
-        int, console.number("validate", "regions", "N", "Leave out N regions in turn as well.")
+        int,
+        console.number_option("validate", "regions", "N", "Leave out N regions in turn as well."),
     ] = 0,
     seed: console.Seed = 0,
     as_json: console.Json = False,

@@ -17,7 +17,9 @@ def view(
         Path | None,
         typer.Option(metavar="DIR", help="SESSION/calibration, where it is, unless given."),
     ] = None,
-    port: Annotated[int, console.number("view", "port", "N", "A free one unless given.")] = 0,
+    port: Annotated[
+        int, console.number_option("view", "port", "N", "A free one unless given.")
+    ] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address, and open nothing.")
     ] = False,

@@ -22,7 +22,9 @@ def watch(
         ),
     ],
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
-    alpha: Annotated[float, console.number("watch", "alpha", "P", "Share of false alarms.")] = 0.01,
+    alpha: Annotated[
+        float, console.number_option("watch", "alpha", "P", "Share of false alarms.")
+    ] = 0.01,
     same_place: Annotated[
         list[str] | None,
         typer.Option(

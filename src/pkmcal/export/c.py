@@ -343,7 +343,6 @@ def c_comment(lines: Iterable[str]) -> str:
 
 _CONSTANT = re.compile(r"static const \w+ (\w+)")
 _NUMBER = re.compile(r"-?INFINITY|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-_FIELD = re.compile(r"\.(\w+) = (\{[^{}]*\}|[^\s,{}]+)")
 _WRAPPED = re.compile(r"REAL\(([^()]*)\)")
 _WORD = re.compile(r"(?<![\w.])[A-Z_]+")
 
