@@ -53,8 +53,8 @@ from pkmcal.export.linuxcnc_module import (
     MODULE_CONVENTIONS,
     MODULE_NAME,
     MODULE_SOURCE_FILE,
-    coordinates,
     joint_units,
+    linuxcnc_coordinates,
     module_differences,
     module_files,
 )
@@ -276,7 +276,7 @@ def _module_joints(machine: Machine) -> Joints:
 def _module_ini(source: MachineSource) -> str:
     machine = source.machine
     home = world(machine.home()[None])[0]
-    letters = coordinates(machine)
+    letters = linuxcnc_coordinates(machine)
     if "A" not in letters:
         home[3:] = 0.0  # C counts from home
     return _ini(

@@ -93,6 +93,7 @@ class RepRap(Exporter):
             for readings in readings_elsewhere(fit)
             for values in [switch_values(text, readings)]
         ]
+        same = [*words.get("665B", words.get("669B", []))] == _radius(source)
         return [
             firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
             Difference(
@@ -101,12 +102,7 @@ class RepRap(Exporter):
                 SWITCH_ROUNDING,
                 "mm or degrees",
             ),
-            Difference(
-                "print radius",
-                largest(words.get("665B", words.get("669B", [])), _radius(source)),
-                0.0,
-                "mm",
-            ),
+            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
