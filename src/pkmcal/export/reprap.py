@@ -44,7 +44,7 @@ FILE = "pkmcal_delta.g"
 PROGRAM = "RepRapFirmware"
 REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
 STEEPEST_ARM_ANGLE = 90.0
-NO_PRINT_RADIUS = (
+NO_REPRAP_PRINT_RADIUS = (
     "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
 )
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
@@ -71,7 +71,7 @@ class RepRap(Exporter):
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
         radius = workspace_radius(source)
         if radius is None:
-            lines.append(NO_PRINT_RADIUS)
+            lines.append(NO_REPRAP_PRINT_RADIUS)
         commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
