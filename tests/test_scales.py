@@ -161,7 +161,11 @@ def test_derivatives_by_scales_and_readings(name):
         ("delta", "klipper", "Divide its gear_ratio by that."),
         ("linear-delta", "reprap", "Divide its steps per mm (M92) by that."),
         ("delta", "reprap", "Divide its steps per degree (M92) by that."),
-        ("linear-delta", "linuxcnc", "Divide its SCALE in the INI file, steps or counts per unit,"),
+        (
+            "gough-stewart",
+            "linuxcnc",
+            "Divide its SCALE in the INI file, steps or counts per unit,",
+        ),
     ],
 )
 def test_a_firmware_without_scales_is_told_what_to_set(name, to, words):
