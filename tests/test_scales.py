@@ -162,7 +162,7 @@ def test_derivatives_by_scales_and_readings(name):
         ("linear-delta", "reprap", "Divide its steps per mm (M92) by that."),
         ("delta", "reprap", "Divide its steps per degree (M92) by that."),
         (
-            "gough-stewart",
+            "linear-delta",
             "linuxcnc",
             "Divide its SCALE in the INI file, steps or counts per unit,",
         ),
