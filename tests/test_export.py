@@ -32,14 +32,14 @@ EXPRESSED = {
     "yaml": MACHINES,
     "reprap": DELTAS,
     "klipper": DELTAS,
-    "linuxcnc": (*DELTAS, *HEXAPODS),
+    "linuxcnc": (*DELTAS, *HEXAPODS, "3-rpr", "6-rus", "h4", "hexaglide"),
     "ros": (),
 }
 REFUSALS = {
     "c": "do not just hold its platform",
     "reprap": "RepRapFirmware has settings for linear and rotary deltas",
     "klipper": "Klipper has settings for linear and rotary deltas",
-    "linuxcnc": "genhexkins moves six telescopic legs on fixed joints",
+    "linuxcnc": "LinuxCNC moves as many joints as coordinates",
     "ros": "no camera is known to stand anywhere",
 }
 
@@ -88,6 +88,21 @@ def test_what_reads_back_otherwise_is_not_written(name, old, new, monkeypatch, t
     assert done.code == 1
     assert "read again, are not the machine" in done.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", sorted(exporters()))
+def test_numbers_have_the_fewest_digits_that_read_back(name, tmp_path):
+    """269.3, not 269.30000000000001, which is the same number to every reader."""
+    source = load_source(calibration(tmp_path, built("linear-delta")))
+    hexapod = source_of(load_mechanism("gough-stewart"))
+    for one in (source, hexapod):
+        try:
+            files = make_export(one, name).files
+        except InputError:  # another machine's format
+            continue
+        for text in files.values():
+            for word in re.findall(r"(?<![\w.])-?\d+\.\d{12,}(?:e[-+]?\d+)?", text):
+                assert len(word) <= len(repr(float(word))), word
 
 
 def test_a_difference_that_is_no_number_is_beyond():

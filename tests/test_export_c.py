@@ -6,6 +6,7 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -201,6 +202,59 @@ def test_the_source_is_c_plus_plus_as_well(name, tmp_path):
             check=False,
         )
         assert done.returncode == 0, done.stderr
+
+
+SKETCH = Path(__file__).parents[1] / "examples" / "arduino" / "pkmcal_circle" / "pkmcal_circle.ino"
+ARDUINO_MAIN = """\
+#include <stdio.h>
+#include <stdlib.h>
+struct SerialPort {
+    void begin(long) {}
+    void print(const char *text) { fputs(text, stdout); }
+    void print(char c) { putchar(c); }
+    void print(int number) { printf("%d", number); }
+    void print(unsigned long number) { printf("%lu", number); }
+    void print(double number, int digits) { printf("%.*f", digits, number); }
+    template <class T> void println(T value) { print(value); putchar('\\n'); }
+};
+static SerialPort Serial;
+static unsigned long micros() { return 0; }
+static void delay(unsigned long) {}
+#include "SKETCH"
+int main() {
+    setup();
+    for (int k = 0; k < 120; ++k) loop();
+    return 0;
+}
+"""
+
+
+@pytest.mark.skipif(
+    CPP_COMPILER is None, reason="NO C++ COMPILER (g++): the sketch is not compiled"
+)
+@pytest.mark.parametrize("flags", [[], ["-DPKMCAL_FLOAT"]], ids=["double", "float"])
+def test_the_arduino_sketch_goes_round(flags, tmp_path):
+    """Compiled as the Arduino IDE does, the .ino as C++ 11 and the .c as C, and run on this one."""
+    machine = built("delta")
+    for file, text in CSource().files(source_of(machine)).items():
+        (tmp_path / file).write_text(text)
+    (tmp_path / "main.cpp").write_text(ARDUINO_MAIN.replace("SKETCH", str(SKETCH)))
+    build = [CPP_COMPILER, "-std=gnu++11", "-Wall", "-Wextra", "-Werror", *flags, "-I", tmp_path]
+    source = [COMPILER, *flags, "-std=gnu11", "-c", SOURCES[0], "-o", "kinematics.o"]
+    subprocess.run(source, cwd=tmp_path, check=True)
+    subprocess.run([*build, "main.cpp", "kinematics.o", "-o", "sketch"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 120
+    home = machine.home()
+    for k, line in enumerate(lines):
+        words = line.split()
+        turn = 2 * np.pi * (k % 60) / 60
+        T = home.copy()
+        T[:2, 3] += 0.01 * np.array([np.cos(turn), np.sin(turn)])
+        expected = machine.inverse(T[None])[0]
+        np.testing.assert_allclose([float(word) for word in words[:3]], expected, atol=3e-6)
+        assert float(words[4]) == pytest.approx(1e3 * T[0, 3], abs=2e-3)
 
 
 @pytest.mark.slow

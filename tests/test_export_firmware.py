@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from configparser import ConfigParser
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from export_sources import built, source_of
+from export_sources import built, calibration, source_of
+from pkmcal.calibration.source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export import klipper, linuxcnc, reprap
 from pkmcal.export.contract import exporters, make_export
@@ -18,7 +21,7 @@ from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
 
-FIRMWARES = ("reprap", "klipper", "linuxcnc")
+FIRMWARES = ("reprap", "klipper")
 SMALL = np.array([0.004, -0.003, 0.002])
 
 
@@ -107,7 +110,7 @@ def test_an_ideal_rotary_delta_is_recovered():
 def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
     machine = built(name, seed=4)
     made = make_export(source_of(machine), to)
-    (difference,) = made.differences
+    difference = made.differences[0]
     assert "off by" in made.notes[0].text
     assert not difference.beyond
     # what is said is what happens, not a multiple of it
@@ -117,9 +120,108 @@ def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
     assert drawn.notes[0].level is Level.NOTE
 
 
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+def test_linuxcnc_gets_a_module_of_what_its_own_do_not_follow(name):
+    drawn = make_export(source_of(load_mechanism(name)), "linuxcnc")
+    assert set(drawn.files) == {"pkmcal_kinematics.hal", "pkmcal_kinematics.ini"}
+    assert 0 < drawn.differences[0].largest < 5e-5
+    made = make_export(source_of(built(name, seed=4)), "linuxcnc")
+    assert set(made.files) == {
+        *("pkmcal_kinematics.ini", "pkmcal_kins.c"),
+        *("pkmcal_kinematics.c", "pkmcal_kinematics.h"),
+    }
+    assert "KINEMATICS = pkmcal_kins\n" in made.files["pkmcal_kinematics.ini"]
+    assert made.differences[0].largest < 1e-12
+    assert all(note.level is Level.NOTE for note in made.notes)
+
+
+# Limits and switches that a printer has of its own
+
+
+def with_radius(machine, radius):
+    """The machine whose printer keeps to a radius, m."""
+    document = machine.document.model_copy(update={"workspace_radius": radius})
+    return replace(machine, document=document)
+
+
+def klipper_config(text):
+    found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+    found.read_string(text)
+    return found
+
+
+def test_the_print_radius_is_the_printers_own(tmp_path):
+    """Of the reachable radius, 162 mm of this machine's, nothing stands in any file."""
+    machine = load_mechanism("linear-delta")
+    g = exporters()["reprap"].files(source_of(machine))["pkmcal_delta.g"]
+    assert "665B" not in reprap.read_words(g)
+    text = exporters()["klipper"].files(source_of(machine))["pkmcal_printer.cfg"]
+    assert "print_radius" not in klipper_config(text)["printer"]
+    own = source_of(with_radius(load_mechanism("delta"), 0.0905))
+    words = reprap.read_words(exporters()["reprap"].files(own)["pkmcal_delta.g"])
+    assert words["669B"].tolist() == [90.5]
+    # through a calibration's folder as well
+    source = load_source(calibration(tmp_path, with_radius(built("linear-delta"), 0.0905)))
+    text = exporters()["klipper"].files(source)["pkmcal_printer.cfg"]
+    assert klipper_config(text).getfloat("printer", "print_radius") == 90.5
+    made = make_export(source, "reprap")
+    assert reprap.read_words(made.files["pkmcal_delta.g"])["665B"].tolist() == [90.5]
+    assert "The print radius stays 90.5 mm." in made.notes[-1].text
+
+
+def switch_lines(text):
+    """Each motor's line of values for end switches elsewhere."""
+    return [line for line in text.splitlines() if "reading - " in line or " rad, " in line]
+
+
+@pytest.mark.parametrize("to", FIRMWARES)
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+def test_an_end_switch_elsewhere_has_a_number_of_its_own(to, name):
+    """The tool's place by the firmware, homed by that number, is the machine's."""
+    machine = built(name, seed=4)
+    text = next(iter(make_export(source_of(machine), to).files.values()))
+    lines = switch_lines(text)
+    assert len(lines) == 3
+    linear = name == "linear-delta"
+    motors = re.findall(
+        r"Motor (\w) is leg \d, joint (\d): .* = (\S+) \* reading \(\w+\) (\S+)\.\n", text
+    )
+    for k, (line, (_, joint, rate, zero)) in enumerate(zip(lines, motors, strict=True)):
+        low, high = machine.joint_ranges[int(joint) - 1]
+        end = high if float(rate) > 0 else low
+        reading = end + 0.2 * (low + high - 2 * end)
+        motor = float(rate) * reading + float(zero)
+        if to == "klipper" and not linear:
+            # an elbow a lower arm away from the tool in the middle, at every pair of the table
+            config = klipper_config(text)
+            section = config["stepper_" + "abc"[k]]
+            arm, rod = (section.getfloat(f"{side}_arm_length") for side in ("upper", "lower"))
+            pairs = re.findall(r"(\S+) at (\S+) rad", line)
+            assert len(pairs) > 8
+            for height, at in pairs:
+                angle = (float(rate) * float(at) + float(zero)) / DEGREES_A_RADIAN
+                out = config.getfloat("printer", "shoulder_radius") + arm * np.cos(angle)
+                up = config.getfloat("printer", "shoulder_height") + arm * np.sin(angle)
+                assert np.hypot(out, up - float(height)) == pytest.approx(rod, abs=2e-3)
+            continue
+        value, sign, slope, place = re.search(
+            r"= (\S+) ([+-]) (\S+) \* \(reading - (\S+)\)", line
+        ).groups()
+        number = float(float(value) + float(sign + slope) * (reading - float(place)))
+        if to == "klipper":
+            config = klipper_config(text)
+            config["stepper_" + "abc"[k]]["position_endstop"] = repr(number)
+            homed = klipper.homed(config)
+        else:
+            words = reprap.read_words(text)
+            words["666" + "XYZ"[k]] = np.array([number])
+            homed = reprap.homed_carriages(words) if linear else reprap.homed_arms(words)
+        assert homed[k] == pytest.approx(motor, abs=2e-3)
+
+
 def test_parallel_towers_are_followed_where_leaning_ones_are_not():
     leaning = put(ideal_linear(), 1, base__axis=[0.004, 0.0, 1.0])
-    for to in ("reprap", "klipper"):
+    for to in FIRMWARES:
         assert make_export(source_of(ideal_linear()), to).differences[0].largest < 1e-6
         made = make_export(source_of(leaning), to)
         assert made.notes[0].level is Level.DOUBTFUL
@@ -137,6 +239,11 @@ def test_parallel_towers_are_followed_where_leaning_ones_are_not():
         ("klipper", "pkmcal_printer.cfg", "endstop: 301.2", "endstop: 301.3"),
         ("linuxcnc", "pkmcal_kinematics.hal", "lineardeltakins.R 10", "lineardeltakins.R 11"),
         ("linuxcnc", "pkmcal_kinematics.ini", "HOME_OFFSET = -0.0", "HOME_OFFSET = 1.0"),
+        ("linuxcnc", "pkmcal_kinematics.ini", "HOME = 398.7", "HOME = 0"),
+        ("linuxcnc", "pkmcal_kinematics.ini", "MAX_LIMIT = 549.", "MAX_LIMIT = 559."),
+        ("reprap", "pkmcal_delta.g", " ; L rods", " B162 ; L rods"),
+        ("reprap", "pkmcal_delta.g", "M666 Y = 0 + 1000", "M666 Y = 0 - 1000"),
+        ("klipper", "pkmcal_printer.cfg", "delta_radius: ", "print_radius: 99\ndelta_radius: "),
     ],
 )  # fmt: skip
 def test_tampered_settings_are_found(to, file, old, new):
@@ -215,10 +322,20 @@ def test_genhexkins_angles_are_roll_pitch_yaw():
     offset = machine.values[machine.parameters.index("legs[2].length.offset")]
     ini = made.files["pkmcal_kinematics.ini"]
     scale = machine.values[machine.parameters.index("legs[2].scale")]
-    word = "TYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2\n"
-    word += f"# joint 1 = {1e3 * scale:.17g} * reading + HOME_OFFSET\n"
-    word += f"# Divide its SCALE in the INI file, steps or counts per unit, by {scale:.17g}.\n"
-    assert f"[JOINT_1]\n{word}HOME_OFFSET = {1e3 * offset:.17g}\n" in ini
+    offset, rate = float(1e3 * offset), float(1e3 * scale)
+    word = f"TYPE = LINEAR\n# joint 1 = {rate!r} * reading + {offset!r}\n"
+    word += "# Divide its SCALE in the INI file, steps or counts per unit, by"
+    word += f" {float(scale)!r}.\nHOME_ABSOLUTE_ENCODER = 2\n"
+    home = float(machine.inverse(machine.home()[None])[0, 1] * rate + offset)
+    assert f"[JOINT_1]\n{word}HOME_OFFSET = {offset!r}\nHOME = {home!r}\n" in ini
+    assert ini.count("HOME_SEQUENCE = 0\n") == 6
+
+
+def test_a_home_beyond_the_limits_is_no_home(tmp_path):
+    text = catalogue()["linear-delta"].read_text()
+    (tmp_path / "m.yaml").write_text(text.replace("range: [0.25, 0.55]", "range: [0.25, 0.35]"))
+    with pytest.raises(InputError, match=r"the home pose of .* is beyond a joint's range"):
+        make_export(source_of(load_mechanism(tmp_path / "m.yaml")), "linuxcnc")
 
 
 # Machines that are no firmware's

@@ -516,6 +516,7 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
         assert done.code == 0, done.out + done.err
     (path,) = (tmp_path / "kit" / "export-reprap").iterdir()
     words = reprap.read_words(path.read_text())
+    assert words["665B"].tolist() == [90.0]  # the printer's own
     told = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
     travel = reprap.homed_carriages(words) - reprap.reprap_carriage_heights(words, told)
     there = 1e3 * true.forward(1e-3 * (SAYS.homed - travel))[:, 2, 3]

@@ -519,7 +519,7 @@ def workspace_radius(source: MachineSource) -> str | None:
     mechanism file has none. It is a limit, and no value of the machine's: no export makes one up.
     """
     radius = source.machine.document.workspace_radius
-    return None if radius is None else firmware_length(MM_A_METRE * radius)
+    return None if radius is None else _digits(MM_A_METRE * radius)
 
 
 def end_switches(fit: Fit) -> str:

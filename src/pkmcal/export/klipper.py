@@ -49,7 +49,7 @@ SAVED_MARK_ADVICE = (
     " Klipper drops all that was saved."
 )
 """klippy/configfile.py, _find_autosave_data."""
-NO_PRINT_RADIUS = (
+NO_KLIPPER_PRINT_RADIUS = (
     "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
     " stands; then write the former delta_radius there."
 )
@@ -79,7 +79,7 @@ class Klipper(Exporter):
             lines += proportional_switches(fit, names, _tower_endstops(fit))
             radius = workspace_radius(source)
             if radius is None:
-                lines.append(NO_PRINT_RADIUS)
+                lines.append(NO_KLIPPER_PRINT_RADIUS)
             sections = _linear(fit, radius)
         else:
             sections = _rotary(fit)

@@ -28,7 +28,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_HEADER_FILE, C_SOURCE_FILE
@@ -53,8 +53,8 @@ from pkmcal.export.linuxcnc_module import (
     MODULE_CONVENTIONS,
     MODULE_NAME,
     MODULE_SOURCE_FILE,
-    coordinates,
     joint_units,
+    linuxcnc_coordinates,
     module_differences,
     module_files,
 )
@@ -116,7 +116,9 @@ class Joints:
     scale: Array
 
 
-def _joints(machine: Machine, columns: Array, rate: Array, offset: Array, scale: Array) -> Joints:
+def _joints(
+    machine: Machine, columns: Integers, rate: Array, offset: Array, scale: Array
+) -> Joints:
     """Joints that follow the readings of some columns; InputError where home is beyond a limit."""
     readings = machine.inverse(machine.home()[None])[0][columns]
     home = rate * readings + offset
@@ -226,8 +228,11 @@ class LinuxCnc(Exporter):
         kind = _kind(source)
         if kind is None:
             return {**module_files(source), LINUXCNC_INI_FILE: _module_ini(source)}
-        hal, ini = (_delta_hal, _delta_ini) if isinstance(kind, Fit) else (_hal, _hexapod_ini)
-        return {LINUXCNC_HAL_FILE: hal(source, kind), LINUXCNC_INI_FILE: ini(source, kind)}
+        if isinstance(kind, Fit):
+            texts = _delta_hal(source, kind), _delta_ini(source, kind)
+        else:
+            texts = _hal(source, kind), _hexapod_ini(source, kind)
+        return dict(zip((LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE), texts, strict=True))
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Pins and words read again, moved by LinuxCNC's own formulas."""
@@ -276,7 +281,7 @@ def _module_joints(machine: Machine) -> Joints:
 def _module_ini(source: MachineSource) -> str:
     machine = source.machine
     home = world(machine.home()[None])[0]
-    letters = coordinates(machine)
+    letters = linuxcnc_coordinates(machine)
     if "A" not in letters:
         home[3:] = 0.0  # C counts from home
     return _ini(

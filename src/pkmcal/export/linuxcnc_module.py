@@ -42,7 +42,7 @@ def joint_units(machine: Machine) -> Array:
     )
 
 
-def coordinates(machine: Machine) -> str:
+def linuxcnc_coordinates(machine: Machine) -> str:
     """LinuxCNC's letters of the platform's freedoms, X first; InputError where joints are not as
     many, so that not every command of coordinates is a pose.
     """
@@ -61,7 +61,7 @@ def coordinates(machine: Machine) -> str:
 
 def module_files(source: MachineSource) -> dict[str, str]:
     """The C source and header, and the module around them."""
-    coordinates(source.machine)
+    linuxcnc_coordinates(source.machine)
     files = CSource().files(source)
     del files[C_SELFTEST_FILE]
     units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {_plain(source.machine)};\n"

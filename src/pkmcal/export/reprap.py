@@ -44,7 +44,7 @@ FILE = "pkmcal_delta.g"
 PROGRAM = "RepRapFirmware"
 REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
 STEEPEST_ARM_ANGLE = 90.0
-NO_PRINT_RADIUS = (
+NO_REPRAP_PRINT_RADIUS = (
     "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
 )
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
@@ -71,7 +71,7 @@ class RepRap(Exporter):
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
         radius = workspace_radius(source)
         if radius is None:
-            lines.append(NO_PRINT_RADIUS)
+            lines.append(NO_REPRAP_PRINT_RADIUS)
         commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
@@ -93,6 +93,7 @@ class RepRap(Exporter):
             for readings in readings_elsewhere(fit)
             for values in [switch_values(text, readings)]
         ]
+        same = [*words.get("665B", words.get("669B", []))] == _radius(source)
         return [
             firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
             Difference(
@@ -101,12 +102,7 @@ class RepRap(Exporter):
                 SWITCH_ROUNDING,
                 "mm or degrees",
             ),
-            Difference(
-                "print radius",
-                largest(words.get("665B", words.get("669B", [])), _radius(source)),
-                0.0,
-                "mm",
-            ),
+            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
