@@ -42,7 +42,7 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
-from pkmcal.calibration.rejected import rejections_in_words
+from pkmcal.calibration.rejected import rejections_in_words, unused_configurations
 from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
@@ -466,7 +466,6 @@ def _judge(
         findings,
         method,
         richer=found.richer,
-        held_out=len(found.out.region.rows) if found.out else 0,
         doubts=(
             *scale_doubt(session, found.estimate),
             *noise_doubt(session, found.estimate),
@@ -476,6 +475,9 @@ def _judge(
             *(one.sentence for one in departed if one.against),
         ),
         cautions=(
+            *unused_configurations(
+                session, found.estimate, found.out.region.rows if found.out else ()
+            ),
             *rejections.warnings,
             *(one.sentence for one in departed if not one.against),
             *sentences(errors),

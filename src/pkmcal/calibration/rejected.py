@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pkmcal.arrays import Integers
 from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import RejectedUnit, Rejections, rejected_units, rejections_of
 from pkmcal.identify.estimate import Estimate
@@ -58,6 +59,21 @@ def rejections_in_words(
     if found.shift <= sigma:
         return RejectionWords((), warnings)
     return RejectionWords((_doubt_sentence(session, found, sigma, what),), warnings)
+
+
+def unused_configurations(
+    session: Session, estimate: Estimate, held_out: Sequence[int] | Integers
+) -> tuple[str, ...]:
+    """A sentence on the configurations of which nothing was measured, but for those held out."""
+    unused = ~estimate.configurations
+    unused[np.asarray(held_out, dtype=int)] = False
+    names = [session.configurations[k] for k in np.flatnonzero(unused)]
+    if not names:
+        return ()
+    return (
+        f"{count(len(names), 'configuration')} had no usable photograph and did not take part:"
+        f" {listed(names, MOST_UNITS_NAMED)}.",
+    )
 
 
 def _naming_sentences(

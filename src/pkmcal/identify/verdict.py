@@ -22,7 +22,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
 from pkmcal.solver.search import Stop
-from pkmcal.wording import count, listed
+from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -77,7 +77,6 @@ def judge(
     doubts: tuple[str, ...] = (),
     cautions: tuple[str, ...] = (),
     hints: tuple[str, ...] = (),
-    held_out: int = 0,
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
 
@@ -85,7 +84,6 @@ def judge(
     richer : models of the machine that were tried because this one is too poor for the poses.
     doubts : further reasons against it, cautions : further warnings, hints : further advice, found
     in the session.
-    held_out : configurations that were left out on purpose.
     """
     bed = findings.bed
     large, small = ((), ()) if bed else _left_open(estimate, findings)
@@ -102,7 +100,7 @@ def judge(
         least = WORTH_SAYING * platform_sigma(estimate)
         matter = tuple(s for s in matter if s.moves_platform > least)
     warnings = (
-        *_warnings(observation, estimate, held_out),
+        *_warnings(observation, estimate),
         *_poses_doubted(estimate, richer),
         *(_touch_unnoticed(bed) if bed else ()),
         *cautions,
@@ -382,7 +380,7 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
 
 
-def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> list[str]:
+def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
@@ -398,11 +396,6 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
         f"Leg {leg + 1} was seen in few photographs; its values lean on the readings."
         for leg in np.flatnonzero(seen < 0.3 * np.median(seen))
     )
-    unseen = int(np.sum(~estimate.configurations)) - held_out
-    if unseen:
-        out.append(
-            f"{count(unseen, 'configuration')} had no usable photograph and did not take part."
-        )
     if estimate.statistics.noise_scale > 1.5:
         out.append(
             f"The edges scatter {estimate.statistics.noise_scale:.1f} times more than their"
