@@ -113,7 +113,13 @@ def unmodelled_departures(
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    tests = Departures(*ended, [one.effect for one in listed], number.tolist(), singles=True)
+    tests = Departures(
+        *ended,
+        [one.effect for one in listed],
+        number.tolist(),
+        singles=True,
+        variance=1 + measurements.look_variance,
+    )
     known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
     found = [*tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known]), *known]
     if not found:
