@@ -230,6 +230,26 @@ def test_right_sessions_have_chances_like_dice():
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
 
+def test_errors_of_whole_configurations_are_no_departure():
+    """One reading of each configuration off by chance, by far more than noise, along what a scale
+    would do: without asking how that scatters over the configurations a scale would be named."""
+    named = np.zeros(2, dtype=int)
+    for seed in range(6):
+        drawing, data, where = measured(40 + seed, count=20)
+        wrong = data.joints.copy()
+        off = np.random.default_rng(seed).normal(0, 5e-3, len(wrong))
+        wrong[:, 2] *= 1 + off
+        data = replace(data, joints=wrong)
+        _, tests = score_tests(drawing, data, where, scales(data)[2:3], False)
+        named += (
+            tests.scores()[0].adjusted < FALSE_DEPARTURE_CHANCE,
+            len(tests.found(FALSE_DEPARTURE_CHANCE)),
+        )
+        assert tests.fitted([0])[0].sigma[0] > 3e-4  # 5e-3 of twenty, as far as edges see it
+    assert named[0] >= 3
+    assert named[1] == 0
+
+
 @pytest.mark.slow
 def test_right_sessions_have_chances_like_dice_often():
     chances = false_alarms(range(500))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.saved import load
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -261,6 +262,41 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     write_joints(folder, made.joints)
     right = calibrate_session(folder).verdict
     assert not [text for text in right.warnings if "outvoted" in text]
+
+
+def test_no_configuration_is_exchanged_with_itself(folder):
+    """A pose that lost its weight, its reading off by as much as makes it just disagree."""
+    made = make(folder, "h4", n=30)
+    right = calibrate_session(folder)
+    estimate, measurements = right.estimate, right.measurements
+    weights = estimate.pose_weights.copy()
+    weights[measurements.poses.configuration == 7] = 0.0
+    said = []
+    for off in np.linspace(0, 2e-3, 401):
+        joints = measurements.joints.copy()
+        joints[7] += off
+        said += outvoted(
+            replace(right.session, joints=joints),
+            replace(measurements, joints=joints),
+            replace(estimate, pose_weights=weights),
+        )
+    assert said  # far off enough it is named
+    assert not [text for text in said if "007 and 007" in text or "readings of 007" in text]
+    assert len(made.joints) == 30
+
+
+def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
+    """Hobby servos, half a degree, stated as a thousandth of that: some poses look wrong until the
+    readings' noise is found, and are right then."""
+    made = make(folder, "h4", n=24)
+    rng = np.random.default_rng(3)
+    write_joints(folder, made.joints + np.deg2rad(0.5) * rng.normal(size=made.joints.shape))
+    found = calibrate_session(folder)
+    assert np.all(found.estimate.pose_weights > 0.5)
+    scatter = found.estimate.statistics.reading_scale * found.session.joint_noise
+    assert np.rad2deg(scatter) == pytest.approx(0.5, rel=0.25)
+    low, high = found.estimate.statistics.reading_range
+    assert low < np.deg2rad(0.5) / found.session.joint_noise < high
 
 
 def test_exchanged_rows_are_outvoted_and_told(folder):

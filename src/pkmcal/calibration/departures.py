@@ -156,7 +156,14 @@ def model_violations(
 
     def tested(beside: RandomEffects | None) -> tuple[Departures, list[tuple[int, Score]]]:
         effects = [one.effect for one in listed]
-        tests = Departures(*ended, effects, number.tolist(), singles=True, beside=beside)
+        tests = Departures(
+            *ended,
+            effects,
+            number.tolist(),
+            singles=True,
+            beside=beside,
+            variance=1 + measurements.look_variance,
+        )
         found = tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known])
         return tests, [*found, *known]
 

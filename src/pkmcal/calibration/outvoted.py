@@ -60,6 +60,8 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
         _chance(m, np.nan_to_num(_chi2(rows - joints, noise[odd, None]), nan=np.inf))
         > UNLIKELY_EXPLANATION_CHANCE
     )
+    # its own readings are those that it stands against, however narrowly
+    alike[np.arange(len(odd)), own[odd]] = False
     exchanged = alike[:, own[odd]] & alike[:, own[odd]].T
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     for n, k in enumerate(odd.tolist()):

@@ -37,6 +37,7 @@ from pkmcal.identify.noise import (
     noise_shares,
 )
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.reinstated import innovations
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
@@ -202,7 +203,9 @@ def _settle(
             )
         if robust:
             rows = problem.unweighted(state)
-            weight = settled_weights(norms(problem, rows), scale)
+            distance = norms(problem, rows)
+            poses = innovations(fit.info, distance.poses, weight.poses, scale.poses)
+            weight = settled_weights(distance._replace(poses=poses), scale)
             if by_tube:
                 trust = edges.trust(problem.blocks, np.sum(rows.edges**2, axis=-1))
         change = (shading - problem.data.shading) / np.maximum(problem.data.shading, SHADING_SIGMA)

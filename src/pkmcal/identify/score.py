@@ -11,6 +11,16 @@ are what a further estimate with the departure free would find to first order (R
 making it: the value that fits, the gain in chi2, and what it does to the unknowns. Under the model
 chi2 has as many degrees of freedom as the data see of the departure.
 
+Rows of one configuration may be wrong together: edges in a photograph by hand that light moves, or
+that were found where the photograph's own pose had them. So a departure counts by what its products
+with the residuals really scatter by over the configurations where that is more than they should,
+
+    f = max(1, K / (K - 1) tr((H^T H)^-1 sum over K configurations c of u_c u_c^T) / k),
+    u_c = H_c^T (r + H value)_c,
+
+(Liang and Zeger 1986), and chi2 is divided by it. That is asked only of those that are about to be
+named, and not of single readings, which are one configuration's.
+
 The rows are gone through twice, some configurations at a time: for an orthonormal basis of what the
 shared unknowns can do, then for the products of all columns with each other, with the basis and
 with r. These few numbers are all that is kept, however many configurations there are, and
@@ -93,16 +103,20 @@ class Departures:
         *,
         singles: bool = False,
         beside: RandomEffects | None = None,
+        variance: float = 1.0,
     ) -> None:
         """As the module says.
 
         families : of which each listed one is; among many departures of one kind the single one
         has to gain more, and those of other kinds do not pay for it. One family if absent; single
         readings are one of their own. beside : what counts as further unknowns, known beforehand
-        to be small.
+        to be small. variance : factor on that of all residuals, for what else they are known to be
+        wrong by.
         """
         beside = beside or RandomEffects((), np.zeros((0, 0)))
+        self._variance, self._scatter = variance, dict[int, float]()
         basis = _basis_beside(assembled, info, beside)
+        self._problem = assembled, info, listed, basis, beside
         self._made = _products(assembled, info, listed, basis, singles, beside)
         family = np.zeros(len(listed), dtype=int) if families is None else np.array(families)
         rest = np.full(self._made.single[..., 0].size, family.max(initial=-1) + 1)
@@ -125,6 +139,9 @@ class Departures:
             )
             chi2[k], dof[k] = found.gain
         chi2[len(made.listed) :], dof[len(made.listed) :] = made.gains_of_singles(freed, free)
+        chi2 /= self._variance
+        for k, factor in self._scatter.items():
+            chi2[k] /= factor
         dof[list(freed)] = 0
         tests = np.bincount(self._family, weights=dof > 0)
         times = np.count_nonzero(tests) * tests[self._family]
@@ -145,6 +162,9 @@ class Departures:
             best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
             if scores[best].adjusted > alpha:
                 break
+            if best < len(self._made.listed) and best not in self._scatter:
+                self._scatter[best] = self._scattered(best, [*freed, *(k for k, _ in out)])
+                continue
             out.append((best, scores[best]))
         return out
 
@@ -152,12 +172,59 @@ class Departures:
         """What some departures come to, all free together."""
         made, free = self._made, _Left.of(self._made, freed)
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
+        factors = [self._variance * self._scatter.get(k, 1.0) for k in freed]
+        sigma = sigma * np.sqrt(np.repeat(factors, [made.count(k) for k in freed]))
         sigma[free.hidden > UNTOLD_HIDDEN_SHARE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
             Freed(v, s, self._moves @ (made.with_basis(k).T @ v))
             for k, v, s in zip(freed, np.split(value, cuts), np.split(sigma, cuts), strict=True)
         ]
+
+    def _scattered(self, k: int, freed: Sequence[int]) -> float:
+        """The factor f of a listed departure beside those that are free already."""
+        assembled, info, listed, basis, effects = self._problem
+        made, problem = self._made, info.problem
+        beside = [f for f in freed if f < len(made.listed)]  # single readings stay as they are
+        every = [*beside, k]
+        of_basis = np.concatenate([made.with_basis(f) for f in every]).T
+        free = _Left.of(made, every)
+        value, n = -free.inverse @ free.value, made.count(k)
+        # what is left of the departure's columns beside those of the others
+        rest, own = slice(0, len(value) - n), slice(len(value) - n, None)
+        gain = np.linalg.pinv(free.squared[rest, rest]) @ free.squared[rest, own]
+        part = np.concatenate([-gain, np.eye(n)])
+        throughout = [listed[f] for f in every if listed[f].station is None]
+        columns = columns_of(assembled, info.state, throughout)
+        random = columns_of(assembled, info.state, effects.effects)
+        scatter, clusters = np.zeros((n, n)), 0
+        for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+            linear = piece.linear
+            further = [random(cut, linear) @ effects.root, columns(cut, linear)]
+            rows, left = eliminated_beside(linear, np.concatenate(further, axis=-1))
+            count = taken = problem.unknowns.count + effects.root.shape[1]
+            wide: list[Array] = []
+            for f in every:
+                number = listed[f].count
+                if listed[f].station is None:
+                    wide.append(rows[..., taken : taken + number])
+                    taken += number
+                    continue
+                at = made.listed[f].columns
+                later = np.arange(cut.start, cut.start + len(rows)) >= made.listed[f].since
+                by = rows[..., problem.unknowns.stations][..., at]
+                wide.append(np.where(later[:, None, None], by, 0.0))
+            by_basis = rows[..., :count] @ basis
+            h = np.concatenate(wide, axis=-1) - by_basis @ of_basis
+            left = left - by_basis @ made.known + h @ value
+            products = ((h @ part).mT @ left[..., None])[..., 0]
+            scatter += products.T @ products
+            clusters += int(np.count_nonzero(products.any(axis=-1)))
+        if clusters < 2:
+            return 1.0
+        squared = part.T @ free.squared @ part
+        usual = np.trace(np.linalg.pinv(squared) @ scatter) / n
+        return max(1.0, float(usual) / self._variance * clusters / (clusters - 1))
 
 
 class _Listed(NamedTuple):

@@ -1,0 +1,335 @@
+"""Sessions in which nothing is wrong: what is said of them all the same.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/right_sessions.py [--sessions 10] [--kind KIND ...]
+                                                               [--first SEED] [--workers 2]
+
+Of each kind so many sessions, each of a machine of its own that is off its drawing as its drawing
+says, with noise as stated. For each kind: sessions that are refused, that have a departure, a
+configuration said to be outvoted, a stated noise said to be wrong, and any of these; intervals of
+the readings' noise at 95 % that hold the truth, of those that have two ends and of all; the tool's
+error over the session's poses in stated standard deviations (root mean square over the sessions,
+and the largest); seconds. Then each of these findings, in its own words.
+
+Legs and photographs by hand are rendered; boards are corners with noise, trackers tables, and
+printers the heights that their firmware keeps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
+import printers
+
+INTERVAL_MISS = 0.05
+CORNER_SIGMA = 0.1
+"""px, of a board's corner."""
+TRACKER_SIGMA = np.repeat([1e-4, 2e-5], 3)
+"""rad and m."""
+HEIGHT_SIGMA = 0.02
+"""mm, of a printer's probe."""
+FINDINGS = ("refused", "departure", "outvoted", "noise", "rejected")
+"""rejected : measured poses, which in these sessions are all right."""
+
+
+class Session(NamedTuple):
+    """A session's folder; the true machine, poses (K, 4, 4) and readings (K, m), None where they
+    are not compared; factor of the readings' true noise on the stated one; corners in place of
+    photographs.
+    """
+
+    folder: Path
+    machine: Any
+    poses: Any
+    readings: Any
+    detections: Any = None
+
+
+class Outcome(NamedTuple):
+    """What was said of a session, by kind of finding; the interval of the readings' noise; z of the
+    tool, NaN where it is not compared; seconds.
+    """
+
+    findings: dict[str, list[str]]
+    low: float
+    high: float
+    z: float
+    seconds: float
+
+
+def written(folder: Path, drawing: Any, readings: Any, noise: float, **more: Any) -> None:
+    """Files of a session without photographs."""
+    from pkmcal.files import csv_text, yaml_text
+    from pkmcal.mechanisms import mechanism_text
+
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"{k:03d}" for k in range(len(readings))]
+    columns = [f"motor{k + 1}" for k in range(readings.shape[1])]
+    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "joints.csv").write_text(csv_text(columns, names, readings))
+    document = {
+        "pkmcal": 1,
+        "mechanism": "mechanism.yaml",
+        "joints": {"file": "joints.csv", "noise": noise},
+        **more,
+    }
+    (folder / "session.yaml").write_text(yaml_text(document))
+
+
+def photographed(
+    machine: str, stations: int, count: int, size: tuple[int, int], *, handheld: bool = False
+) -> Callable[[Path, int], Session]:
+    """A session of legs in rendered photographs."""
+
+    def make(folder: Path, seed: int) -> Session:
+        from pkmcal.mechanisms import load_mechanism
+        from pkmcal.simulation import Settings, simulate_session, with_forearms
+        from pkmcal.simulation.demo import camera_of_size
+
+        drawing = with_forearms(load_mechanism(machine))
+        settings = Settings(stations=stations, configurations=count, handheld=handheld)
+        truth = simulate_session(folder, drawing, camera_of_size(size), settings, seed=seed)
+        return Session(folder, truth.machine, truth.T_base_platform, truth.joints)
+
+    return make
+
+
+def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Session]:
+    """A session of a board on the platform, one station; noise of a reading, m or rad."""
+
+    def make(folder: Path, seed: int) -> Session:
+        import cv2
+
+        from pkmcal.boards.board import Detection
+        from pkmcal.files import yaml_text
+        from pkmcal.geometry.rigid import apply
+        from pkmcal.mechanisms import load_mechanism
+        from pkmcal.simulation import Settings, board_for, draw_truth, with_forearms
+        from pkmcal.simulation.demo import camera_of_size
+        from pkmcal.simulation.placement import one_a_station
+
+        drawing = with_forearms(load_mechanism(machine))
+        made, camera = board_for(drawing, "platform"), camera_of_size((1280, 960))
+        settings = Settings(
+            stations=1, configurations=count, board=made, board_on="platform", observe=("board",),
+            joint_noise=noise,
+        )  # fmt: skip
+        cameras = one_a_station(camera, 1)
+        truth = draw_truth(drawing, cameras, settings, seed)
+        T = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
+        pixels = camera.project(apply(T[:, None], made.points))
+        rng = np.random.default_rng([seed, 1])
+        pixels = pixels + CORNER_SIGMA * rng.normal(size=pixels.shape)
+        inside = camera.in_image(pixels, margin=2.0)
+        found = []
+        for k, seen in enumerate(inside):
+            ids = np.flatnonzero(seen)
+            sigma = np.full(len(ids), CORNER_SIGMA)
+            reason = "" if len(ids) >= 12 else "out of the picture"
+            found.append(
+                Detection(f"{k:03d}.png", camera.image_size, ids, pixels[k, ids], sigma, reason)
+            )
+        (folder / "images").mkdir(parents=True)
+        grey = cv2.imencode(".png", np.full((960, 1280), 128, dtype=np.uint8))[1].tobytes()
+        for item in found:
+            (folder / "images" / item.name).write_bytes(grey)
+        (folder / "camera.yaml").write_text(yaml_text(camera.document()))
+        document = {k: v for k, v in made.document.items() if k != "tolerance"}
+        (folder / "board.yaml").write_text(yaml_text(document))
+        station = {
+            "camera": "camera.yaml", "images": "images/{configuration}.png", "observe": "board",
+        }  # fmt: skip
+        more = {"stations": {"tripod": station}, "board": "board.yaml"}
+        written(folder, drawing, truth.readings, noise, **more)
+        return Session(folder, truth.machine, truth.T_base_platform, truth.joints, tuple(found))
+
+    return make
+
+
+def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
+    """A session of a tracker's table, of poses or of points."""
+
+    def make(folder: Path, seed: int) -> Session:
+        from pkmcal.files import csv_text
+        from pkmcal.geometry.rigid import perturb, pose, rotation, rotation_vector
+        from pkmcal.mechanisms import load_mechanism
+        from pkmcal.simulation import true_machine
+        from pkmcal.simulation.placement import draw_configurations
+
+        rng = np.random.default_rng(seed)
+        drawing = load_mechanism(machine)
+        truth = true_machine(drawing, 1.0, rng)
+        poses, joints = draw_configurations(truth, count, 0.5, rng)
+        place = pose(rotation(rng.normal(size=3)), rng.normal(size=3))
+        target = pose(rotation(rng.normal(size=3)), 0.03 * rng.normal(size=3))
+        seen = perturb(place @ poses @ target, TRACKER_SIGMA * rng.normal(size=(len(poses), 6)))
+        values = np.concatenate([seen[:, :3, 3], rotation_vector(seen[:, :3, :3])], axis=1)
+        columns = ("x", "y", "z", "rx", "ry", "rz")[: 3 if points else 6]
+        sigma = {"rotation": TRACKER_SIGMA[0], "position": TRACKER_SIGMA[3]}
+        table = {"poses": "poses.csv", "noise": {k: float(v) for k, v in sigma.items()}}
+        readings = joints + noise * rng.normal(size=joints.shape)
+        written(folder, drawing, readings, noise, stations={"tracker": {"tracker": table}})
+        names = [f"{k:03d}" for k in range(len(poses))]
+        (folder / "poses.csv").write_text(csv_text(columns, names, values[:, : len(columns)]))
+        return Session(folder, truth, poses, joints)
+
+    return make
+
+
+def printer(points: int) -> Callable[[Path, int], Session]:
+    """A delta printer that felt its bed, its parts as far off as those of a kit."""
+
+    def make(folder: Path, seed: int) -> Session:
+        from pkmcal.printers.session import write_printer_session
+
+        rng = np.random.default_rng(seed)
+        built = printers.Settings(
+            radius=105.0 + 0.3 * rng.normal(),
+            angle=tuple(np.array([210.0, 330.0, 90.0]) + 0.1 * rng.normal(size=3)),
+            rod=tuple(270.0 + 0.1 * rng.normal(size=3)),
+        )
+        true = printers.machine(built, endstops=tuple(0.3 * rng.normal(size=3)))
+        readings = printers.felt(true, printers.bed(points), HEIGHT_SIGMA, rng)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        file = folder.parent / f"{folder.name}.cfg"
+        file.write_text(printers.printer_cfg(printers.Settings(), readings))
+        write_printer_session(folder, file)
+        return Session(folder, None, None, None)
+
+    return make
+
+
+KINDS: dict[str, Callable[[Path, int], Session]] = {
+    "legs, hexapod": photographed("gough-stewart", 2, 8, (640, 480)),
+    "legs, three-legged": photographed("3-rps", 2, 8, (640, 480)),
+    "by hand, hexapod": photographed("gough-stewart", 1, 8, (640, 480), handheld=True),
+    "board, hexapod": board("gough-stewart", 20, 3e-6),
+    "board, H4": board("h4", 24, 3e-6),
+    "board, delta": board("delta", 24, 1e-5),
+    "board, delta by servos": board("delta", 24, float(np.deg2rad(0.5))),
+    "board, 6-RUS": board("6-rus", 24, 1e-5),
+    "board, 6-RUS by servos": board("6-rus", 24, float(np.deg2rad(0.5))),
+    "tracker, hexapod": tracker("gough-stewart", 20, 1e-5, points=False),
+    "tracker's points, delta": tracker("delta", 24, 1e-5, points=True),
+    "printer, 7 heights": printer(7),
+    "printer, 19 heights": printer(19),
+}
+
+
+def off_by(result: Any, session: Session) -> float:
+    """How far the tool is off at the session's true poses, in stated standard deviations."""
+    from pkmcal.identify.tool import tool_error
+
+    if session.machine is None:
+        return float("nan")
+    legs_seen = result.estimate.edge_weights.size > 0
+    stated = tool_error(
+        result.session.machine, result.machine, result.estimate.covariance,
+        session.poses, session.readings, legs_seen=legs_seen,
+    )  # fmt: skip
+    off = tool_error(
+        session.machine, result.machine, stated.parameters, session.poses, session.readings,
+        legs_seen=legs_seen,
+    )  # fmt: skip
+    return float(np.sqrt(np.nanmean(off.off_position**2) / np.nanmean(stated.position**2)))
+
+
+def outcome(kind: str, seed: int, folder: Path) -> Outcome:
+    """One session, made and calibrated."""
+    from contextlib import nullcontext
+
+    from pkmcal import calibrate
+    from pkmcal.errors import PkmcalError
+    from pkmcal.identify.bundle import as_ended
+    from pkmcal.identify.kinds import READING_ROWS_KIND
+    from pkmcal.identify.noise import noise_shares
+
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        session = KINDS[kind](Path(temporary) / "session", seed)
+        corners = session.detections
+        found = patch("pkmcal.boards.stations.detect_in", lambda *_: corners)
+        quiet = patch("pkmcal.boards.stations.check_boards", lambda *_: None)
+        begin, none = time.perf_counter(), nullcontext()
+        try:
+            with found if corners else none, quiet if corners else none:
+                result = calibrate(session.folder)
+        except PkmcalError as error:
+            seconds = time.perf_counter() - begin
+            return Outcome({"refused": [str(error)]}, 0.0, float("inf"), float("nan"), seconds)
+        seconds = time.perf_counter() - begin
+    lost = int(np.sum(result.estimate.pose_weights < 0.5))
+    verdict, statistics = result.verdict, result.estimate.statistics
+    findings = {
+        "refused": list(verdict.reasons),
+        "departure": [one.sentence for one in result.departures],
+        "outvoted": [text for text in verdict.warnings if "outvoted" in text],
+        "noise": [text for text in verdict.warnings if "noise" in text and " scatters " in text]
+        + ["joints.noise contradicted"] * (statistics.reading_scale != 1),
+        "rejected": [f"{lost} of {result.estimate.pose_weights.size} measured poses"] * (lost > 0),
+        "other": list(verdict.warnings),
+    }
+    _, info = as_ended(result.measurements, result.estimate)
+    low, high = noise_shares(info, READING_ROWS_KIND).interval(INTERVAL_MISS)
+    scale = statistics.reading_scale
+    return Outcome(
+        findings, float(scale * low[0]), float(scale * high[0]), off_by(result, session), seconds
+    )
+
+
+def main() -> None:
+    """A line a kind, then the findings."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--sessions", type=int, default=10, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
+    parser.add_argument("--kind", nargs="*", help="kinds whose names have one of these words")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--other", action="store_true", help="all other warnings too")
+    options = parser.parse_args()
+    kinds = [k for k in KINDS if not options.kind or any(word in k for word in options.kind)]
+    seeds = range(options.first, options.first + options.sessions)
+    said, every, within, two_ended = [], 0, [], []
+    with tempfile.TemporaryDirectory() as temporary, ProcessPoolExecutor(options.workers) as pool:
+        print(f"{'':26}{'n':>4}" + "".join(f"{name:>10}" for name in (*FINDINGS, "any"))
+              + f"{'interval':>10}{'two ends':>10}{'z rms':>7}{'worst':>7}{'s':>6}")  # fmt: skip
+        for kind in kinds:
+            jobs = [(kind, seed, Path(temporary)) for seed in seeds]
+            found = list(pool.map(outcome, *zip(*jobs, strict=True)))
+            hit = [[bool(one.findings.get(name)) for name in FINDINGS] for one in found]
+            shown = np.array(hit)
+            holds = np.array([one.low <= 1 <= one.high for one in found])
+            both = np.array([one.low > 0 and np.isfinite(one.high) for one in found])
+            z = np.array([one.z for one in found])
+            every += int(shown.any(axis=1).sum())
+            within += holds.tolist()
+            two_ended += holds[both].tolist()
+            z_rms = np.sqrt(np.nanmean(z**2)) if np.isfinite(z).any() else float("nan")
+            worst = np.nanmax(z) if np.isfinite(z).any() else float("nan")
+            print(f"{kind:26}{len(found):4d}"
+                  + "".join(f"{n:10d}" for n in (*shown.sum(axis=0), shown.any(axis=1).sum()))
+                  + f"{holds.mean():10.0%}{holds[both].sum():6d}/{both.sum():<3d}"
+                  f"{z_rms:7.2f}{worst:7.2f}{np.mean([one.seconds for one in found]):6.1f}",
+                  flush=True)  # fmt: skip
+            for seed, one in zip(seeds, found, strict=True):
+                names = (*FINDINGS, "other") if options.other else FINDINGS
+                said += [f"{kind}, {seed}: {name}: {text}" for name in names
+                         for text in one.findings.get(name, ())]  # fmt: skip
+    n = len(kinds) * len(seeds)
+    print(f"\n{every} of {n} sessions have a finding; intervals hold the truth in"
+          f" {np.mean(within):.1%}, those with two ends in {np.mean(two_ended or [np.nan]):.1%}"
+          f" of {len(two_ended)}\n")  # fmt: skip
+    print("\n".join(said))
+
+
+if __name__ == "__main__":
+    main()
