@@ -227,16 +227,14 @@ def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, st
     whole = replace(session, stations=(lost, *session.stations))
 
     def without_the_first(saved, session, *rest):
-        return new_data.measured_new_data(
-            saved, session.of_stations([1], ("by hand/1 is left out",)), *rest
-        )
+        return new_data.measured_new_data(saved, session.without({0: "its place is open"}), *rest)
 
     monkeypatch.setattr("pkmcal.judge.watch.measured_new_data", without_the_first)
     found = watch_machine(load(demo.calibration), whole, same_place=[stayed.name])
     assert found.same_place == (stayed.name,)
     assert not found.moved
     assert not found.judged.changed
-    assert "by hand/1 is left out" in found.session.warnings
+    assert "by hand/1: left out, for its place is open." in found.session.warnings
 
 
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
