@@ -1,5 +1,6 @@
 """Photographs by hand: the format, EXIF, and a session in which each has a place of its own."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -18,13 +19,13 @@ from pkmcal.calibration.byhand import (
     misplaced,
     without_misplaced,
 )
-from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.calibrate import better_refined, calibrate_session, worse_refined
 from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import calibration_document
 from pkmcal.check.check import check_session
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Exif, read_exif, with_exif
 from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
@@ -40,6 +41,8 @@ from pkmcal.observe.stations import SECOND_PLACE_DOUBT
 from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
 from pkmcal.observe.tubes import PAIR_DIRECTIONS, RARITY_STEPS, tube_chart
+from pkmcal.outcome import Verdict
+from pkmcal.report.calibration import outcome_of
 from pkmcal.session.exif import camera_by_exif
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
@@ -298,6 +301,67 @@ def breathed(simulated, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         at_truth(patch, folder)
         return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
+
+
+def test_a_rejected_photograph_is_counted_named_and_shown(simulated, monkeypatch):
+    """On the terminal, in the report and in the documents; it was dropped from the count."""
+
+    def place(session, photographs, boards, _rng, _told):
+        T = load_truth(simulated, session.machine).T_camera_base[[0, 2]]
+        known = KnownScene.as_drawn(session.machine, T, session.joints)
+        kept = [replace(photographs[k], station=n) for n, k in enumerate((0, 2))]
+        return SeenSession(session.without({1: EDGES_DISAGREE_REASON}), kept, boards, known)
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    found = outcome_of(calibrate_session(simulated))
+    (card,) = [card for card in found.figures if card.question == "What is it based on?"]
+    assert card.values == (("2 of 3", "photographs"),)
+    file = "images/phone/0001-1.jpg"
+    (told,) = [one.text for one in found.findings]
+    assert told == f"{file}: left out, for {EDGES_DISAGREE_REASON}."
+    entry = {
+        "file": file, "station": "phone-0001-1", "configuration": "0001",
+        "reason": EDGES_DISAGREE_REASON,
+    }  # fmt: skip
+    assert found.summary["photographs"] == 3
+    assert found.summary["rejected_photographs"] == [entry]
+    assert json.loads(found.texts["calibration.json"])["rejected_photographs"] == [entry]
+    (part,) = [part for part in found.parts if part.name == "photographs"]
+    shown = part.html.partition("Left out whole")[2]
+    assert "phone-0001-1" in shown
+    assert f"left out, for {EDGES_DISAGREE_REASON}" in shown
+    assert len(re.findall(r'href="data:image/jpeg;base64,[^"]{1000}', shown)) >= 1
+
+
+def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
+    """An option never makes a result worse: what may be used, keeps more, fits better."""
+    found, _ = breathed
+    found = replace(found, verdict=Verdict(True, "Good."))
+    fewer = replace(found, session=found.session.without({2: EDGES_DISAGREE_REASON}))
+    refused = replace(found, verdict=Verdict(False, "Bad."))
+    statistics = found.estimate.statistics
+    worse = replace(statistics, chi2_as_stated=10 * statistics.chi2_as_stated)
+    misfit = replace(found, estimate=replace(found.estimate, statistics=worse))
+    assert worse_refined(found, found) == ""
+    assert worse_refined(fewer, found) == "2 of 3 photographs have a sure place, not 3"
+    for bad in (fewer, refused, misfit):
+        assert worse_refined(bad, found)
+        assert worse_refined(found, bad) == ""
+        taken = better_refined(lambda bad=bad: bad, lambda: found)
+        assert taken.session == found.session
+        assert taken.estimate is found.estimate
+        (warning,) = taken.verdict.warnings
+        assert "--refine-camera" in warning
+        assert better_refined(lambda: found, lambda bad=bad: bad) is found
+    assert better_refined(lambda: fewer, lambda: refused) is fewer  # first of all, it may be used
+
+    def failed():
+        raise ResultError("the search has diverged")
+
+    assert "the search has diverged" in better_refined(failed, lambda: found).verdict.warnings[0]
+    assert better_refined(lambda: found, failed) is found
+    with pytest.raises(ResultError, match="diverged"):
+        better_refined(failed, failed)
 
 
 def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):

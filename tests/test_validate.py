@@ -33,7 +33,7 @@ from pkmcal.judge.comparison import (
     promise,
     weighed_mean_and_rms,
 )
-from pkmcal.judge.held import held_machine
+from pkmcal.judge.held import held_machine, too_little
 from pkmcal.judge.holdouts import by_regions, hold_out
 from pkmcal.judge.new_data import repeated_rows
 from pkmcal.judge.paths import straightness
@@ -571,3 +571,16 @@ def test_no_calibration_there(session):
     done = run("validate", session, session)
     assert done.code == 2
     assert "there is no calibration here" in done.err
+
+
+def test_what_is_advised_where_too_little_was_seen():
+    """More configurations do not help legs on cranks, for their edges need the readings."""
+    delta, hexapod = load_mechanism("delta"), load_mechanism("gough-stewart")
+    alone = SimpleNamespace(edges=[1], on_platform=np.zeros(0, dtype=bool))
+    error = too_little(delta, alone)
+    assert error.exit_code == 2
+    assert "all legs on cranks or sliders" in error.found
+    assert "board on the platform" in error.expected
+    with_board = SimpleNamespace(edges=[1], on_platform=np.ones(1, dtype=bool))
+    for machine, measured_alone in ((hexapod, alone), (delta, with_board)):
+        assert too_little(machine, measured_alone).exit_code == 1

@@ -18,9 +18,8 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
-from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import count, named
+from pkmcal.wording import count
 
 FEWEST_LEFT_TO_CALIBRATE = 3
 """Configurations without which a calibration of the rest means nothing."""
@@ -160,30 +159,6 @@ def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integ
     if not rows.size:
         return rows, rows
     return rows, same_pose(measurements.joints[rows], measurements.joint_noise)
-
-
-def check_predictable(session: Session, where: str) -> None:
-    """Raise `InputError` where readings cannot be predicted from what the session observed: of legs
-    that stand on cranks or sliders, edges are located with the readings that would be predicted.
-
-    where : the option, or the session, that asks for it.
-    """
-    layout = session.machine.layout
-    moved = (layout.actuated >= 0) & ~layout.rod_reads
-    by_legs = any("legs" in station.observe for station in session.stations)
-    by_board = session.board_body == "platform" and any(
-        "board" in station.observe for station in session.stations
-    )
-    if moved.any() and by_legs and not by_board and not session.trackers:
-        raise InputError(
-            "readings of cranks and sliders cannot be predicted from photographs of legs yet",
-            where=where,
-            found=f"{named(np.flatnonzero(moved), layout.n_legs)} of {session.machine.name} with"
-            " ends that readings move, and nothing that shows the platform",
-            expected="a board on the platform, or a tracker's table of its poses, besides",
-            next_step="Add one of these (observe: [legs, board]), or calibrate two sessions of"
-            " different configurations and compare the results with pkmcal diff",
-        )
 
 
 def _check(n: int, left: int, total: int, what: str) -> None:

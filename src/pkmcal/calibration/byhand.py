@@ -25,7 +25,7 @@ from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.closely import AskedPlaces, join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import CalibrationProgress, Recognition, search_stations
+from pkmcal.calibration.recognise import CalibrationProgress, Recognition, locate_stations
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
 from pkmcal.identify.bundle import MachineTold
@@ -104,7 +104,7 @@ def localize(
     share done.
     """
     fixed = [p for p in photographs if not session.stations[p.station].handheld]
-    search = search_stations(session, fixed, boards, rng, told)
+    search = locate_stations(session, fixed, boards, rng, told)
     places: dict[int, Alone] = {}
     if search.error is not None:
         return Localization(search.recognition, places, search.error)

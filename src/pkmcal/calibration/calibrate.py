@@ -166,10 +166,6 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, clock)
-        if holdout:
-            from pkmcal.calibration.aside import check_predictable
-
-            check_predictable(session, "--holdout")
         seen = _observe(session, seed, clock)
 
         def calibrated(refine: bool) -> Calibration:

@@ -327,17 +327,17 @@ def station_poses(
     rng: np.random.Generator,
     told: CalibrationProgress | None = None,
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`search_stations`.
+    """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`locate_stations`.
 
     Raises `InputError`, or `ResultError`, where nothing tells one that is not by hand.
     """
-    found = search_stations(session, photographs, boards, rng, told)
+    found = locate_stations(session, photographs, boards, rng, told)
     if found.error is not None:
         raise found.error
     return found.T_camera_base
 
 
-def search_stations(
+def locate_stations(
     session: Session,
     photographs: list[Photographs],
     boards: Boards,

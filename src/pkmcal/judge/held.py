@@ -20,7 +20,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.calibration.saved import Known
-from pkmcal.errors import ResultError
+from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.geometry.rigid import pose_difference, skew
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
@@ -34,6 +34,7 @@ from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
 from pkmcal.solver.search import Stop, minimise
+from pkmcal.wording import named
 
 USUAL_RATIO_CHANGE = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
@@ -156,7 +157,8 @@ def hold(
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if trust is None:
-        _check_enough(assembled.problem, begin)
+        if not _is_enough(assembled.problem, begin):
+            raise too_little(machine, measurements)
         result = solve_batch(assembled.problem, begin, scale_readings=False)
         problem, found = result.info.problem, result.solution
     else:
@@ -177,16 +179,28 @@ def hold(
     return Held(still, assembled.seen, problem, state, ("machine", "intrinsics"))
 
 
-def _check_enough(problem: Problem, state: BatchState) -> None:
-    """Raise ResultError where there are fewer rows than unknowns."""
+def _is_enough(problem: Problem, state: BatchState) -> bool:
+    """Whether there are as many rows as unknowns."""
     linear = problem.linearize(state)
     rows = int(linear.usable.sum()) + len(linear.shared_by)
-    if rows < problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]:
-        raise too_little()
+    return rows >= problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]
 
 
-def too_little() -> ResultError:
-    """What is said where readings would be predicted from themselves."""
+def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
+    """Why readings cannot be predicted: too little was measured, or, of legs alone whose ends are
+    moved by the readings, more of it would not help.
+    """
+    layout = machine.layout
+    moved = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
+    if len(measurements.edges) and not measurements.on_platform.any() and moved.size:
+        return InputError(
+            f"the readings of {machine.name} cannot be predicted from photographs of its legs yet",
+            found=f"{named(moved, layout.n_legs)} on cranks or sliders, where edges are located"
+            " with the readings that are to be predicted",
+            expected="a board on the platform, or a tracker's table of its poses, besides",
+            next_step="Add one of these (observe: [legs, board]), or calibrate two sessions of"
+            " different configurations and compare the results with pkmcal diff",
+        )
     return ResultError(
         "too little was seen to predict readings: some poses follow from their own readings alone",
         expected="legs, a board or whole poses in several more configurations; heights tell none",

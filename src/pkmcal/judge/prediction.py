@@ -108,7 +108,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
     left = np.eye(m) - along - beside @ beside.mT  # L
     if float(np.linalg.eigvalsh(left).min(initial=1.0)) < LEAST_RESIDUAL_LEFT:
-        raise too_little()
+        raise too_little(machine, measurements)
     alone = np.linalg.inv(left)
     units = _size(held)[..., None] * alone
 

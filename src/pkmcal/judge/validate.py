@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
-from pkmcal.calibration.aside import check_predictable
 from pkmcal.calibration.calibrate import CalibrationProgress
 from pkmcal.calibration.same_machine import read_same_machine
 from pkmcal.calibration.saved import SavedCalibration
-from pkmcal.errors import ResultError
+from pkmcal.errors import PkmcalError
 from pkmcal.files import json_value
 from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
 from pkmcal.judge.holdouts import HoldOut, by_regions
@@ -106,7 +105,6 @@ def validate_calibration(
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
-        check_predictable(session, str(session.folder))
         lines, known = paths_of(session), known_rows(saved, session)
         if not regions:
             check_new(known, _photographed(session), *NOT_INDEPENDENT)
@@ -126,7 +124,7 @@ def validate_calibration(
         if new.size:
             try:
                 by_drawing = predict(drawing, data, estimate.state)
-            except ResultError:  # so far off that its poses are not found
+            except PkmcalError:  # so far off that its poses are not found
                 by_drawing = None
             judged = compare_with_drawing(drawing, saved.covariance, data, found, by_drawing, new)
 
