@@ -103,6 +103,17 @@ def focal(share: float) -> Any:
     return camera(change)
 
 
+def aspect(share: float) -> Any:
+    """fx / fy."""
+
+    def change(document: dict[str, Any], rng: np.random.Generator) -> None:
+        half = rng.choice([-1, 1]) * share / 2
+        fx, fy = document["focal"]
+        document["focal"] = [float(fx * (1 + half)), float(fy * (1 - half))]
+
+    return camera(change)
+
+
 def centre(pixels: float) -> Any:
     """Its centre."""
 
@@ -249,6 +260,7 @@ FACTS: dict[str, Fact] = {
     ),
     "focal length .2 %": Fact(focal(0.002), ("is not the one that took",)),
     "focal length 1 %": Fact(focal(0.01), ("is not the one that took",)),
+    "pixel aspect .3 %": Fact(aspect(0.003), ("is not the one that took",)),
     "centre 3 px": Fact(centre(3.0), ("is not the one that took",)),
     "centre 30 px": Fact(centre(30.0), ("is not the one that took",)),
     "distortion omitted": Fact(camera(undistorted), ("is not the one that took",)),

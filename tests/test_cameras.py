@@ -544,3 +544,17 @@ def test_faults_of_camera_files(tmp_path, line, instead, sentence):
     with pytest.raises(InputError) as caught:
         load_camera(tmp_path / "a.yaml")
     assert str(caught.value) == sentence.replace("MODELS", " or ".join(sorted(camera_models())))
+
+
+def test_a_changed_aspect_leaves_the_mean_focal_length(case):
+    """Of every model: fx / fy grows by the number, and fx fy stays, to first order."""
+    camera, share = case[1], 1e-4
+    other = camera.parameters + share * camera.aspect_part
+    ratio = (other[0] / other[1]) / (camera.parameters[0] / camera.parameters[1])
+    assert ratio - 1 == pytest.approx(share, rel=1e-3)
+    assert other[0] * other[1] == pytest.approx(np.prod(camera.parameters[:2]), rel=share**2)
+    np.testing.assert_array_equal(other[2:], camera.parameters[2:])
+    parts = camera.departures()
+    assert len({part.kind for part in parts}) == len(parts)
+    every = np.concatenate([part.columns for part in parts], axis=1)
+    assert np.linalg.matrix_rank(every[:4] / camera.image_size[0]) == 4

@@ -81,7 +81,8 @@ class UpsideDown:
 def upside_down(session: Session, turns: Turns) -> tuple[UpsideDown, ...]:
     """The cameras against whose files the photographs are upside down, or may well be."""
     changed = CameraChange.of(session, turns.observation, turns.measurements)
-    if changed is None or not len(turns.measurements.edges):
+    refined = turns.measurements.intrinsics_factor.shape[-1] > 0
+    if changed is None or refined or not len(turns.measurements.edges):
         return ()
     entries = np.array([station.entry for station in session.stations])
     cameras = {station.entry: (station.camera_file, station.camera) for station in session.stations}

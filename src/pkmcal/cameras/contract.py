@@ -54,10 +54,11 @@ class CameraSchema(Schema):
         return focal
 
 
-USUAL_FOCAL, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.01, 0.05
-"""Standard deviations of a camera whose file states none: of its focal lengths, relative; of its
-centre, in parts of the picture's width; of its first term of distortion. A zoom ring turned by a
-hair, a sensor that is not centred behind its lens, and the distortion of most lenses."""
+USUAL_FOCAL, USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.001, 0.01, 0.05
+"""Standard deviations of a camera whose file states none: of its focal lengths, relative, and of
+their ratio; of its centre, in parts of the picture's width; of its first term of distortion. A zoom
+ring turned by a hair, pixels that are square to a thousandth, a sensor that is not centred behind
+its lens, and the distortion of most lenses."""
 
 
 class LensDeparture(NamedTuple):
@@ -161,9 +162,17 @@ class Camera(ABC):
         focal = [name.startswith("focal.") for name in self.parameter_names]
         return np.where(focal, self.parameters, 0.0)
 
+    @property
+    def aspect_part(self) -> Array:
+        """(n,) change of the parameters when fx / fy grows by its own size and their geometric mean
+        stays.
+        """
+        way = [{"focal.x": 0.5, "focal.y": -0.5}.get(name, 0.0) for name in self.parameter_names]
+        return np.array(way) * self.parameters
+
     def departures(self) -> tuple[LensDeparture, ...]:
-        """What is wrong first, where anything is: focus, the picture cut otherwise, a lens whose
-        distortion was left out.
+        """What is wrong first, where anything is: focus, pixels that are not as square as stated,
+        the picture cut otherwise, a lens whose distortion was left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
@@ -175,6 +184,15 @@ class Camera(ABC):
                 lambda v, s: (
                     f"focal lengths fit that are {abs(v[0]):.2%} ± {s[0]:.2%}"
                     f" {'longer' if v[0] > 0 else 'shorter'}"
+                ),
+            ),
+            LensDeparture(
+                "pixel aspect",
+                self.aspect_part[:, None],
+                USUAL_ASPECT,
+                lambda v, s: (
+                    f"fx / fy fits that is {abs(v[0]):.2%} ± {s[0]:.2%}"
+                    f" {'larger' if v[0] > 0 else 'smaller'}"
                 ),
             ),
             LensDeparture(
