@@ -175,7 +175,9 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     shared = own.by_shared[0]
     begin = problem.unknowns.stations.start + 6
     later = np.where((np.arange(14) >= 5)[:, None, None], shared[..., begin : begin + 6], 0.0)
-    throughout = columns_of(assembled, state, [effects[0], effects[2]], singles=True)(slice(0, 14))
+    throughout = columns_of(assembled, state, [effects[0], effects[2]], singles=True)(
+        slice(0, 14), own
+    )
     single = np.einsum("krm,kl->krlm", throughout[..., 3:], np.eye(14)).reshape(
         *later.shape[:2], -1
     )

@@ -320,13 +320,15 @@ class Effect:
     have been.
 
     edges : (N, 2, k) turn of the normals, in their bases. readings : (K, m, k). poses : (N', 6, k)
-    left perturbation of T_station_target. Absent: none. Or, where ``station`` is given, the camera
+    left perturbation of T_station_target. motion : (S, K, 6, k) left perturbation (omega, tau) of
+    the stations' poses, by configuration. Absent: none. Or, where ``station`` is given, the camera
     or tracker of that number stands elsewhere from configuration ``since`` on, by (omega, tau).
     """
 
     edges: Array | None = None
     readings: Array | None = None
     poses: Array | None = None
+    motion: Array | None = None
     station: int | None = None
     since: int = 0
 
@@ -335,7 +337,7 @@ class Effect:
         """How many numbers, k."""
         if self.station is not None:
             return 6
-        parts = (self.edges, self.readings, self.poses)
+        parts = (self.edges, self.readings, self.poses, self.motion)
         return max((part.shape[-1] for part in parts if part is not None), default=0)
 
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from pkmcal.arrays import Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
 from pkmcal.calibration.chance import by_chance, chance_doubt
-from pkmcal.calibration.departures import Departed, unmodelled_departures
+from pkmcal.calibration.departures import Departed, model_violations
 from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
     as_stated,
@@ -29,7 +29,8 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
-from pkmcal.calibration.known import SeenSession
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.model_errors import ModelError, sentences
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
@@ -46,9 +47,10 @@ from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_t
 from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
     explain,
@@ -81,6 +83,7 @@ class Calibration(ShownCalibration):
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
     the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
     tells what it predicts of them. departures : what the data show that the model does not have.
+    model_errors : smooth errors of the model that have no name; the covariance contains them.
     upside_down : cameras whose photographs are, by which they were measured.
     photographs : of stations whose legs were observed, by their number; those that fitted into
     memory are decoded.
@@ -99,6 +102,7 @@ class Calibration(ShownCalibration):
     boards: Boards = field(default_factory=Boards)
     holdout: LeftOut | None = None
     departures: tuple[Departed, ...] = ()
+    model_errors: tuple[ModelError, ...] = ()
     upside_down: tuple[UpsideDown, ...] = ()
     photographs: Mapping[int, Sequence[Integers]] = field(
         default_factory=dict[int, Sequence[Integers]]
@@ -175,6 +179,28 @@ def calibrate_session(
         check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
         found = _estimated(seen.session.machine, turns, richer, method, seed, holdout, clock)
         return _judge(seen, found, turned, method, seed, clock)
+
+
+def calibrate_measurements(
+    session: Session,
+    observation: Observation,
+    measurements: Measurements,
+    T_camera_base: Array,
+    *,
+    progress: CalibrationProgress | None = None,
+) -> Calibration:
+    """Calibrate the machine of a session from edges that were measured already, as simulated ones.
+
+    No image is read. observation : with the edges of ``measurements``. T_camera_base : (S, 4, 4)
+    from where the estimate starts. Raises ResultError where there is no estimate.
+    """
+    clock = _Clock(progress)
+    start = start_state(session.machine, measurements, T_camera_base)
+    estimate = bundle(session.machine, measurements, start)
+    turns = Turns(observation, measurements, estimate, refinement_of(session, False), start=start)
+    known = KnownScene.as_drawn(session.machine, T_camera_base, session.joints)
+    seen = SeenSession(session, [], Boards(), known)
+    return _judge(seen, _Identified(turns, estimate, (), None), (), "bundle", 0, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -323,11 +349,13 @@ def _judge(
     ended = as_ended(found.turns.measurements, found.estimate)
     findings = _findings(found.turns.measurements, found.estimate, ended[1])
     departed: tuple[Departed, ...] = ()
+    errors: tuple[ModelError, ...] = ()
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = found.turns
-        departed = unmodelled_departures(
+        departed, errors, estimate = model_violations(
             session, turns.observation, turns.measurements, found.estimate, ended
         )
+        found = found._replace(estimate=estimate)
     verdict = judge(
         found.turns.observation,
         found.estimate,
@@ -344,8 +372,9 @@ def _judge(
         ),
         cautions=(
             *(one.sentence for one in departed if not one.against),
+            *sentences(errors),
             *outvoted(session, found.turns.measurements, found.estimate),
-            *noise_told(session, found.estimate, bool(departed)),
+            *noise_told(session, found.estimate, bool(departed or errors)),
             *lens_told(found.turns.cameras),
             *(one.sentence for one in (*turned, *found.turns.responses) if not one.sure),
         ),
@@ -371,6 +400,7 @@ def _judge(
         boards=seen.boards,
         holdout=found.out,
         departures=departed,
+        model_errors=errors,
         upside_down=tuple(one for one in turned if one.sure),
         photographs={one.station: one.images for one in seen.photographs},
     )

@@ -8,23 +8,37 @@ measurements and in which words it is told; here they are put together and teste
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.model_errors import (
+    ModelError,
+    discrepancy_components,
+    model_errors,
+    with_discrepancy,
+)
 from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import Information
+from pkmcal.identify.discrepancy import discrepancy_of, no_discrepancy
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import MOST_DEPARTURES_SOUGHT, Departures, Freed, Score
+from pkmcal.identify.score import (
+    MOST_DEPARTURES_SOUGHT,
+    Departures,
+    Freed,
+    RandomEffects,
+    Score,
+)
 from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
-from pkmcal.mechanisms.closure import scales
+from pkmcal.mechanisms.closure import scales as scales_of
 from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
@@ -80,26 +94,41 @@ class Departed:
         return f"{self.what}; {moves}, {self.tool:.2g} standard deviations. {self.todo}."
 
 
-def unmodelled_departures(
+class ModelViolations(NamedTuple):
+    """What the data show that the model does not have.
+
+    departures : violations that have a name, the surest first. errors : components of the model
+    discrepancy beside them. estimate : whose covariance contains the discrepancy.
+    """
+
+    departures: tuple[Departed, ...]
+    errors: tuple[ModelError, ...]
+    estimate: Estimate
+
+
+def model_violations(
     session: Session,
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
     ended: tuple[Assembled, Information],
-) -> tuple[Departed, ...]:
-    """What the data show that the model does not have, the surest first.
+) -> ModelViolations:
+    """What the data show that the model does not have.
 
-    ended : the estimate's problem at its end, :func:`pkmcal.identify.bundle.as_ended`.
+    A violation is named only if it explains more than the discrepancy does: what is found at first
+    is tested once more beside the discrepancy. ended : the estimate's problem at its end,
+    :func:`pkmcal.identify.bundle.as_ended`.
     """
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     layout = estimate.machine.layout
-    present = scales(layout, estimate.machine.values) / scales(
+    present = scales_of(layout, estimate.machine.values) / scales_of(
         layout, session.machine.parameters.drawing
     )
     first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
     families = [
         *readings.reading_departures(measurements.joints, columns, units, present[first]),
         list(_lenses(session, observation, measurements)),
+        list(_lenses_of_stations(session, observation, measurements)),
         list(_boards(session, measurements)),
         list(_tripods(session, measurements)),
     ]
@@ -113,35 +142,62 @@ def unmodelled_departures(
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    tests = Departures(*ended, [one.effect for one in listed], number.tolist(), singles=True)
     known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    found = [*tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known]), *known]
+    seen = np.flatnonzero(ended[0].seen)
+
+    def declared(k: int) -> Departure:
+        if k < len(listed):
+            return listed[k]
+        row, m = divmod(k - len(listed), len(columns))
+        wrong = readings.wrong_reading(columns[m], units[m], session.configurations[seen[row]])
+        one = np.zeros((*measurements.joints.shape, 1))
+        one[seen[row], m] = 1.0
+        return replace(wrong, effect=Effect(readings=one))
+
+    def tested(beside: RandomEffects | None) -> tuple[Departures, list[tuple[int, Score]]]:
+        effects = [one.effect for one in listed]
+        tests = Departures(*ended, effects, number.tolist(), singles=True, beside=beside)
+        found = tests.found(FALSE_DEPARTURE_CHANCE, [k for k, _ in known])
+        return tests, [*found, *known]
+
+    tests, found = tested(None)
+    discrepancy = no_discrepancy(ended[1])
+    if not only_heights(estimate):
+        scales = estimate.statistics.reading_scale, estimate.statistics.pose_scale
+        discrepancy = discrepancy_of(
+            *ended,
+            discrepancy_components(measurements, estimate),
+            [declared(k).effect for k, _ in found],
+            scales,
+        )
+    if discrepancy.scales and found:
+        tests, found = tested(discrepancy.random)
+    before = tool_of(session, estimate)
+    estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
+    tool = tool_of(session, estimate) if discrepancy.scales else before
+    errors = model_errors(discrepancy, tool, before, units[0])
     if not found:
-        return ()
-    used = estimate.configurations
-    machine = estimate.machine
-    tool = tool_error(
+        return ModelViolations((), errors, estimate)
+    fits = tests.fitted([k for k, _ in found])
+    last = len(fits) - len(tubes)
+    fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    departures = tuple(
+        _departed(declared(k), score, fit, tool)
+        for (k, score), fit in zip(found, fits, strict=True)
+    )
+    return ModelViolations(departures, errors, estimate)
+
+
+def tool_of(session: Session, estimate: Estimate) -> ToolError:
+    """The tool at the session's poses."""
+    used, machine = estimate.configurations, estimate.machine
+    return tool_error(
         session.machine,
         machine,
         free_of_gauge(machine, estimate.covariance),
         estimate.state.T_base_platform[used],
         session.joints[used],
         legs_seen=estimate.edge_weights.size > 0,
-    )
-
-    def declared(k: int) -> Departure:
-        if k < len(listed):
-            return listed[k]
-        row, m = divmod(k - len(listed), len(columns))
-        name = session.configurations[np.flatnonzero(ended[0].seen)[row]]
-        return readings.wrong_reading(columns[m], units[m], name)
-
-    fits = tests.fitted([k for k, _ in found])
-    last = len(fits) - len(tubes)
-    fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
-    return tuple(
-        _departed(declared(k), score, fit, tool)
-        for (k, score), fit in zip(found, fits, strict=True)
     )
 
 
@@ -163,15 +219,50 @@ def _lenses(
     session: Session, observation: Observation, measured: Measurements
 ) -> Iterator[Departure]:
     """A camera that is not as its file says, by the departures that its model declares."""
+    if measured.intrinsics_factor.shape[-1]:
+        return  # they are estimated already
     changed = CameraChange.of(session, observation, measured)
     if changed is None:
-        return  # they are estimated already
+        return
     files = {station.camera_file: station.camera for station in session.stations}
     for file, camera in files.items():
         own = np.array([station.camera_file == file for station in session.stations])
         for part in camera.departures():
             effect = changed.effect(own, part.columns)
             yield Departure(part.kind, file, _of_lens(part.says, file), effect)
+
+
+def _lenses_of_stations(
+    session: Session, observation: Observation, measured: Measurements
+) -> Iterator[Departure]:
+    """A station whose camera is another than that of the other stations with the same file; not of
+    images by hand, whose focal lengths are estimated one by one.
+    """
+    files = [station.camera_file for station in session.stations]
+    shared = [
+        files.count(station.camera_file) > 1 and not station.handheld
+        for station in session.stations
+    ]
+    changed = CameraChange.of(session, observation, measured) if any(shared) else None
+    if changed is None:
+        return
+    for s in np.flatnonzero(shared).tolist():
+        station, own = session.stations[s], np.arange(len(files)) == s
+        for part in station.camera.departures():
+            says = _of_lens_at(part.says, station.name, station.camera_file)
+            effect = changed.effect(own, part.columns)
+            yield Departure(f"station's {part.kind}", station.name, says, effect)
+
+
+def _of_lens_at(
+    says: Callable[[Array, Array], str], station: str, file: str
+) -> Callable[[Array, Array], tuple[str, str]]:
+    return lambda value, sigma: (
+        f"The camera of {station} is not that of the other stations, which share {file}:"
+        f" {says(value, sigma)}",
+        f"Calibrate the camera of {station} by itself with `pkmcal camera`, and give the station a"
+        " file of its own",
+    )
 
 
 @dataclass(frozen=True)
@@ -189,9 +280,9 @@ class CameraChange:
     def of(
         cls, session: Session, observation: Observation, measured: Measurements
     ) -> CameraChange | None:
-        """Nothing where no camera is held: what is estimated is not asked about."""
+        """Nothing where there is no camera."""
         cameras = [station.camera for station in session.stations]
-        if measured.intrinsics_factor.shape[-1] or not cameras:
+        if not cameras:
             return None
         edges = edges_by_camera(observation, cameras)
         poses = np.zeros((len(measured.poses), 6, edges.shape[-1]))

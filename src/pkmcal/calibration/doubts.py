@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import CameraRefinement
 from pkmcal.calibration.recognise import frozen_in
-from pkmcal.cameras.contract import USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
+from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
 from pkmcal.identify.assembly import assemble, batch_of
@@ -63,6 +63,9 @@ COMMON_FACTOR_CHI2 = 60.0
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
 richer model no help: what is believed ends below MOST_CURED_MISFIT."""
+WRONG_MODEL_READING_SCALE = 100.0
+"""Factor on the readings' stated noise from which it is no noise: between a data sheet's figure and
+what a mounted encoder does lies a factor of ten or thirty."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
 BOARDS_TURN_WORDS = {"one axis": "turn about one axis", "none": "do not turn"}
@@ -380,12 +383,23 @@ def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
 
 
 def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """A reason where readings scatter by more than the drawing is off: they tell nothing."""
+    """A reason where readings scatter by more than the drawing is off, and so tell nothing, or by
+    so much more than is stated that it is no noise.
+    """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
     most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
-    if s.reading_scale <= 1 or noise <= most:
+    if s.reading_scale <= 1:
         return ()
+    if noise <= most and s.reading_scale < WRONG_MODEL_READING_SCALE:
+        return ()
+    if noise <= most:
+        return (
+            f"The readings scatter by {_lengths(noise, units)},"
+            f" {s.reading_scale:.0f} times what joints.noise in session.yaml says: encoders are"
+            " not stated so wrong, something moves the machine beside its readings, or they are"
+            " not those of these configurations. If they really are no better, state their noise.",
+        )
     return (
         f"The readings scatter by {_lengths(noise, units)}, more than the drawing's tolerance of"
         f" {_lengths(most, units)}: they may belong to other configurations, or to another"
@@ -482,6 +496,7 @@ def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
     usual = ", ".join(
         (
             f"focal lengths to {USUAL_FOCAL:.1%}",
+            f"their ratio to {USUAL_ASPECT:.1%}",
             f"the centre to {USUAL_CENTRE:.0%} of the width",
             f"distortion to {USUAL_DISTORTION:g}",
         )

@@ -190,6 +190,7 @@ def calibration_document(
             **session.document,
         },
         "departures": [one.document() for one in calibration.departures],
+        "model_errors": [one.document() for one in calibration.model_errors],
         "warnings": session.warnings,
         "versions": versions(),
         "timings": {name: round(value, 3) for name, value in calibration.timings.items()},

@@ -69,6 +69,13 @@ class Freed:
     moved: Array
 
 
+class RandomEffects(NamedTuple):
+    """Effects whose k coefficients together have the covariance ``root root^T``, root (k, l)."""
+
+    effects: tuple[Effect, ...]
+    root: Array
+
+
 class Departures:
     """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run), of
     which ``info`` tells.
@@ -85,15 +92,18 @@ class Departures:
         families: Sequence[int] | None = None,
         *,
         singles: bool = False,
+        beside: RandomEffects | None = None,
     ) -> None:
         """As the module says.
 
         families : of which each listed one is; among many departures of one kind the single one
         has to gain more, and those of other kinds do not pay for it. One family if absent; single
-        readings are one of their own.
+        readings are one of their own. beside : what counts as further unknowns, known beforehand
+        to be small.
         """
-        basis = _basis(info)
-        self._made = _products(assembled, info, listed, basis, singles)
+        beside = beside or RandomEffects((), np.zeros((0, 0)))
+        basis = _basis_beside(assembled, info, beside)
+        self._made = _products(assembled, info, listed, basis, singles, beside)
         family = np.zeros(len(listed), dtype=int) if families is None else np.array(families)
         rest = np.full(self._made.single[..., 0].size, family.max(initial=-1) + 1)
         self._family = np.append(family, rest).astype(int)
@@ -283,10 +293,34 @@ class _Left:
         return np.sum(ways[:, part <= SEEN_SQUARE_SHARE] ** 2, axis=1)
 
 
-def _basis(info: Information) -> Array:
+def shared_basis(info: Information) -> Array:
     """B (na, nb): the rows by the shared unknowns times it are orthonormal."""
     half = inverse_root(info.rows[0][:1], ROWS_RANK_TOLERANCE, loose=False)[0]
     return half[:, np.any(half != 0, axis=0)]
+
+
+def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects) -> Array:
+    """B (na + l, nb + l): the rows by the shared unknowns and by random effects, in their own
+    standard deviations, times it are orthonormal; those that say so of the effects are among them.
+
+    With Q = J B0 the orthonormal rows of the unknowns alone and D the effects' columns, the further
+    ones are ``(D - Q Q^T D) L^-T`` with ``L L^T = 1 + D^T D - (Q^T D)^T Q^T D``.
+    """
+    basis, count = shared_basis(info), beside.root.shape[1]
+    if not count:
+        return basis
+    columns = columns_of(assembled, info.state, beside.effects)
+    across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
+    na = len(basis)
+    for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
+        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ beside.root)
+        flat = rows.reshape(-1, na + count)
+        across += (flat[:, :na] @ basis).T @ flat[:, na:]
+        squared += flat[:, na:].T @ flat[:, na:]
+    triangle = np.linalg.inv(np.linalg.cholesky(squared - across.T @ across)).T
+    return np.block(
+        [[basis, -basis @ across @ triangle], [np.zeros((count, basis.shape[1])), triangle]]
+    )
 
 
 def _products(
@@ -295,8 +329,9 @@ def _products(
     listed: Sequence[Effect],
     basis: Array,
     singles: bool,
+    beside: RandomEffects,
 ) -> _Products:
-    """Of the departures' columns."""
+    """Of the departures' columns; basis : of the unknowns and the random effects beside them."""
     problem, seen = assembled.problem, assembled.seen
     stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
     parts: list[_Listed] = []
@@ -314,14 +349,16 @@ def _products(
     single, among, known = [np.zeros((0, motors, width))], [np.zeros((0, motors, motors))], 0.0
     throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, info.state, throughout, singles=singles)
+    random, n_random = columns_of(assembled, info.state, beside.effects), beside.root.shape[1]
     for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
         linear = piece.linear
-        rows, value = _eliminated(linear, columns(cut))
+        further = [random(cut, linear) @ beside.root, columns(cut, linear)]
+        rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
-            known = (linear.shared_by @ basis).T @ linear.shared_value[0]
-        split = rows.shape[-1] - motors
-        own = [rows[..., stations], rows[..., count:split], rows[..., :count] @ basis]
+            known = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
+        first, split = count + n_random, rows.shape[-1] - motors
+        own = [rows[..., stations], rows[..., first:split], rows[..., :first] @ basis]
         wide = np.concatenate([*own, value[..., None]], axis=-1)
         for begin in begins:
             flat = wide[max(begin - cut.start, 0) :].reshape(-1, width)
@@ -336,7 +373,7 @@ def _products(
     )
 
 
-def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
+def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
     """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
     which the configurations' own unknowns are eliminated. Rows that are weighted away or hold
     nothing say nothing of departures either.
@@ -352,9 +389,9 @@ def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
 
 def columns_of(
     assembled: Assembled, state: BatchState, listed: Sequence[Effect], *, singles: bool = False
-) -> Callable[[slice], Array]:
-    """Gives the columns (K', r, k) of some configurations, by effects throughout, in their order,
-    then by the single readings.
+) -> Callable[[slice, Linear], Array]:
+    """Gives the columns (K', r, k) of some configurations, of which the problem's rows are given,
+    by effects throughout, in their order, then by the single readings.
     """
     problem, places = assembled.problem, assembled.places
     counts = [effect.count for effect in listed]
@@ -362,6 +399,7 @@ def columns_of(
     readings = np.zeros((len(problem.blocks.present), m, n + (m if singles else 0)))
     readings[..., n:] = np.eye(m)[:, : readings.shape[-1] - n]
     placed: list[tuple[slice, Array | None, Array | None]] = []
+    moving: list[tuple[slice, Array]] = []
     for effect, end in zip(listed, np.cumsum(counts).tolist(), strict=True):
         where = slice(end - effect.count, end)
         if effect.readings is not None:
@@ -369,8 +407,10 @@ def columns_of(
         edges = None if effect.edges is None else places.edges.filled(effect.edges)
         poses = None if effect.poses is None else places.poses.filled(effect.poses)
         placed.append((where, edges, poses))
+        if effect.motion is not None:
+            moving.append((where, effect.motion[:, assembled.seen]))
 
-    def columns(cut: slice) -> Array:
+    def columns(cut: slice, linear: Linear) -> Array:
         part = problem.among(cut)
         c, layout = part.closure(part.state_among(state, cut)), part.layout
         out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
@@ -388,6 +428,10 @@ def columns_of(
                 before[..., where] = -(of_edges @ edges[cut]).reshape(shape)
             if poses is not None:
                 after[..., where] = -(of_poses @ poses[cut]).reshape(shape)
+        by_station = linear.by_shared[0][..., problem.unknowns.stations]
+        for where, motion in moving:
+            each = motion[:, cut].swapaxes(0, 1)
+            out[..., where] += by_station @ each.reshape(len(out), -1, each.shape[-1])
         return out
 
     return columns

@@ -1,0 +1,345 @@
+"""Model discrepancy: what the model leaves out, as random effects with estimated scales.
+
+A *component* is a family of functions that could be missing from the model: errors of the readings
+that vary smoothly over the workspace, say. Each function is a column G of derivatives of all rows,
+in standard deviations, and its coefficient is random, ``w ~ N(0, s^2 L L^T)`` with a known L.
+
+Evidence
+--------
+With J the Jacobian at the solution, r its residuals and ``H = (I - J J^+) G`` what the unknowns
+leave of the columns, ``h = H^T r`` and ``M = H^T H``,
+
+    h ~ N(0, M + s^2 M L L^T M)
+
+so s has a likelihood of its own, the restricted one (Patterson and Thompson 1971). A component is
+believed where its likelihood ratio is beyond what chance gives at a level that all components
+share; half of a chi-square variable of one degree of freedom, since s cannot be negative (Self and
+Liang 1987). Components are taken up one after the other, the one with the largest ratio first, each
+beside those before it. Model violations that have names take part, each a component of its own: one
+that explains more than smooth functions do is taken up before them, one that explains less is left
+without anything to explain.
+
+Where the estimate has enlarged the noise of readings or poses, the discrepancy may be what enlarged
+it: the two are compared by the restricted likelihood of both, and a component of the readings, or
+poses, needs no further evidence, for that something is left out is known already.
+
+Covariance
+----------
+The discrepancy has moved the unknowns by ``J^+ G w``. With m and C the mean and the covariance of w
+given the data, the mean square of that is
+
+    J^+ G (m m^T + C) (J^+ G)^T
+
+and is added to the unknowns' covariance. Functions that the data see count as they are seen. Those
+that the unknowns absorb keep the scale that the visible ones have (Kennedy and O'Hagan 2001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.assembly import Assembled
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside, shared_basis
+from pkmcal.measurements import Effect
+from pkmcal.solver.elimination import divisions
+
+NAMED = "named."
+"""Begins the codes of violations that have names elsewhere."""
+COLUMNS_BY_UNKNOWNS = 4
+"""Columns of all components in times of the unknowns': rows are gone through in so much smaller
+pieces, which take no more memory."""
+
+
+@dataclass(frozen=True)
+class DiscrepancyOptions:
+    """Constants of the search."""
+
+    # chance at which any component is found in a session that has none
+    false_alarm: float = 0.005
+    # factor on a stated noise from which the discrepancy may be what enlarged it
+    enlarged: float = 1.2
+    # factors tried then, from what was stated to what is in use
+    noise_factors: int = 5
+    # components in one session at most; more are a session with other troubles
+    most: int = 4
+    # scales tried for each component, geometrically between hardly visible and nothing else visible
+    scales: int = 121
+    # part of a squared column that has to be left beside the unknowns; less is rounding
+    rank: float = 1e-10
+
+
+@dataclass(frozen=True)
+class Component:
+    """A family of functions with one scale.
+
+    code : for programs. effect : what the k functions do to the measurements. roots : the L (k, l)
+    to choose from, of functions with a mean square of one over the session's configurations.
+    inflates : kind of rows whose noise such an error enlarges, as READING_ROWS_KIND.
+    """
+
+    code: str
+    effect: Effect
+    roots: tuple[Array, ...]
+    inflates: int | None = None
+
+
+@dataclass(frozen=True)
+class ComponentScale:
+    """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
+    logarithm of the likelihood ratio against no such component.
+    """
+
+    code: str
+    scale: float
+    ratio: float
+    root: Array
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What the data show of the components.
+
+    scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
+    shared unknowns. random : their effects.
+    """
+
+    scales: tuple[ComponentScale, ...]
+    shared: Array
+    random: RandomEffects
+
+
+@dataclass(frozen=True)
+class _Products:
+    """Products of the columns that the unknowns leave: squared (c, c) M, value (c,) h; gain (na, c)
+    J^+ G of the shared unknowns. whole : (c, c) of the columns themselves. likelihood : restricted,
+    without any component.
+    """
+
+    squared: Array
+    value: Array
+    gain: Array
+    whole: Array
+    likelihood: float
+
+
+def no_discrepancy(info: Information) -> Discrepancy:
+    """None at all."""
+    na = info.problem.unknowns.count
+    return Discrepancy((), np.zeros((na, na)), RandomEffects((), np.zeros((0, 0))))
+
+
+def discrepancy_of(
+    assembled: Assembled,
+    info: Information,
+    components: Sequence[Component],
+    named: Sequence[Effect] = (),
+    enlarged: tuple[float, float] = (1.0, 1.0),
+    options: DiscrepancyOptions = DiscrepancyOptions(),
+) -> Discrepancy:
+    """The discrepancy at a solution; the problem's first run.
+
+    named : effects of the model violations that were found otherwise, which take part with a scale
+    each: what they explain better is theirs, and not in the result. enlarged : factors in use on
+    the stated noise of the readings and of the poses.
+    """
+    rivals = [
+        Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
+    ]
+    every = [*components, *rivals]
+    effects = [one.effect for one in every]
+    ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
+    parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
+    at_solution = _products(assembled, info, effects)
+    kinds = (READING_ROWS_KIND, POSE_ROWS_KIND)
+    kind, factor = max(zip(kinds, enlarged, strict=True), key=lambda pair: pair[1])
+    noises = [at_solution]
+    if factor > options.enlarged:
+        for share in np.geomspace(1 / factor, 1, options.noise_factors)[:-1].tolist():
+            other = _with_noise(assembled, kind, share)
+            noises.append(_products(other, Information(other.problem, info.state), effects))
+    searches = [_Search(products, every, parts, options) for products in noises]
+    for search in searches:
+        search.run(kind if factor > options.enlarged else None)
+    best = max(searches, key=lambda one: one.products.likelihood + one.gain)
+    scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
+    if not scales:
+        return no_discrepancy(info)
+    # scales by the noise that fits best, gains by the weights with which the estimate was made
+    smooth = ~np.any(best.root[ends[len(components)] :], axis=0)
+    root = best.root[: ends[len(components)], smooth]
+    gain = at_solution.gain[:, : ends[len(components)]] @ root
+    spread = gain @ best.second_moment[np.ix_(smooth, smooth)] @ gain.T
+    return Discrepancy(scales, spread, RandomEffects(tuple(effects[: len(components)]), root))
+
+
+class _Search:
+    """Components taken up one after the other.
+
+    root : (c, l) prior root of all columns that are taken up. gain : of the log likelihood.
+    """
+
+    def __init__(
+        self,
+        products: _Products,
+        components: Sequence[Component],
+        parts: Sequence[slice],
+        options: DiscrepancyOptions,
+    ) -> None:
+        self.products, self.components, self.parts = products, components, parts
+        self.options = options
+        self.scales: list[ComponentScale] = []
+        self.gain = 0.0
+        self.root = np.zeros((parts[-1].stop if parts else 0, 0))
+
+    def run(self, enlarged: int | None) -> None:
+        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        from scipy.special import chdtri
+
+        level = self.options.false_alarm / max(len(self.components), 1)
+        beyond = float(chdtri(1.0, 2 * level))
+        named = sum(one.code.startswith(NAMED) for one in self.components)
+        while len(self.scales) < self.options.most + named:
+            squared, value = self._left()
+            codes = {one.code for one in self.scales}
+            best: ComponentScale | None = None
+            for one, part in zip(self.components, self.parts, strict=True):
+                if one.code in codes:
+                    continue
+                for root in one.roots:
+                    scale, ratio = self._scale(
+                        root.T @ squared[part, part] @ root,
+                        root.T @ value[part],
+                        root.T @ self.products.whole[part, part] @ root,
+                    )
+                    least = 0.0 if one.inflates == enlarged and enlarged is not None else beyond
+                    if ratio > least and (best is None or ratio > best.ratio):
+                        best = ComponentScale(one.code, scale, ratio, root)
+            if best is None:
+                return
+            self.scales.append(best)
+            self.gain += best.ratio / 2
+            (k,) = (k for k, one in enumerate(self.components) if one.code == best.code)
+            more = np.zeros((len(self.root), best.root.shape[1]))
+            more[self.parts[k]] = best.scale * best.root
+            self.root = np.concatenate([self.root, more], axis=1)
+
+    def _left(self) -> tuple[Array, Array]:
+        """M and h of all columns beside the noise that the taken ones are."""
+        n = len(self.root)
+        squared, value = self.products.squared[:n, :n], self.products.value[:n]
+        across = squared @ self.root
+        inverse = self._posterior
+        return squared - across @ inverse @ across.T, value - across @ (
+            inverse @ (self.root.T @ value)
+        )
+
+    @property
+    def _posterior(self) -> Array:
+        """(l, l) covariance of the taken coefficients, in their prior deviations."""
+        n = len(self.root)
+        information = self.root.T @ self.products.squared[:n, :n] @ self.root
+        return np.linalg.inv(np.eye(len(information)) + information)
+
+    @property
+    def second_moment(self) -> Array:
+        """(l, l) mean square of the taken coefficients given the data, in prior deviations."""
+        covariance = self._posterior
+        mean = -covariance @ (self.root.T @ self.products.value[: len(self.root)])
+        return np.outer(mean, mean) + covariance
+
+    def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
+        """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
+        m, vectors = np.linalg.eigh((squared + squared.T) / 2)
+        visible = m > self.options.rank * float(np.trace(whole))
+        m, z = m[visible], vectors[:, visible].T @ value
+        if not m.size:
+            return 0.0, 0.0
+        # from where the best seen function is hardly seen to where the least seen one is all
+        square = np.geomspace(1e-3 / m[-1], max(1e3 / m[0], 1e-2 / m[-1]), self.options.scales)
+        load = square[:, None] * m
+        ratio = np.sum(z**2 / m * load / (1 + load) - np.log1p(load), axis=1)
+        best = int(np.argmax(ratio))
+        return (float(np.sqrt(square[best])), float(ratio[best])) if ratio[best] > 0 else (0.0, 0.0)
+
+
+def _with_noise(assembled: Assembled, kind: int, factor: float) -> Assembled:
+    """The problem with the noise of readings, or poses, times a factor."""
+    problem = assembled.problem
+    if kind == READING_ROWS_KIND:
+        problem = replace(problem, joint_noise=problem.joint_noise * factor)
+    else:
+        poses = problem.pose_data
+        problem = replace(problem, pose_data=replace(poses, weight=poses.weight / factor**2))
+    return replace(assembled, problem=problem)
+
+
+def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]) -> _Products:
+    """Products of the effects' columns, and the restricted likelihood without them."""
+    problem, basis = assembled.problem, shared_basis(info)
+    columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
+    n, count = sum(effect.count for effect in effects), problem.unknowns.count
+    squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
+    in_basis, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
+    configurations, n_rows = problem.extent
+    for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
+        piece = Information(problem.among(cut), problem.state_among(info.state, cut))
+        linear = piece.linear
+        rows, residuals = eliminated_beside(linear, columns(cut, linear))
+        own, extra = rows[..., :count] @ basis, rows[..., count:].reshape(-1, n)
+        own, residuals = own.reshape(-1, basis.shape[1]), residuals.ravel()
+        if not cut.start:
+            own = np.concatenate([own, linear.shared_by @ basis])
+            extra = np.pad(extra, ((0, len(linear.shared_by)), (0, 0)))
+            residuals = np.append(residuals, linear.shared_value[0])
+        squared += extra.T @ extra
+        by_basis += extra.T @ own
+        value += extra.T @ residuals
+        in_basis += own.T @ residuals
+        left += float(residuals @ residuals)
+        diagonal = np.einsum("bkii->bki", piece.reduced.r)
+        own_scale += float(np.sum(np.log(np.maximum(np.abs(diagonal), 1e-300))))
+    # of the restricted likelihood: the noise's own scale, then the unknowns', then the residuals
+    scale = own_scale + _log_scale(info) + _log_noise(assembled)
+    return _Products(
+        squared - by_basis @ by_basis.T,
+        value - by_basis @ in_basis,
+        basis @ by_basis.T,
+        squared,
+        -scale - (left - float(in_basis @ in_basis)) / 2,
+    )
+
+
+def _log_scale(info: Information) -> float:
+    """Half of the logarithm of the determinant of the shared unknowns' information, where known."""
+    rows = info.rows[0][0]
+    length = np.linalg.norm(rows, axis=0)
+    used = length > 0
+    s = np.linalg.svd(rows[:, used] / length[used], compute_uv=False)
+    s = s[s > 1e-12 * s[0]]
+    return float(np.sum(np.log(s)) + np.sum(np.log(length[used])))
+
+
+def _log_noise(assembled: Assembled) -> float:
+    """Logarithm of the noise of all readings and poses, up to a constant."""
+    problem = assembled.problem
+    readings = problem.blocks.present.shape[0] * problem.layout.n_readings
+    out = readings * float(np.log(problem.joint_noise[0]))
+    kind = problem.kinds.poses
+    used = kind.present & (kind.weight[0] > 0)
+    return out - float(np.sum(0.5 * kind.count[used] * np.log(kind.weight[0][used])))
+
+
+def _as_motion(assembled: Assembled, effect: Effect) -> Effect:
+    """A station that stands elsewhere from some configuration on, as a motion by configuration."""
+    if effect.station is None:
+        return effect
+    unknowns = assembled.problem.unknowns
+    motion = np.zeros((unknowns.n_stations, len(assembled.seen), 6, 6))
+    motion[effect.station, effect.since :] = np.eye(6)
+    return Effect(motion=motion)
