@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.calibration.calibrate import calibrate_measurements
 from pkmcal.calibration.departures import model_violations
+from pkmcal.calibration.doubts import WRONG_MODEL_READING_SCALE, noise_doubt
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.model_errors import (
     CORRELATION_LENGTHS,
@@ -265,6 +267,28 @@ def test_a_station_with_another_lens_than_its_file_is_named(calibrated):
 def test_a_right_session_has_no_errors_left_out(calibrated):
     assert calibrated.model_errors == ()
     assert sentences(calibrated.model_errors) == ()
+
+
+def test_readings_far_beyond_their_noise_are_no_noise(calibrated):
+    def reasons(factor):
+        statistics = replace(calibrated.estimate.statistics, reading_scale=factor)
+        return noise_doubt(calibrated.session, replace(calibrated.estimate, statistics=statistics))
+
+    tolerance = calibrated.session.machine.document.tolerance.offset
+    assert WRONG_MODEL_READING_SCALE * calibrated.session.joint_noise < tolerance
+    assert reasons(0.9 * WRONG_MODEL_READING_SCALE) == ()
+    assert len(reasons(1.1 * WRONG_MODEL_READING_SCALE)) == 1
+
+
+def test_edges_measured_elsewhere_give_the_same_machine(calibrated):
+    state = calibrated.estimate.state
+    other = calibrate_measurements(
+        calibrated.session, calibrated.observation, calibrated.measurements, state.T_camera_base
+    )
+    off = other.machine.values - calibrated.machine.values
+    sigma = np.sqrt(np.diag(calibrated.estimate.covariance))
+    assert np.all(np.abs(off) <= 0.05 * sigma + 1e-9)
+    assert other.verdict.usable == calibrated.verdict.usable
 
 
 def test_components_act_in_the_readings_units():
