@@ -200,7 +200,7 @@ def test_c_of_a_new_carrier(exported, tmp_path):
     assert done.returncode == 0
     assert "PASS: 12 reference poses of mixed" in done.stdout
     text = (exported("c") / "pkmcal_kinematics.c").read_text()
-    assert [text.count(f".drive = {drive}") for drive in ("TURN", "SLIDE")] == [2, 1]
+    assert [text.count(f"{drive}, /* drive */") for drive in ("TURN", "SLIDE")] == [2, 1]
 
 
 def test_mujoco_of_a_new_carrier(exported):
