@@ -19,6 +19,17 @@ from pkmcal.files.documents import (
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import IMAGE_FILE_ENDINGS, stated_size
+from pkmcal.files.limits import (
+    LARGEST_WRITTEN_FILE,
+    MOST_HANDHELD_IMAGES,
+    MOST_IMAGES,
+    MOST_LEGS,
+    MOST_PIXELS,
+    MOST_PLANNED_CONFIGURATIONS,
+    MOST_STATIONS,
+    MOST_TUBES,
+    check_count,
+)
 from pkmcal.files.locks import output_lock
 from pkmcal.files.quantities import (
     LARGEST_UNITLESS_LENGTH,
@@ -53,6 +64,14 @@ from pkmcal.files.writing import (
 __all__ = [
     "IMAGE_FILE_ENDINGS",
     "LARGEST_UNITLESS_LENGTH",
+    "LARGEST_WRITTEN_FILE",
+    "MOST_HANDHELD_IMAGES",
+    "MOST_IMAGES",
+    "MOST_LEGS",
+    "MOST_PIXELS",
+    "MOST_PLANNED_CONFIGURATIONS",
+    "MOST_STATIONS",
+    "MOST_TUBES",
     "CsvTable",
     "Document",
     "Exif",
@@ -65,6 +84,7 @@ __all__ = [
     "Share",
     "alone_in",
     "any_unit",
+    "check_count",
     "check_own_folder",
     "check_regular",
     "check_writable",

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.calibration.saved import Known
 from pkmcal.errors import InputError
+from pkmcal.files import MOST_PLANNED_CONFIGURATIONS, check_count
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.candidates import (
@@ -188,6 +189,7 @@ def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: i
         raise InputError(
             "a plan needs two configurations or more", where="--configurations", found=str(count)
         )
+    check_count(count, MOST_PLANNED_CONFIGURATIONS, "configurations", "--configurations")
     if rig.machine.layout.n_internal:
         raise InputError(
             f"mechanism {rig.machine.name!r} has side bars that turn on hinges, and how far they"
