@@ -253,7 +253,7 @@ def test_output_folder_of_the_kernels(session):
     if not os.path.isdir("/proc/self"):  # noqa: PTH112
         pytest.skip("no folder here that even an administrator cannot write to")
     unwritten(
-        session, "/proc/self/out", "/proc/self/out: cannot be written", "Choose another folder"
+        session, "/proc/self/out", "/proc/self/out: cannot be written", "Name another folder"
     )
 
 

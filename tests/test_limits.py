@@ -87,8 +87,8 @@ def test_legs_and_tubes(tmp_path):
     source = catalogue()["gough-stewart"]
     tube = {"radius": 0.01, "from": 0.1, "to": 0.2}
     for most, change in (
-        (limits.MOST_LEGS, lambda data: data.update(legs=data["legs"] * 6)),
-        (limits.MOST_TUBES, lambda data: data["legs"][1].update(tubes=[tube] * 36)),
+        (limits.MOST_MACHINE_LEGS, lambda data: data.update(legs=data["legs"] * 6)),
+        (limits.MOST_LEG_TUBES, lambda data: data["legs"][1].update(tubes=[tube] * 36)),
     ):
         path = tmp_path / "mechanism.yaml"
         path.write_text(source.read_text())

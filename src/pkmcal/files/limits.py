@@ -21,9 +21,9 @@ MOST_CHARACTERS = 10_000_000
 MOST_NESTED_LEVELS = 50
 """Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
 at two hundred or so."""
-MOST_LEGS = 32
+MOST_MACHINE_LEGS = 32
 """Legs of a machine; redundant ones have eight."""
-MOST_TUBES = 16
+MOST_LEG_TUBES = 16
 """Tubes of a leg; a telescopic leg has five. Each is measured in every image."""
 MOST_STATIONS = 200
 """Entries of ``stations``: places of cameras that stand, and trackers."""
