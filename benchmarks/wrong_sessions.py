@@ -104,7 +104,7 @@ def focal(share: float) -> Any:
 
 
 def aspect(share: float) -> Any:
-    """fx / fy."""
+    """Scale of the pixels: fx / fy."""
 
     def change(document: dict[str, Any], rng: np.random.Generator) -> None:
         half = rng.choice([-1, 1]) * share / 2

@@ -252,9 +252,7 @@ def test_output_is_a_file(session):
 def test_output_folder_of_the_kernels(session):
     if not os.path.isdir("/proc/self"):  # noqa: PTH112
         pytest.skip("no folder here that even an administrator cannot write to")
-    unwritten(
-        session, "/proc/self/out", "/proc/self/out: cannot be written", "Choose another folder"
-    )
+    unwritten(session, "/proc/self/out", "/proc/self/out: cannot be written", "Name another folder")
 
 
 def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, monkeypatch):

@@ -120,6 +120,8 @@ def with_links(home):
             (tracked / name).symlink_to(empty)
             (later / name).symlink_to(empty)
     (later / "calibration").symlink_to(empty)
+    (tracked / "calibration" / "mechanism.yaml").unlink()
+    (tracked / "calibration" / "mechanism.yaml").symlink_to(home / "x")
     (photographed / "calibration").symlink_to(home / "earlier")
     # the folder in which the earlier result would be kept
     when = datetime.fromtimestamp((tracked / "calibration" / "calibration.json").stat().st_mtime)
@@ -211,7 +213,9 @@ def test_no_command_changes_anything_outside_its_output(home, tmp_path, prepare)
     after = tree(root, outputs)
     added = after.keys() - before.keys()
     assert {name: after.get(name) for name in before} == before
-    # an earlier result that is kept stands beside its place
+    # an earlier result that is kept stands beside its place, without what its links lead to
+    copies = [path for path in (root / "tracked").glob("calibration-*/*") if not path.is_symlink()]
+    assert not any(path.read_bytes() == b"mine\n" for path in copies)
     assert {name for name in added if not name.startswith("tracked/calibration-")} == set()
 
 

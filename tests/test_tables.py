@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from faults import fault, written
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, documents, read_csv, write_text
+from pkmcal.files.limits import MOST_ROWS
 
 HEADER = "configuration,leg1,leg2\n"
 
@@ -137,8 +138,9 @@ def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said, monkeypatch)
     assert fault(read_csv, path).startswith("t.csv, " + said.format(2402))
 
 
-def test_a_large_table(tmp_path):
-    names = [f"{k:06d}" for k in range(100_000)]
+def test_a_large_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(documents, "TEXT_BLOCK_BYTES", 1 << 14)
+    names = [f"{k:06d}" for k in range(MOST_ROWS)]
     values = np.random.default_rng(0).normal(size=(len(names), 2))
     path = written(tmp_path / "t.csv", csv_text(["leg1", "leg2"], names, values))
     assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES

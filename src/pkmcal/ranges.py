@@ -48,8 +48,10 @@ def _whole(least: int, most: int) -> Range:
 
 
 MOST_CONFIGURATIONS = 1000
-"""Of a plan, or of a simulation: nobody photographs more in a day. The memory of a plan grows with
-it; a hundred times as many took 6.7 GB."""
+"""Of a simulation: nobody photographs more in a day."""
+MOST_PLANNED_CONFIGURATIONS = 200
+"""Configurations from each place that a plan may choose; candidates are twenty times as many, and
+memory grows with them."""
 _SEED = _whole(0, 2**63 - 1)
 _COUNT = _whole(1, 100)
 _READING_NOISE = Range(0, 1, above=True)
@@ -60,7 +62,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
         "check": {"seed": _SEED},
         "new": {"places": _whole(1, 20)},
         "plan": {
-            "configurations": _whole(2, MOST_CONFIGURATIONS),
+            "configurations": _whole(2, MOST_PLANNED_CONFIGURATIONS),
             "places": _whole(1, 12),
             "best_of": _COUNT,
             "edge_noise": _PIXEL_NOISE,

@@ -45,13 +45,13 @@ def keep_earlier(
         place = folder.with_name(f"{stem}-{number}")
     with staged_folder(place) as stage:
         for name in names:
-            shutil.copy2(folder / name, stage / name)
+            shutil.copy2(folder / name, stage / name, follow_symlinks=False)
     return place
 
 
 def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page: str) -> bool:
     """Whether the new result tells what the one in the folder does; pages are made from these."""
-    if {*names} - {page} != {*texts} - {page}:
+    if {*names} - {page} != {*texts} - {page} or not _regular(folder, names):
         return False
     return all(
         _told(name, (folder / name).read_bytes()) == _told(name, texts[name])
@@ -76,6 +76,14 @@ def _told(name: str, content: str | bytes) -> object:
 
 def _copied(folder: Path, names: list[str], place: Path) -> bool:
     """Whether a folder holds these files already."""
-    return entries(place) == names and all(
+    same = entries(place) == names and _regular(folder, names) and _regular(place, names)
+    return same and all(
         (folder / name).read_bytes() == (place / name).read_bytes() for name in names
     )
+
+
+def _regular(folder: Path, names: list[str]) -> bool:
+    """Whether all of these are files. What a link leads to is neither read nor copied: it may be
+    anything, in somebody else's session.
+    """
+    return all((folder / name).is_file() and not (folder / name).is_symlink() for name in names)

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.files import Schema
+from pkmcal.files import MOST_PIXELS, Schema
 from pkmcal.geometry.rigid import dot, of_components
 
 PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
@@ -40,6 +40,14 @@ class CameraSchema(Schema):
     image_size: PositiveSize = Field(description="[width, height] in pixels")
     focal: PositivePair = Field(description="[fx, fy] in pixels")
     center: tuple[float, float] = Field(description="[cx, cy] in pixels, pixel centres at integers")
+
+    @field_validator("image_size")
+    @classmethod
+    def _of_some_pixels(cls, size: tuple[int, int]) -> tuple[int, int]:
+        """No more than an image may have."""
+        if (pixels := size[0] * size[1]) > MOST_PIXELS:
+            raise ValueError(f"too many pixels; found {pixels}, expected at most {MOST_PIXELS}")
+        return size
 
     @field_validator("focal")
     @classmethod

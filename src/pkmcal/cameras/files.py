@@ -14,6 +14,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import (
+    LARGEST_WRITTEN_FILE,
     Document,
     closest,
     parse_yaml,
@@ -45,7 +46,7 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     """
     path, camera = camera_path(path)
     label = label.removesuffix(f"#{camera}") if label else path.name
-    text = read_text(path, label)
+    text = read_text(path, label, LARGEST_WRITTEN_FILE)
     if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)

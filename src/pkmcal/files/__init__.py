@@ -19,6 +19,16 @@ from pkmcal.files.documents import (
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import IMAGE_FILE_ENDINGS, stated_size
+from pkmcal.files.limits import (
+    LARGEST_WRITTEN_FILE,
+    MOST_HANDHELD_IMAGES,
+    MOST_IMAGES,
+    MOST_LEG_TUBES,
+    MOST_MACHINE_LEGS,
+    MOST_PIXELS,
+    MOST_STATIONS,
+    check_count,
+)
 from pkmcal.files.locks import output_lock
 from pkmcal.files.quantities import (
     LARGEST_UNITLESS_LENGTH,
@@ -53,6 +63,13 @@ from pkmcal.files.writing import (
 __all__ = [
     "IMAGE_FILE_ENDINGS",
     "LARGEST_UNITLESS_LENGTH",
+    "LARGEST_WRITTEN_FILE",
+    "MOST_HANDHELD_IMAGES",
+    "MOST_IMAGES",
+    "MOST_LEG_TUBES",
+    "MOST_MACHINE_LEGS",
+    "MOST_PIXELS",
+    "MOST_STATIONS",
     "CsvTable",
     "Document",
     "Exif",
@@ -65,6 +82,7 @@ __all__ = [
     "Share",
     "alone_in",
     "any_unit",
+    "check_count",
     "check_own_folder",
     "check_regular",
     "check_writable",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,6 +16,14 @@ import numpy as np
 import yaml
 
 from pkmcal.errors import InputError, legible
+from pkmcal.files.limits import (
+    LARGEST_TEXT_FILE,
+    LARGEST_WRITTEN_FILE,
+    MOST_CHARACTERS,
+    MOST_NESTED_LEVELS,
+    MOST_VALUES,
+    MOST_YAML_NODES,
+)
 from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
@@ -27,30 +36,39 @@ TEXT_BLOCK_BYTES = 2**20
 """Bytes of a text that are in memory at a time where it is read line by line."""
 
 
-def read_text(path: Path, label: str | None = None) -> str:
+def read_text(path: Path, label: str | None = None, largest: int = LARGEST_TEXT_FILE) -> str:
     """Text of a UTF-8 file, without byte-order mark and with Unix line ends.
 
-    label : the file's name in messages; the path's last part unless told.
+    label : the file's name in messages; the path's last part unless told. largest : bytes that it
+    may have.
     """
-    return "".join(text_blocks(path, label or path.name))
+    return "".join(text_blocks(path, label or path.name, largest))
 
 
-def text_blocks(path: Path, label: str) -> Iterator[str]:
+def text_blocks(path: Path, label: str, largest: int = LARGEST_TEXT_FILE) -> Iterator[str]:
     """The same in blocks of whole lines, some TEXT_BLOCK_BYTES bytes each: of a table of many
     megabytes no more has to be in memory.
     """
     lines, mark = 0, "\ufeff"
-    for raw in _raw_blocks(path, label):
+    for raw in _raw_blocks(path, label, largest):
         yield _decoded(raw, label, lines).removeprefix(mark)
         lines, mark = lines + raw.count(b"\n"), ""
 
 
-def _raw_blocks(path: Path, label: str) -> Iterator[bytes]:
+def _raw_blocks(path: Path, label: str, largest: int) -> Iterator[bytes]:
     """A file's bytes, cut behind line ends of any kind."""
     try:
         check_replaced(path.parent)
         check_regular(path, label)
         with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size > largest:
+                raise InputError(
+                    "the file is too large",
+                    where=label,
+                    found=f"{size} bytes",
+                    expected=f"at most {largest}",
+                )
             rest: list[bytes] = []
             while block := stream.read(TEXT_BLOCK_BYTES):
                 # a carriage return at the end may be half of a line end
@@ -130,14 +148,6 @@ def shown(value: object) -> str:
 Keys = tuple[str | int, ...]
 """Where a value stands in a file: keys and zero-based list indices from the top."""
 
-MOST_VALUES = 200_000
-"""Values a file may expand to. A large machine has a thousand; aliases of aliases reach billions
-from one short line, and would fill the memory."""
-MOST_CHARACTERS = 10_000_000
-"""The same of their texts."""
-MOST_NESTED_LEVELS = 50
-"""Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
-at two hundred or so."""
 LARGEST_WRITTEN_NUMBER = 1e15
 """Of a number that a person writes, whatever its unit; what is computed with larger ones, to the
 fourth power and further, would overflow."""
@@ -202,7 +212,7 @@ def field_path(keys: Keys) -> str:
 def read_yaml(path: Path | str, label: str | None = None) -> Document:
     """Read a YAML file whose top is a mapping; every fault is an `InputError` with its line."""
     path = Path(path)
-    return parse_yaml(read_text(path, label), path, label)
+    return parse_yaml(read_text(path, label, LARGEST_WRITTEN_FILE), path, label)
 
 
 def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
@@ -215,6 +225,9 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
             raise InputError("the file is empty", where=label, expected="keys and values")
         builder = _Builder(loader, label)
         data = builder.value(node, ())
+    except _LimitError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise InputError(str(error.problem), where=label + line) from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
@@ -291,11 +304,16 @@ def yaml_text(data: Mapping[str, Any]) -> str:
     return yaml.dump(dict(data), Dumper=_Dumper, allow_unicode=True, **style)
 
 
+class _LimitError(yaml.MarkedYAMLError):
+    """More of something than a file may hold."""
+
+
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader with YAML 1.2's scalars, and an end of nesting."""
+    """PyYAML's safe loader with YAML 1.2's scalars, and an end of nesting and of values."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
     depth = 0
+    nodes = 0
     top = ""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -304,7 +322,13 @@ class _Loader(yaml.SafeLoader):
         if self.depth > MOST_NESTED_LEVELS:
             mark = self.peek_event().start_mark
             what = f"{self.top} is nested too deeply, in more than {MOST_NESTED_LEVELS} levels"
-            raise yaml.MarkedYAMLError(problem=what, problem_mark=mark)
+            raise _LimitError(problem=what, problem_mark=mark)
+        self.nodes += 1
+        if self.nodes > MOST_YAML_NODES:
+            raise _LimitError(
+                problem=f"there are more than {MOST_YAML_NODES} keys and values up to here",
+                problem_mark=self.peek_event().start_mark,
+            )
         self.depth += 1
         try:
             return super().compose_node(parent, index)

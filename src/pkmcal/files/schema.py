@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
 from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, Document, Keys, closest, shown
+from pkmcal.files.limits import MOST_FAULTS_NAMED
 from pkmcal.wording import listed
 
 JsonSchema = Mapping[str, Any]
@@ -45,7 +46,10 @@ def validated_document(document: Document, model: type[SchemaModel]) -> SchemaMo
         _check_numbers(document, found.model_dump(by_alias=True))
         return found
     except ValidationError as error:
-        faults = [_fault(document, model, details) for details in error.errors()]
+        found = error.errors()
+        found.sort(key=lambda details: _line(document, details))
+        schema = model.model_json_schema()
+        faults = [_fault(document, schema, details) for details in found[:MOST_FAULTS_NAMED]]
     # A required key that is misspelt is one mistake, not one unknown and one missing key.
     meant = {(*fault.keys[:-1], fault.guess) for fault in faults if fault.guess}
     faults = [fault for fault in faults if not (fault.missing and fault.keys in meant)]
@@ -94,14 +98,20 @@ class _Fault:
     error: InputError
 
 
-def _fault(document: Document, model: type[BaseModel], details: ErrorDetails) -> _Fault:
+def _line(document: Document, details: ErrorDetails) -> int:
+    """The line of a fault's key, or of what it is missing from."""
+    keys = _keys_in(document.data, details["loc"], missing=details["type"] == "missing")
+    return document.lines.get(keys, document.lines.get(keys[:-1], 0))
+
+
+def _fault(document: Document, root: JsonSchema, details: ErrorDetails) -> _Fault:
     missing = details["type"] == "missing"
     keys = _keys_in(document.data, details["loc"], missing=missing)
     # An entry that a list lacks is told as a list that is too short.
     short = missing and isinstance(keys[-1], int)
     keys = keys[:-1] if short else keys
     location = details["loc"][:-1] if short else details["loc"]
-    schemas = _schemas_at(model.model_json_schema(), location)
+    schemas = _schemas_at(root, location)
     what, found, expected = _phrases(details, keys, schemas, short=short)
     unknown = details["type"] == "extra_forbidden"
     return _Fault(
@@ -138,6 +148,9 @@ def _phrases(
     if kind in ("value_error", "assertion_error"):
         # A schema's own validator wrote a whole sentence.
         return str(context["error"]), None, None
+    if kind == "too_long" and isinstance(value, (list, dict)):
+        entries = f"{len(value)} entries"
+        return _WHAT[kind], entries, _EXPECTED[kind].format_map(context)
     limits = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in context.items()}
     expected = (
         _EXPECTED[kind].format_map(limits)

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, closest, shown, text_blocks
+from pkmcal.files.limits import MOST_COLUMNS, MOST_ROWS, check_count
 from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
 
@@ -91,6 +92,7 @@ def read_csv(
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
     _check_header(header, columns, f"{label}, line {header_line}")
+    check_count(len(header), MOST_COLUMNS, "columns", f"{label}, line {header_line}")
     lines: dict[str, int] = {}
     values = array("d")
     for line, cells in rows:
@@ -106,6 +108,13 @@ def read_csv(
                 f"the {CONFIGURATION_COLUMN} {name} stands twice, on lines {first} and {line}",
                 where=f"{label}, line {line}",
                 next_step="Give each row its own name, or remove one of the two",
+            )
+        if len(lines) > MOST_ROWS:
+            raise InputError(
+                "there are too many rows",
+                where=label,
+                found=f"more on line {line}",
+                expected=f"at most {MOST_ROWS}",
             )
     if not lines:
         raise InputError("there are no rows under the header", where=label)

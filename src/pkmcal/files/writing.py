@@ -247,6 +247,8 @@ def remove_folder(folder: Path) -> None:
 
 def _to_disk(path: Path) -> None:
     """Without it, a power cut after a move can leave the new name on an empty file."""
+    if path.is_symlink():
+        return
     with path.open("r+b") as stream:
         os.fsync(stream.fileno())
 
@@ -272,11 +274,16 @@ def _locked_stage(path: Path) -> tuple[Path, int]:
         stage = _beside(path)
         stage.mkdir()
         # Until its file is locked, another process may take the stage for an abandoned one.
-        with suppress(FileNotFoundError):
+        try:
             held = os.open(stage / _lock_file(), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            if lock(held) is not False and (stage / _lock_file()).exists():
-                return stage, held
-            os.close(held)
+        except FileNotFoundError:
+            continue
+        except OSError:
+            stage.rmdir()
+            raise
+        if lock(held) is not False and (stage / _lock_file()).exists():
+            return stage, held
+        os.close(held)
 
 
 def _remove_stage(stage: Path) -> None:

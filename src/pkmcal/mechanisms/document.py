@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME
-from pkmcal.files import Metres, Point, Radians, Schema, Share
+from pkmcal.files import MOST_LEG_TUBES, MOST_MACHINE_LEGS, Metres, Point, Radians, Schema, Share
 from pkmcal.mechanisms.carriers.contract import (
     Carrier,
     ParameterKind,
@@ -162,7 +162,7 @@ class Leg(Schema):
         float,
         Field(gt=0.5, lt=2, description="the reading's true value over the reading, such as 1.0"),
     ] = 1.0
-    tubes: tuple[Tube, ...] = ()
+    tubes: Annotated[tuple[Tube, ...], Field(max_length=MOST_LEG_TUBES)] = ()
 
 
 TOLERANCE_RANGE = Field(ge=1e-12)
@@ -228,7 +228,9 @@ class MechanismDocument(Schema):
 
     name: Annotated[str, Field(max_length=LONGEST_NAME)]
     motion: PlatformMotion
-    legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
+    legs: Annotated[
+        tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_some_legs)
+    ]
     tolerance: DrawingTolerance = DrawingTolerance()
     home: Home | None = None
     workspace_radius: (

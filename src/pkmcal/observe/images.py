@@ -21,7 +21,7 @@ import numpy as np
 
 from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import check_regular, read_exif, stated_size
+from pkmcal.files import MOST_PIXELS, check_count, check_regular, read_exif, stated_size
 from pkmcal.observe.complaints import decoded_and_fault
 
 KEPT_PHOTOGRAPH_BYTES = 128 * 2**20
@@ -58,6 +58,7 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     size = stated_size(BytesIO(data))
     if min(size) == 0:
         raise _broken(label, "no readable image")
+    check_count(size[0] * size[1], MOST_PIXELS, "pixels", label)
     if tuple(image_size) not in (size, size[::-1]):
         raise _other_size(label, size, image_size)
     # a turned picture would no longer be its camera's: flags that ask for turning are ignored where

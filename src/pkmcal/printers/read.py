@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.errors import InputError
-from pkmcal.files import read_text, shown
+from pkmcal.files import LARGEST_WRITTEN_FILE, read_text, shown
 from pkmcal.printers import klipper, reprap
 from pkmcal.printers.printer import Printer
 
@@ -39,7 +39,7 @@ def read_printer(path: Path) -> Printer:
     Raises InputError for another file, and for a printer that is no linear delta.
     """
     label = path.name
-    text = read_text(path)
+    text = read_text(path, largest=LARGEST_WRITTEN_FILE)
     if klipper.is_one(text):
         return buildable_delta(klipper.printer(text, label))
     if reprap.is_one(text):

@@ -23,10 +23,12 @@ from pkmcal.cameras.response import JPEG_FILE_ENDINGS, Response
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files import (
     LARGEST_UNITLESS_LENGTH,
+    MOST_HANDHELD_IMAGES,
     CsvTable,
     Document,
     Keys,
     any_unit,
+    check_count,
     check_regular,
     closest,
     json_text,
@@ -525,6 +527,7 @@ def _stations(
     )  # fmt: skip
     if not station.handheld:
         return [whole]
+    check_count(len(photographs), MOST_HANDHELD_IMAGES, "photographs by hand", where)
     return [
         replace(whole, name="-".join(filter(None, called)), photographs=(photo,))
         for photo in photographs

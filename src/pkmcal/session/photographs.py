@@ -11,7 +11,16 @@ from pathlib import Path
 from string import Formatter
 
 from pkmcal.errors import InputError
-from pkmcal.files import IMAGE_FILE_ENDINGS, check_regular, closest, shown, stated_size
+from pkmcal.files import (
+    IMAGE_FILE_ENDINGS,
+    MOST_IMAGES,
+    MOST_PIXELS,
+    check_count,
+    check_regular,
+    closest,
+    shown,
+    stated_size,
+)
 from pkmcal.wording import listed
 
 _FIELDS = ("configuration", "repeat")
@@ -53,9 +62,11 @@ def find_photographs(
         some = dict.fromkeys(name for name in within if name in rows)
         return re.fullmatch(_regex(parts, "|".join(map(re.escape, some))), path) if some else None
 
+    matches = glob.glob(wildcard, root_dir=folder)
+    check_count(len(matches), MOST_IMAGES, "files under this pattern", where)
     files = [
         path
-        for path in (Path(name).as_posix() for name in glob.glob(wildcard, root_dir=folder))
+        for path in (Path(name).as_posix() for name in matches)
         # A folder or a pipe that has a photograph's name is told; others are nobody's business.
         if (folder / path).is_file() or known(path)
     ]
@@ -95,6 +106,7 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
     except OSError as error:
         raise InputError(f"the image cannot be read ({error.strerror})", where=label) from None
     if min(size) > 0:
+        check_count(size[0] * size[1], MOST_PIXELS, "pixels", label)
         return size
     raise InputError(
         "the image file is empty" if empty else "the file is not an image that can be read",

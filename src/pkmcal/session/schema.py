@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from pkmcal.cameras.response import Response
-from pkmcal.files import Metres, Point, Radians, Reading, Schema, closest, shown
+from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema, closest, shown
 
 BoardBody = Literal["base", "platform"]
 """What a board may be fixed to."""
@@ -135,7 +135,9 @@ class SessionDocument(Schema):
     mechanism: str = Field(description="a mechanism's file, or a built-in's name")
     joints: JointsDocument = Field(description="file and noise of the joint readings")
     stations: dict[str, AnyStation] = Field(
-        default_factory=dict, description="one entry a camera, or a tracker, in one place"
+        default_factory=dict,
+        max_length=MOST_STATIONS,
+        description="one entry a camera, or a tracker, in one place",
     )
     board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
     paths: dict[str, list[str]] | None = Field(
