@@ -303,32 +303,28 @@ def breathed(simulated, tmp_path_factory):
         return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
 
 
-def test_a_rejected_photograph_is_counted_named_and_shown(simulated, monkeypatch):
+def test_a_rejected_photograph_is_counted_named_and_shown(breathed):
     """On the terminal, in the report and in the documents; it was dropped from the count."""
-
-    def place(session, photographs, boards, _rng, _told):
-        T = load_truth(simulated, session.machine).T_camera_base[[0, 2]]
-        known = KnownScene.as_drawn(session.machine, T, session.joints)
-        kept = [replace(photographs[k], station=n) for n, k in enumerate((0, 2))]
-        return SeenSession(session.without({1: EDGES_DISAGREE_REASON}), kept, boards, known)
-
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
-    found = outcome_of(calibrate_session(simulated))
+    calibration, _ = breathed
+    session = calibration.session
+    again = replace(session.stations[1], name="phone-0001-2")
+    whole = replace(session, stations=(*session.stations, again))
+    found = outcome_of(replace(calibration, session=whole.without({3: EDGES_DISAGREE_REASON})))
     (card,) = [card for card in found.figures if card.question == "What is it based on?"]
-    assert card.values == (("2 of 3", "photographs"),)
+    assert card.values == (("3 of 4", "photographs"),)
     file = "images/phone/0001-1.jpg"
     (told,) = [one.text for one in found.findings]
     assert told == f"{file}: left out, for {EDGES_DISAGREE_REASON}."
     entry = {
-        "file": file, "station": "phone-0001-1", "configuration": "0001",
+        "file": file, "station": "phone-0001-2", "configuration": "0001",
         "reason": EDGES_DISAGREE_REASON,
     }  # fmt: skip
-    assert found.summary["photographs"] == 3
+    assert found.summary["photographs"] == 4
     assert found.summary["rejected_photographs"] == [entry]
     assert json.loads(found.texts["calibration.json"])["rejected_photographs"] == [entry]
     (part,) = [part for part in found.parts if part.name == "photographs"]
     shown = part.html.partition("Left out whole")[2]
-    assert "phone-0001-1" in shown
+    assert "phone-0001-2" in shown
     assert f"left out, for {EDGES_DISAGREE_REASON}" in shown
     assert len(re.findall(r'href="data:image/jpeg;base64,[^"]{1000}', shown)) >= 1
 
@@ -340,7 +336,7 @@ def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
     fewer = replace(found, session=found.session.without({2: EDGES_DISAGREE_REASON}))
     refused = replace(found, verdict=Verdict(False, "Bad."))
     statistics = found.estimate.statistics
-    worse = replace(statistics, chi2_as_stated=10 * statistics.chi2_as_stated)
+    worse = replace(statistics, chi2=10 * statistics.chi2, chi2_edges=10 * statistics.chi2_edges)
     misfit = replace(found, estimate=replace(found.estimate, statistics=worse))
     assert worse_refined(found, found) == ""
     assert worse_refined(fewer, found) == "2 of 3 photographs have a sure place, not 3"
