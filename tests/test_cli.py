@@ -595,7 +595,7 @@ def test_completion_knows_commands_and_options():
     [
         (MemoryError(), 2, "there is not enough memory. Close other programs"),
         (OSError(errno.ENOSPC, "No space left on device", "x.png"), 2,
-         "x.png: the operating system refused: no space left on device. Make room"),
+         "x.png: the operating system refused: no space left on device. Free space"),
         (PermissionError(errno.EACCES, "Permission denied", "s"), 2, "s: the operating system"),
         (KeyboardInterrupt(), 130, "interrupted; what was not finished was not written"),
         (ZeroDivisionError("by zero"), 70,
