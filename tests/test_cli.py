@@ -514,13 +514,13 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
         (
             "--joint-noise",
             "0",
-            "this number cannot be used; found 0, expected more than 0 and at most 1",
+            "this number cannot be used; found 0, expected over 0 to 1",
         ),
         ("--joint-noise", "nan", "found nan"),
         ("--mechanism", "gough-stuart", "found gough-stuart, expected gough-stewart"),
         ("--mechanism", "mine.yaml", "mine.yaml: the file does not exist"),
         ("--camera", "eye.yaml", "eye.yaml: the file does not exist"),
-        ("--stations", "0", "'--stations'"),
+        ("--stations", "0", "--stations: this number cannot be used"),
     ],
 )
 def test_simulate_refuses(tmp_path, option, value, said):
@@ -545,7 +545,7 @@ def test_simulate_refuses(tmp_path, option, value, said):
         (["calibrate", "s", "--foo"], "No such option: --foo. See pkmcal calibrate --help."),
         (["calibrate", "s", "-x"], "No such option: -x. See pkmcal calibrate --help."),
         (["calibrate", "s", "--seed", "many"], "'--seed': it should be a valid integer. See"),
-        (["calibrate", "s", "--seed", "-1"], "'--seed': it should be greater than or equal to 0"),
+        (["calibrate", "s", "--seed", "-1"], "--seed: this number cannot be used; found -1"),
         (["calibrate", "s", "--method", "best"], "'bundle', 'four-step', 'linear'"),
         (["calibrate", "s", "--method", "bundel"], "'inverse-kinematic', did you mean bundle. See"),
         (["reproduce", "d"], "'d' is not one of 'a', 'b', 'c'. See pkmcal reproduce --help."),

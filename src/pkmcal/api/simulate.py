@@ -83,7 +83,8 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         if name == "stations" and not isinstance(value, int | float):
             continue  # where they stand
         if name in RANGES["simulate"]:
-            for one in value if name == "shake" else (value,):
+            each: Any = value if name == "shake" else (value,)
+            for one in each:
                 check_number("simulate", name, one)
     sensor = settings.get("sensor")
     if isinstance(sensor, Sensor):

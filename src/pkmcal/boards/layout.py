@@ -88,7 +88,7 @@ def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
         down,
         float(np.median(np.concatenate([part.pitch for part in found]))) - 1,
         Counter((i, j) for i, j in rows),
-        frozenset(ids.ravel().tolist()),
+        frozenset(int(number) for number in ids.flat),
     )
 
 

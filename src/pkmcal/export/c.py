@@ -370,7 +370,8 @@ def _records(text: str, name: str, structure: str) -> list[dict[str, Any]]:
     """A constant's rows, by the fields of a structure in the order in which the text has them."""
     plain = _without_comments(text)
     end = plain.index(f"}} {structure};")
-    fields = re.findall(r"(\w+)(?:\[\d\])?;", plain[plain.rindex("{", 0, end) : end])
+    declared = plain[plain.rindex("{", 0, end) + 1 : end].split(";")[:-1]
+    fields = [declaration.split()[-1].partition("[")[0] for declaration in declared]
     listed = _WRAPPED.sub(r"\1", _body(text, name)).translate(str.maketrans("{}", "[]"))
     rows = json.loads(re.sub(r",\s*\]", "]", _WORD.sub(r'"\g<0>"', listed)))
     return [

@@ -543,15 +543,15 @@ def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list
     ]
 
 
-_SWITCH = re.compile(r"(\S+) = (\S+) ([+-] \S+) \* \(reading - (\S+)\)")
-
-
 def switch_values(text: str, readings: Array) -> Array:
     """The values (3,) that lines of :func:`proportional_switches` give at readings (3,)."""
+    lines = (line.partition(" * (reading - ") for line in text.splitlines())
     found = [
-        [float(word.replace(" ", "")) for word in groups[1:]] for groups in _SWITCH.findall(text)
+        (*head.replace("+ ", "+").replace("- ", "-").split()[-2:], tail.partition(")")[0])
+        for head, times, tail in lines
+        if times
     ]
-    value, rate, end = np.array(found).T
+    value, rate, end = np.array(found, dtype=float).T
     return value + rate * (readings - end)
 
 

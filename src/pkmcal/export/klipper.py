@@ -9,7 +9,6 @@ height at which the nozzle would be in the middle if all arms were at that arm's
 
 from __future__ import annotations
 
-import re
 from configparser import ConfigParser
 from typing import ClassVar, final
 
@@ -184,8 +183,8 @@ def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
         return [(q, switch_values(text, q)) for q in readings_elsewhere(fit)]
     out: list[tuple[Array, Array]] = []
     for k, name in enumerate(KLIPPER_STEPPERS):
-        line = re.findall(rf"stepper_{name}\.position_endstop = (.*)", text)[0]
-        for height, reading in re.findall(r"(\S+) at (\S+) rad", line):
+        pairs = text.partition(f"stepper_{name}.position_endstop = ")[2].partition("\n")[0]
+        for height, _, reading, _ in (pair.split() for pair in pairs.split(", ") if pair):
             both = np.full((2, 3), np.nan)
             both[:, k] = float(reading), float(height)
             out.append((both[0], both[1]))
