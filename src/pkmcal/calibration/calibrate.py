@@ -478,7 +478,7 @@ def _judge(
             *(one.sentence for one in departed if not one.against),
             *sentences(errors),
             *outvoted(session, found.turns.measurements, found.estimate),
-            *noise_told(session, found.estimate, bool(departed or errors)),
+            *noise_told(session, found.estimate, bool(departed or sentences(errors))),
             *lens_told(found.turns.cameras),
             *(one.sentence for one in (*turned, *found.turns.responses) if not one.sure),
         ),

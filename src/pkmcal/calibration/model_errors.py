@@ -46,7 +46,8 @@ class ModelError:
     code : such as readings.workspace. scale : its standard deviation, m or rad of what it acts on.
     unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
     standard deviation of the platform's position, root mean square over the session's poses, with
-    all components and without any.
+    all components and without any. sure : whether it is named, or only contained in the covariance,
+    for larger noise of the readings or poses explains the data as well.
     """
 
     code: str
@@ -55,6 +56,7 @@ class ModelError:
     tool: float
     tool_before: float
     unit: str
+    sure: bool
 
     def document(self) -> dict[str, Any]:
         """For programs."""
@@ -62,6 +64,7 @@ class ModelError:
             "code": self.code,
             "scale": self.scale,
             "likelihood_ratio": self.ratio,
+            "sure": self.sure,
             "sigma_tool": self.tool,
             "sigma_tool_before": self.tool_before,
         }
@@ -97,8 +100,10 @@ SUBJECTS = {
 
 
 def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
-    """One for the verdict, of all components, the largest by evidence first; none without any."""
-    if not errors:
+    """One for the verdict, of all components, the largest by evidence first; none without sure
+    ones.
+    """
+    if not any(one.sure for one in errors):
         return ()
     first = errors[0]
     parts = [f"{amount(one.scale, one.unit)} {SUBJECTS[one.code][0]}" for one in errors]
@@ -310,6 +315,7 @@ def model_errors(
             with_,
             without,
             unit if one.code.startswith("readings") else "m",
+            discrepancy.sure,
         )
         for one in discrepancy.scales
     )

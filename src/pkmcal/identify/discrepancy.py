@@ -21,7 +21,9 @@ without anything to explain.
 
 Where the estimate has enlarged the noise of readings or poses, the discrepancy may be what enlarged
 it: the two are compared by the restricted likelihood of both, and a component of the readings, or
-poses, needs no further evidence, for that something is left out is known already.
+poses, needs no further evidence, for that something is left out is known already: the covariance
+contains it. It is sure, and worth naming, only where it explains the data better than noise alone
+does, at the same level.
 
 Covariance
 ----------
@@ -73,6 +75,14 @@ class DiscrepancyOptions:
     # part of a squared column that has to be left beside the unknowns; less is rounding
     rank: float = 1e-10
 
+    def least_ratio(self, components: int) -> float:
+        """Twice the logarithm of the likelihood ratio beyond which one of so many components is no
+        chance.
+        """
+        from scipy.special import chdtri
+
+        return float(chdtri(1.0, 2 * self.false_alarm / max(components, 1)))
+
 
 @dataclass(frozen=True)
 class Component:
@@ -106,12 +116,14 @@ class Discrepancy:
     """What the data show of the components.
 
     scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : their effects.
+    shared unknowns. random : their effects. sure : whether they explain the data better than larger
+    noise alone does.
     """
 
     scales: tuple[ComponentScale, ...]
     shared: Array
     random: RandomEffects
+    sure: bool = False
 
 
 @dataclass(frozen=True)
@@ -167,6 +179,10 @@ def discrepancy_of(
     for search in searches:
         search.run(kind if factor > options.enlarged else None)
     best = max(searches, key=lambda one: one.products.likelihood + one.gain)
+    noise_alone = max(one.products.likelihood for one in searches)
+    evidence = 2 * (best.products.likelihood - noise_alone) + sum(
+        one.ratio for one in best.scales if not one.code.startswith(NAMED)
+    )
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
     if not scales:
         return no_discrepancy(info)
@@ -175,7 +191,8 @@ def discrepancy_of(
     root = best.root[: ends[len(components)], smooth]
     gain = at_solution.gain[:, : ends[len(components)]] @ root
     spread = gain @ best.second_moment[np.ix_(smooth, smooth)] @ gain.T
-    return Discrepancy(scales, spread, RandomEffects(tuple(effects[: len(components)]), root))
+    random = RandomEffects(tuple(effects[: len(components)]), root)
+    return Discrepancy(scales, spread, random, evidence > options.least_ratio(len(every)))
 
 
 class _Search:
@@ -199,10 +216,7 @@ class _Search:
 
     def run(self, enlarged: int | None) -> None:
         """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
-        from scipy.special import chdtri
-
-        level = self.options.false_alarm / max(len(self.components), 1)
-        beyond = float(chdtri(1.0, 2 * level))
+        beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
             squared, value = self._left()

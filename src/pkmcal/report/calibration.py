@@ -154,7 +154,7 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        partial=bool(c.model_errors),
+        partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(doubtful(text) for text in session.warnings),
