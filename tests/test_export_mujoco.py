@@ -228,7 +228,7 @@ def test_a_name_cannot_break_the_text():
     machine = machine_of("delta")
     document = machine.document.model_copy(update={"name": 'a --> <b> "c" \x07 & d-'})
     source, text = exported(replace(machine, document=document))
-    assert fromstring(text).get("model") == 'a - -> <b> "c"  & d- '
+    assert fromstring(text).get("model") == 'a - -> <b> "c" \\x07 & d- '
     assert not [d for d in differences(source, text) if d.beyond]
     assert list(exporters()["mujoco"].files(source)) == ["a------b---c------d.xml"]
 

@@ -138,7 +138,7 @@ def test_a_bomb_of_aliases_is_refused(tmp_path):
 )
 def test_too_much_without_an_alias_is_not_blamed_on_aliases(tmp_path, text):
     message = fault(read_yaml, written(tmp_path / "a.yaml", text))
-    assert "too many" in message
+    assert "more than 50000 keys and values" in message or "too large" in message
     assert "alias" not in message
 
 

@@ -70,7 +70,7 @@ def test_a_proper_refusal_has_no_faults():
         ({"err": "Error: line 4, column leg3: not a number.\n"}, "no file named"),
         ({"err": "Error: joints.csv: not a table.\n"}, "no field, line or column named"),
         ({"err": GOOD.replace("x", "x" * 3000)}, "an error of 30"),
-        ({"err": GOOD.replace("x", "\x1b[2J")}, "cannot be seen"),
+        ({"err": GOOD.replace("x", "\x1b[2J")}, "characters that cannot be seen"),
         ({"after": {"s/new": (1,)}}, "written outside the output: ['s/new']"),
         ({"after": {"out/report.html": (1,)}}, "refused, but written"),
         ({"code": 0, "err": "", "after": {"out/.a.part": (1,)}}, "left over"),

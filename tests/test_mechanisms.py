@@ -353,7 +353,7 @@ def test_carriers_broadcast(side, carrier):
             "name: small\nmotion: planar",
             "nam: small\nmotoin: planar",
             "m.yaml, line 1, nam: this key is not known; found nam, expected name (known here: "
-            "fixed, home, legs, models, motion, name, tied, tolerance). "
+            "fixed, home, legs, models, motion, name, tied, tolerance, workspace_radius). "
             "Then look at line 2, "
             "motoin.",
         ),
@@ -406,7 +406,7 @@ def test_carriers_broadcast(side, carrier):
             "name: small\n",
             "name: small\ntolerance: {center: 0.0}\n",
             "m.yaml, line 2, tolerance.center: this value cannot be used; found 0.0, "
-            "expected a number above 0.",
+            "expected a number of 1e-12 or more.",
         ),
     ],
 )

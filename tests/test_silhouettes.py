@@ -237,7 +237,7 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
 
 
 def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
-    monkeypatch.setattr(check, "search_by_hand", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr(byhand, "search_by_hand", lambda *_: pytest.fail("searched"))
     assert check.check_session(beside[0].parent / "tripod").stations
 
 

@@ -53,5 +53,5 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
     heads to a screen reader, as in the program's pages.
     """
     del page
-    html = ROLE.sub(r"<code>\1", html)
+    html = ROLE.sub("<code>", html)
     return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)
