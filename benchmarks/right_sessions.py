@@ -187,24 +187,70 @@ def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
     return make
 
 
-def printer(points: int) -> Callable[[Path, int], Session]:
-    """A delta printer that felt its bed, its parts as far off as those of a kit."""
+def true_printer(rng: np.random.Generator) -> Any:
+    """A delta printer whose parts are as far off as those of a kit."""
+    built = printers.Settings(
+        radius=105.0 + 0.3 * rng.normal(),
+        angle=tuple(np.array([210.0, 330.0, 90.0]) + 0.1 * rng.normal(size=3)),
+        rod=tuple(270.0 + 0.1 * rng.normal(size=3)),
+    )
+    return printers.machine(built, endstops=tuple(0.3 * rng.normal(size=3)))
+
+
+def klipper_printer(points: int) -> Callable[[Path, int], Session]:
+    """Heights of a bed as Klipper's DELTA_CALIBRATE keeps them."""
 
     def make(folder: Path, seed: int) -> Session:
         from pkmcal.printers.session import write_printer_session
 
         rng = np.random.default_rng(seed)
-        built = printers.Settings(
-            radius=105.0 + 0.3 * rng.normal(),
-            angle=tuple(np.array([210.0, 330.0, 90.0]) + 0.1 * rng.normal(size=3)),
-            rod=tuple(270.0 + 0.1 * rng.normal(size=3)),
-        )
-        true = printers.machine(built, endstops=tuple(0.3 * rng.normal(size=3)))
-        readings = printers.felt(true, printers.bed(points), HEIGHT_SIGMA, rng)
+        readings = printers.felt(true_printer(rng), printers.bed(points), HEIGHT_SIGMA, rng)
         folder.parent.mkdir(parents=True, exist_ok=True)
         file = folder.parent / f"{folder.name}.cfg"
         file.write_text(printers.printer_cfg(printers.Settings(), readings))
         write_printer_session(folder, file)
+        return Session(folder, None, None, None)
+
+    return make
+
+
+def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
+    """A height map of a bed as RepRapFirmware writes it, over a grid of ticks by ticks."""
+
+    def make(folder: Path, seed: int) -> Session:
+        from pkmcal.printers.session import write_printer_session
+
+        rng = np.random.default_rng(seed)
+        true, says = true_printer(rng), printers.machine(printers.Settings())
+        line = np.linspace(-90.0, 90.0, ticks)
+        grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        inside = np.hypot(*grid.T) <= 90.5
+        touched, goal, heights = grid[inside], grid[inside], np.zeros(0)
+        noise = int(rng.integers(2**32))
+        for _ in range(4):  # to where the firmware believes to be at the grid's points
+            readings = printers.felt(true, touched, HEIGHT_SIGMA, np.random.default_rng(noise))
+            points = 1e3 * says.forward(1e-3 * readings)[:, :3, 3]
+            touched, heights = touched + goal - points[:, :2], points[:, 2]
+        rows = np.zeros(len(grid))
+        rows[inside] = heights
+        cells = [f"{z:7.3f}" if at else "      0" for z, at in zip(rows, inside, strict=True)]
+        spacing = line[1] - line[0]
+        text = "RepRapFirmware height map file v2\n"
+        text += "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
+        text += f"-90,90.1,-90,90.1,90.5,{spacing:.2f},{spacing:.2f},{ticks},{ticks}\n"
+        text += "".join(
+            ", ".join(cells[k : k + ticks]) + "\n" for k in range(0, len(cells), ticks)
+        )
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        file, probed = folder.parent / "config.g", folder.parent / "heightmap.csv"
+        s = printers.Settings()
+        height = s.endstop[0]  # all three are alike in these settings
+        file.write_text(
+            f"M669 K3\nM665 L{s.rod[0]}:{s.rod[1]}:{s.rod[2]} R{s.radius} H{height} B95 X0 Y0 Z0\n"
+            "M666 X0 Y0 Z0\nM92 X80 Y80 Z80\n"
+        )
+        probed.write_text(text)
+        write_printer_session(folder, file, probed)
         return Session(folder, None, None, None)
 
     return make
@@ -222,8 +268,9 @@ KINDS: dict[str, Callable[[Path, int], Session]] = {
     "board, 6-RUS by servos": board("6-rus", 24, float(np.deg2rad(0.5))),
     "tracker, hexapod": tracker("gough-stewart", 20, 1e-5, points=False),
     "tracker's points, delta": tracker("delta", 24, 1e-5, points=True),
-    "printer, 7 heights": printer(7),
-    "printer, 19 heights": printer(19),
+    "Klipper, 7 heights": klipper_printer(7),
+    "Klipper, 19 heights": klipper_printer(19),
+    "RepRapFirmware, 69 heights": reprap_printer(9),
 }
 
 
