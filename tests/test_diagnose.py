@@ -4,6 +4,7 @@ mix-ups, refused where it is not, and nothing said of a session that is right.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import permutations
 
@@ -111,6 +112,18 @@ def test_two_columns_exchanged(pair, by_hand, seed):
         f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
         " in joints.csv, or the two legs in the drawing."
     )
+
+
+@pytest.mark.parametrize("motor", [2, also(5)])
+def test_a_motor_that_counts_the_other_way(motor):
+    """Its readings are a constant less its lengths, and nobody knows which."""
+    readings = machine().inverse(poses())
+    constant = readings[:, motor].min() + readings[:, motor].max() + 0.004
+    readings[:, motor] = constant - readings[:, motor]
+    error = said(pictures(), readings, by_hand=given(True))
+    assert error.what == f"the readings of motor {motor + 1} count the other way"
+    named = float(re.search(r"some (\d+) mm less the reading", error.found)[1])
+    assert abs(named - 1e3 * constant) < 10
 
 
 @pytest.mark.parametrize(

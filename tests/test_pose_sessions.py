@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -339,6 +340,24 @@ def test_the_sign_of_one_encoder(folder, motor):
     with pytest.raises(InputError, match=f"the readings of motor{motor + 1} have the wrong sign"):
         calibrate_session(folder)
     assert "range" in text
+
+
+@pytest.mark.parametrize("motor", [pytest.param(0, marks=pytest.mark.slow), 3])
+def test_a_motor_that_counts_the_other_way(folder, motor):
+    """With a constant that nobody knows: what is named with it fits the mechanism's tolerance."""
+    made = make(folder, "gough-stewart", n=20)
+    joints = made.joints.copy()
+    constant = joints[:, motor].min() + joints[:, motor].max() + 0.003
+    joints[:, motor] = constant - joints[:, motor]
+    write_joints(folder, joints)
+    with pytest.raises(InputError) as caught:
+        calibrate_session(folder)
+    assert caught.value.what.endswith(f"{motor + 1} count the other way")
+    named = float(re.match(r"(\d+) mm", caught.value.expected)[1])
+    assert abs(named - 1e3 * constant) < 6
+    joints[:, motor] = 1e-3 * named - joints[:, motor]
+    write_joints(folder, joints)
+    assert calibrate_session(folder).verdict.usable
 
 
 def test_two_columns_exchanged(folder):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import chain, combinations
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -30,8 +30,13 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.reading_hypotheses import (
+    ReadingHypothesis,
+    exchanged_motors,
+    reversed_motors,
+)
 from pkmcal.session.load import Session
-from pkmcal.wording import listed, ratio_in_per_cent
+from pkmcal.wording import SHOWN_UNITS, listed, number, ratio_in_per_cent
 
 SUSPECT_POSE_SCALE = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
@@ -75,7 +80,8 @@ BOARDS_TURN_WORDS = {"one axis": "turn about one axis", "none": "do not turn"}
 class Doubt:
     """A mistake that explains the poses.
 
-    motor : column of the readings with the wrong sign, or exchanged with the other. configuration :
+    motor : column of the readings that counts the other way, or is exchanged with the other;
+    constant : of the former, a reading and what it stands for together, m or rad. configuration :
     the first after a movement; before : the last before it. size : of the board, true over
     written. moved : T (4, 4) of the board, or the station, from before to after. misfit : what is
     left, in standard deviations.
@@ -90,6 +96,7 @@ class Doubt:
     configuration: int = -1
     moved: Array = field(default_factory=lambda: np.eye(4))
     size: float = 1.0
+    constant: float = 0.0
 
 
 def pose_misfit(estimate: Estimate) -> float:
@@ -160,38 +167,36 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
 
 
 def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
-    """One motor's readings with the other sign, or two motors' exchanged, the likeliest first.
+    """One motor's readings counted the other way, or two motors' exchanged, the likeliest first.
 
     Such a mistake put right leaves no more than the drawing's errors where an estimate starts, and
     one that is not there a misfit as large as before, after many steps: only what halves it at the
     start is estimated.
     """
-    n = machine.n_joints
-    low, high = machine.joint_ranges.T
-    slack = 0.2 * (high - low)
-    mistakes: list[tuple[Doubt, Array]] = []
-    for motor in range(n):
-        joints = measurements.joints * np.where(np.arange(n) == motor, -1.0, 1.0)
-        outside = (joints < low - slack) | (joints > high + slack)
-        if not outside[:, motor].any():
-            mistakes.append((Doubt("sign", np.inf, motor=motor), joints))
-    for one, other in combinations(range(n), 2):
-        order = np.arange(n)
-        order[[one, other]] = order[[other, one]]
-        doubt = Doubt("order", np.inf, motor=one, other=other)
-        mistakes.append((doubt, measurements.joints[:, order]))
+
+    def misfit(hypothesis: ReadingHypothesis) -> float:
+        return _first_misfit(machine, replace(measurements, joints=hypothesis.joints))
+
+    joints = measurements.joints
+    reversed_ = reversed_motors(joints, machine.joint_ranges)
+    hypotheses = [(misfit(h), h) for h in exchanged_motors(joints)]
+    for constants in filter(None, reversed_):
+        few = dict.fromkeys((0, len(constants) // 2))  # a wrong sign alone, and the middle
+        hypotheses += [(misfit(constants[k]), constants[k]) for k in few]
     limit = CURED_MISFIT_SHARE * _first_misfit(machine, measurements)
-    ranked = [
-        (_first_misfit(machine, replace(measurements, joints=joints)), k)
-        for k, (_, joints) in enumerate(mistakes)
-    ]
-    for first, k in sorted(ranked):
-        doubt, joints = mistakes[k]
+    for first, hypothesis in sorted(hypotheses, key=lambda item: item[0]):
         if first > limit:
             break
-        estimate = _tried(machine, replace(measurements, joints=joints), None)
+        if hypothesis.constant:  # the best of the motor's; its offset, estimated, takes up the rest
+            hypothesis = min(reversed_[hypothesis.motors[0]], key=misfit)
+        estimate = _tried(machine, replace(measurements, joints=hypothesis.joints), None)
         if estimate is not None:
-            yield replace(doubt, misfit=pose_misfit(estimate))
+            kind = "sign" if hypothesis.code == "readings.reversed" else "order"
+            motor, *other = hypothesis.motors
+            yield Doubt(
+                kind, pose_misfit(estimate), motor=motor, other=other[0] if other else -1,
+                constant=hypothesis.constant,
+            )  # fmt: skip
 
 
 def _first_misfit(machine: Machine, measurements: Measurements) -> float:
@@ -364,7 +369,7 @@ def check_poses(
         raise error
     doubt = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:
-        raise _error(session, doubt, estimate.statistics.pose_scale)
+        raise _error(session, doubt, pose_misfit(estimate))
 
 
 def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
@@ -581,25 +586,38 @@ def _lengths(value: float, units: set[str]) -> str:
     return " or ".join(each[unit] for unit in ("m", "rad") if unit in units)
 
 
-def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
-    """The mistake in words."""
+def _error(session: Session, doubt: Doubt, before: float) -> InputError:
+    """The mistake in words; before : misfit of the poses with it, in standard deviations."""
     left = f"with that, the poses fit {doubt.misfit:.1f} times their noise"
+    found = f"poses that the readings miss by {before:.{int(before < 10)}f} times their noise"
     joints = session.document["joints"]
     if doubt.kind == "sign":
         name = joints["columns"][doubt.motor]
+        if not doubt.constant:
+            return InputError(
+                f"the readings of {name} have the wrong sign",
+                where=f"{joints['file']}, column {name}",
+                found=found,
+                expected=f"the readings with the other sign; {left}",
+                next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            )
+        unit = session.machine.joint_units[doubt.motor]
+        scale, shown = SHOWN_UNITS[unit]
+        constant = f"{number(scale * doubt.constant, 0 if unit == 'm' else 1)} {shown}"
         return InputError(
-            f"the readings of {name} have the wrong sign",
+            f"the readings of {name} count the other way",
             where=f"{joints['file']}, column {name}",
-            found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
-            expected=f"the readings with the other sign; {left}",
-            next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            found=found,
+            expected=f"{constant}, or nearly so, less the reading; {left}",
+            next_step=f"Turn the motor's direction round where it is set, or write {constant} less"
+            " the reading into this column; what is left of the constant is calibrated",
         )
     if doubt.kind == "order":
         one, other = (joints["columns"][k] for k in (doubt.motor, doubt.other))
         return InputError(
             f"the readings of {one} and {other} are exchanged",
             where=f"{joints['file']}, line 1",
-            found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
+            found=found,
             expected=f"the two columns in the other order; {left}",
             next_step="Exchange the two columns, or the motors in the mechanism file",
         )

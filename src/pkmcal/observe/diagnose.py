@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, islice
+from itertools import chain, combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +20,10 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
+from pkmcal.mechanisms.reading_hypotheses import reversed_motors
 from pkmcal.observe.evidence import StationView, evidence_by_name, evidence_from, settled
 from pkmcal.observe.stations import FoundStation, evidence_nearby, find_station
-from pkmcal.wording import how_often, listed
+from pkmcal.wording import SHOWN_UNITS, how_often, listed, number
 
 DIAGNOSIS_LOG_ODDS = math.log(30 / 0.05)
 """Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
@@ -222,12 +223,14 @@ def _likelier(
         return None
     better.sort(key=lambda item: -item[0])
     first, error = better[0][0], better[0][1].error
-    also = [h.error.what for o, h in better[1:] if first - o < DIAGNOSIS_LOG_ODDS]
+    # several constants of one motor are told by the same words
+    also = [h.error.what for o, h in better[1:]
+            if first - o < DIAGNOSIS_LOG_ODDS and h.error.what != error.what]  # fmt: skip
     if station.elsewhere and found.good:
         also.append("the pose by hand is of another side of the machine")
     if not also:
         return error
-    distinct = dict.fromkeys(also)  # several numberings are told by the same words
+    distinct = dict.fromkeys(also)  # and several numberings
     said = f"{error.found}; they fit as well if {' or '.join(distinct)}"
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
@@ -249,12 +252,16 @@ def _replaces(
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
-    """What is tried: columns turned, turned round and exchanged, names shifted; of a station that
-    was not recognised, diameters taken for radii.
+    """What is tried: motors that count the other way, columns turned, turned round and exchanged,
+    names shifted; of a station that was not recognised, diameters taken for radii.
     """
     view = station.view
     count = view.all_joints.shape[1]
     own = np.arange(count)
+    for h in chain(*reversed_motors(view.all_joints, view.machine.joint_ranges)):
+        error = _reversed(h.motors[0] + 1, h.constant, view.machine.joint_units[h.motors[0]])
+        readings = h.joints[view.configuration]
+        yield Hypothesis(partial(view.with_joints, h.joints), error, readings=readings)
     exchanged: dict[tuple[int, ...], InputError] = {}
     for a, b in combinations(range(count), 2):
         order = own.copy()
@@ -327,6 +334,20 @@ def _best_names(score: Array) -> Integers:
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(-score)[1]
+
+
+def _reversed(motor: int, constant: float, unit: str) -> InputError:
+    """The error about a motor, counted from 1, whose readings are the constant less its values."""
+    scale, shown = SHOWN_UNITS[unit]
+    sum_ = f"{number(scale * constant, 0 if unit == 'm' else 1)} {shown}"
+    less = f"some {sum_} less the reading" if constant else "the reading with the other sign"
+    return InputError(
+        f"the readings of motor {motor} count the other way",
+        where="joints.csv",
+        found=f"the photographs fit with {less}",
+        next_step=f"Turn the motor's direction round where it is set, or write {less} into this"
+        " column; what is left of a constant is calibrated",
+    )
 
 
 def _two_legs(a: int, b: int) -> InputError:

@@ -166,12 +166,14 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
         row, column = far[0]
         low, high = ranges[column]
         more = f"It is one of {len(far)} such readings. " if len(far) > 1 else ""
+        alone = len(set(far[:, 1])) == 1 and np.ptp(table.values[:, column]) <= high - low
+        way = ", the motor's direction if it counts the other way" if alone else ""
         raise InputError(
             "this reading is outside the machine's range",
             where=table.where(row, column),
             found=f"{table.values[row, column]:g}",
             expected=f"{low:g} to {high:g}, the range in the mechanism file",
-            next_step=f"{more}Correct the reading, or the mechanism's range",
+            next_step=f"{more}Correct the reading{way}, or the mechanism's range",
         )
     near = np.argwhere(~_inside(table.values, ranges, margin=0.0))
     if not len(near):
