@@ -296,9 +296,9 @@ def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
     """By how far the last look moved it, in its deviations."""
     found = turns_of(tripod_calibration, 0.0, ())
     assert found._replace(change=0.9 * turns.SETTLED_MACHINE_CHANGE).doubts == ()
-    (reason,) = found._replace(change=1.5).doubts
+    (reason,) = found._replace(change=2.5).doubts
     assert "does not settle" in reason
-    assert "still moved it by 1.5 of its standard deviations" in reason
+    assert "still moved it by 2.5 of its standard deviations" in reason
 
 
 def test_few_coarse_edges_do_not_tell_how_they_scatter():
