@@ -197,6 +197,7 @@ def test_a_photograph_cut_short(session):
     )
 
 
+@pytest.mark.slow
 def test_photographs_of_something_else(session):
     rng = np.random.default_rng(1)
     for path in photographs(session, "station2"):

@@ -153,7 +153,7 @@ def test_stations_of_one_camera_are_binned_alike(calibrated):
     np.testing.assert_array_equal(found.binning, 2)
 
 
-@pytest.mark.parametrize("spread", [1.6, 2.4])
+@pytest.mark.parametrize("spread", [1.6, pytest.param(2.4, marks=pytest.mark.slow)])
 def test_photographs_out_of_focus(session, calibrated, spread):
     """Profiles do not explain edges blurred over so much; of half the pixels they do. What is lost
     is stated.
@@ -169,6 +169,7 @@ def test_photographs_out_of_focus(session, calibrated, spread):
     assert away(calibrated, found).max() < 3
 
 
+@pytest.mark.slow
 def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):
     """Looked at first as if half their pixels were too many; the last looks are at all of them."""
     width = calibrated.session.stations[0].camera.image_size[0]

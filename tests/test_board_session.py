@@ -177,6 +177,7 @@ def test_poses_joined_are_exact(found):
     assert Boards().joined([None, T[1]])[0] is None
 
 
+@pytest.mark.slow
 def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     path = folder / "session.yaml"
     text = path.read_text()

@@ -80,9 +80,8 @@ def test_slim_bare_rods_are_told_honestly(tmp_path):
     assert np.sqrt(np.mean(errors_in_sigmas(found, folder) ** 2)) < 1.2
 
 
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
     """The rough poses do not matter: the same edges, so the same answer."""
     rng = np.random.default_rng(seed)
@@ -188,6 +187,7 @@ def test_rejected_edges_have_reasons(calibrated):
     assert len(set(zip(*place, strict=True))) == len(edges)
 
 
+@pytest.mark.slow
 def test_cameras_are_refined(demo, calibrated):
     """Intrinsics off by two of their deviations spoil the machine; refined, they spoil it less."""
     session = load_session(demo.session)

@@ -121,21 +121,21 @@ def wide_pool(wide_views):
     return camera_candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
 
 
+def calibration_of(name):
+    """The model and the terms chosen by the views alone."""
+    true = TRUE[name]
+    return calibrate_camera(detections(true, poses_for(true, 10, 1), 2), BOARD)
+
+
 @pytest.fixture(scope="module")
-def calibrated(wide_views, wide_pool):
-    """One calibration a model, chosen by itself."""
-    found = {
-        model: calibrate_camera(detections(TRUE[model], poses_for(TRUE[model], 10, 1), 2), BOARD)
-        for model in ("pinhole", "fisheye")
-    }
+def wide_calibration(wide_pool):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
-        return {**found, "unified": calibrate_camera(wide_views, BOARD)}
+        return calibration_of("unified")
 
 
-def test_the_truth_comes_back(true, calibrated):
+def check_truth(found, true):
     """Model and terms are found, and every intrinsic within its uncertainty."""
-    found = calibrated[true.model]
     assert found.camera.model == true.model
     assert set(TERMS[true.model]) <= set(found.terms) or true.model != "pinhole"
     off = found.camera.parameters - true.parameters
@@ -147,6 +147,16 @@ def test_the_truth_comes_back(true, calibrated):
     assert found.held_out.straightness < 0.06
     assert found.spread == 1.0
     np.testing.assert_array_equal(found.camera.covariance, found.covariance)
+
+
+def test_the_truth_comes_back(wide_calibration):
+    check_truth(wide_calibration, TRUE["unified"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pinhole", "fisheye"])
+def test_the_truth_of_other_models_comes_back(name):
+    check_truth(calibration_of(name), TRUE[name])
 
 
 def test_photographs_give_the_camera(tmp_path, monkeypatch):
@@ -398,8 +408,8 @@ def test_the_strong_correlation_of_xi_is_named(monkeypatch):
 # The page
 
 
-def test_the_page(calibrated, tmp_path):
-    found = calibrated["fisheye"]
+def test_the_page(wide_calibration, tmp_path):
+    found = wide_calibration
     path = tmp_path / "p0.png"
     cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
     html = page_html(outcome_of(found, [path]))

@@ -125,6 +125,7 @@ def test_the_only_station_is_not_left_out_but_doubted():
     assert chance_doubt(alone)
 
 
+@pytest.mark.slow
 def test_the_machine_is_told_by_the_other_stations(demo, monkeypatch):
     """A station that may stand elsewhere is left out with its reason, and the rest identified."""
     found = iter([{1: "it may stand elsewhere"}])

@@ -31,6 +31,7 @@ from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
+from test_pose_sessions import make
 from test_report_page import Found
 
 COMMANDS = (
@@ -429,8 +430,9 @@ def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, m
     assert re.search(r"^  result-\S+ +the earlier result, kept$", done.out, re.MULTILINE)
 
 
-def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
-    out = tmp_path / "result"
+def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
+    """Of poses from a tracker, which takes a second; of photographs above."""
+    session, out = make(tmp_path / "session", "gough-stewart").folder, tmp_path / "result"
     done = python("-m", "pkmcal", "calibrate", session, "-o", out, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     result = json.loads(done.stdout)

@@ -16,6 +16,7 @@ from pkmcal.boards.poses import pose_set, size_departure
 from pkmcal.calibration.departures import FALSE_DEPARTURE_CHANCE
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import outlines
+from pkmcal.calibration.recognise import frozen_in
 from pkmcal.calibration.saved import load
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
@@ -27,6 +28,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.planning.subject import of_machine
+from pkmcal.session.load import load_session
 from pkmcal.session.moved import FEWEST_BESIDE_MOVEMENT
 from pkmcal.simulation import simulate_edges
 from pkmcal.simulation.demo import camera_of_size
@@ -369,6 +371,7 @@ def test_right_tubes_are_not_named():
 # ------------------------------------------------------------------ on photographs
 
 
+@pytest.mark.slow
 def test_a_sleeve_is_named_and_harms_little(session):
     path = session / "mechanism.yaml"
     document = yaml.safe_load(path.read_text())
@@ -404,6 +407,7 @@ def test_an_encoder_of_another_scale_is_named_and_the_result_refused(session, tm
     assert found["moves_tool_in_sigmas"] > 1
 
 
+@pytest.mark.slow
 def test_another_camera_is_named(session):
     path = session / "cameras" / "camera.yaml"
     document = yaml.safe_load(path.read_text())
@@ -433,6 +437,7 @@ def test_one_wrong_reading_is_named_with_its_configuration(session):
     assert "mm less" in one.sentence
 
 
+@pytest.mark.slow
 def test_a_frozen_reading_is_named(session):
     path = session / "joints.csv"
     head, *rows = list(csv.reader(path.read_text().splitlines()))
@@ -444,6 +449,17 @@ def test_a_frozen_reading_is_named(session):
     assert result.code == 2
     assert "joints.csv, column leg2: the readings of leg2 are frozen" in told
     assert f"in all {len(rows)} configurations" in told
+
+
+def test_readings_that_never_change_are_frozen(demo):
+    """As calibrate says it of a session whose data fit nothing: the test above."""
+    session = load_session(demo.session)
+    assert frozen_in(session) is None
+    joints = session.joints.copy()
+    joints[:, 1] = joints[0, 1]
+    error = frozen_in(replace(session, joints=joints))
+    assert error is not None
+    assert "the readings of leg2 are frozen" in error.what
 
 
 def test_a_right_session_names_nothing(calibrated):

@@ -128,7 +128,10 @@ def test_a_motor_that_counts_the_other_way(motor):
 
 @pytest.mark.parametrize(
     ("turn", "or_else"),
-    [(1, ""), also(2, "; they fit as well if the pose by hand is of another side of the machine")],
+    [
+        also(1, ""),
+        also(2, "; they fit as well if the pose by hand is of another side of the machine"),
+    ],
 )
 def test_columns_turned_round(turn, or_else):
     """A hexapod turned by a third looks the same, and only the pose by hand can tell."""
@@ -156,7 +159,7 @@ def test_columns_in_reverse():
 
 
 @pytest.mark.parametrize(
-    ("step", "words", "by_hand"), [(-1, "before", True), also(1, "after", False)]
+    ("step", "words", "by_hand"), [also(-1, "before", True), also(1, "after", False)]
 )
 def test_photographs_shifted_by_one(step, words, by_hand):
     error = said(pictures(), configuration=np.roll(np.arange(6), step), by_hand=given(by_hand))
@@ -192,6 +195,7 @@ def test_two_photographs_exchanged_beside_two_of_one_configuration():
     )
 
 
+@pytest.mark.slow
 def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely():
     """Of the right one the machine is a little less sure, as with many photographs it may be."""
     rng = np.random.default_rng(0)
@@ -208,7 +212,7 @@ def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely
 
 @pytest.mark.parametrize(
     "by_hand",
-    [True, pytest.param(False, marks=[
+    [also(True), pytest.param(False, marks=[
         pytest.mark.slow,
         pytest.mark.xfail(reason="legs numbered backwards fit better, by 27 of 240 in log odds,"
                           " so that they alone are said"),

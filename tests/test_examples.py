@@ -116,6 +116,7 @@ def test_the_notebook_is_small_and_names_no_place_of_one_computer():
             assert not re.search(r"/(home|root|tmp|work|Users)/", " ".join(told))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_plans")
 def test_the_notebook_runs(tmp_path, monkeypatch):
     """Its cells one after the other, as Jupyter would, on smaller photographs; what they show is

@@ -360,6 +360,7 @@ def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
         better_refined(failed, failed)
 
 
+@pytest.mark.slow
 def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
     """The estimate without them gives up all of their edges, and says nothing of where they are."""
     settings = replace(SETTINGS, configurations=4)

@@ -193,7 +193,11 @@ def view(session):
         server.wait(60)
 
 
-HOSTILE = (with_the_issues_example, with_unfinished_results, with_links)
+HOSTILE = (
+    with_the_issues_example,
+    pytest.param(with_unfinished_results, marks=pytest.mark.slow),
+    with_links,
+)
 RESULTS = (
     "calibration", "validation", "watch", "plan", "diff", "export-json", "servo", "study",
 )  # fmt: skip

@@ -100,13 +100,21 @@ def test_a_good_session(checked, calibrating):
     hold_together(checked.found, 0, None)
 
 
-@pytest.mark.parametrize("spoil", [exchanged_stations, one_black, readings_of_another])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(exchanged_stations, marks=pytest.mark.slow),
+        one_black,
+        pytest.param(readings_of_another, marks=pytest.mark.slow),
+    ],
+)
 def test_a_spoilt_session(session, spoil):
     spoil(session)
     found = check_session(session)
     hold_together(found, *calibrated_code(session))
 
 
+@pytest.mark.slow
 def test_photographs_by_hand_without_a_machine(tmp_path):
     """Both are refused, with one finding; it said that it can be calibrated."""
     folder = lines_alone(tmp_path / "session")

@@ -361,7 +361,9 @@ def test_images_are_of_the_size_that_the_options_say():
     assert EdgeNoise().shift == NOMINAL_EDGE_SIGMA
 
 
-@pytest.mark.parametrize(("subject", "n"), [("3-rpr", 4), ("session", 3)])
+@pytest.mark.parametrize(
+    ("subject", "n"), [("3-rpr", 4), pytest.param("session", 3, marks=pytest.mark.slow)]
+)
 def test_the_command_plans_what_the_function_plans(demo, quick_plans, tmp_path, subject, n):
     subject = demo.session if subject == "session" else subject
     done = run("plan", subject, "-n", n, "-o", tmp_path / "out", "--json")

@@ -276,6 +276,7 @@ def test_page_runs_in_a_browser(page, tmp_path):
     assert root["data-printed"] == ",".join(["1344"] * page.count('class="panel in-space"'))
 
 
+@pytest.mark.slow
 def test_the_browser_test_sees_errors(page, tmp_path):
     """And a page whose script fails has its text and its tables, on a wide screen as well."""
     broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)

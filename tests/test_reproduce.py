@@ -319,6 +319,7 @@ def test_the_page_asks_for_nothing_outside(page):
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
+@pytest.mark.slow
 def test_the_page_runs_in_a_browser(page, tmp_path):
     """On a telephone, where it is likeliest to overflow; the template's widths are all tried by
     the report."""

@@ -60,6 +60,7 @@ def test_the_page_is_whole(studied):
     assert "http://" not in re.sub(r'id="plotly">.*?</script>', "", page, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the animation was not played")
 def test_the_animation_has_its_pictures(studied, tmp_path):
     """In a browser; the last one has the platform at the goal."""

@@ -16,7 +16,6 @@ from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.responses import _way
 from pkmcal.calibration.turns import Turns, _scatter_of, _variance, looked_again
-from pkmcal.check import check
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.verdict import POLISHED_SHADING
@@ -165,9 +164,17 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     assert f"results scatter by {np.sqrt(variance):.1f} of the deviations" in page
 
 
-def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
+@pytest.fixture(scope="module")
+def tripod_calibration(beside):
+    """Of the photographs of the camera on the tripod alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(turns, "LOOKS_AGAIN", 2)
+        return calibrate_session(beside[0].parent / "tripod")
+
+
+def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
     """Machines that scatter as noise lets them have one, twice as far apart they have four."""
-    calibration = calibrate_session(beside[0].parent / "tripod")
+    calibration = tripod_calibration
     machine, state = calibration.session.machine, calibration.estimate.state
     measurements = replace(calibration.measurements, look_variance=0.0)
     estimate = bundle(machine, measurements, state)
@@ -182,20 +189,43 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(beside):
     assert _variance(2 * changes, measurements, estimate) == pytest.approx(4, rel=0.1)
 
 
+def turns_of(calibration, shading, photographs):
+    """What the last look left, had its edges been shaded by so many px, as light moves them."""
+    estimate = calibration.estimate
+    noise = replace(estimate.edge_noise, shading=np.full_like(estimate.edge_noise.shading, shading))
+    return Turns(
+        calibration.observation,
+        calibration.measurements,
+        replace(estimate, edge_noise=noise),
+        calibration.cameras,
+        photographs=photographs,
+        start=estimate.state,
+    )
+
+
+def looked_from_machines_as_likely(calibration, found):
+    seen = SimpleNamespace(session=calibration.session, boards=Boards())
+    return looked_again(seen, found, np.random.default_rng(0), lambda *_: None)
+
+
 @pytest.mark.parametrize(("times", "asked"), [(0.9, False), (1.1, True)])
-def test_painted_legs_on_a_tripod_are_not_looked_for_again(beside, monkeypatch, times, asked):
-    calibration = calibrate_session(beside[0].parent / "tripod")
-    estimate, start = calibration.estimate, calibration.estimate.state
-    shading = np.full_like(estimate.edge_noise.shading, times * POLISHED_SHADING)
-    shaded = replace(estimate, edge_noise=replace(estimate.edge_noise, shading=shading))
-    found = Turns(None, calibration.measurements, shaded, None,
-                  photographs=[SimpleNamespace(station=0)], start=start)  # fmt: skip
-    drawn = []
-    monkeypatch.setattr(turns, "_as_likely", lambda *_: drawn.append(1) or [])
-    seen = SimpleNamespace(session=calibration.session)
-    ended = looked_again(seen, found, np.random.default_rng(0), lambda *_: None)
-    assert bool(drawn) == asked
+def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, asked):
+    photographs = read_photographs(tripod_calibration.session)
+    found = turns_of(tripod_calibration, times * POLISHED_SHADING, photographs)
+    ended = looked_from_machines_as_likely(tripod_calibration, found)
     assert (ended is found) != asked
+    assert (ended.measurements.look_variance > 0) == asked
+
+
+def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration):
+    """In photographs of nothing no look finds an edge."""
+    empty = [
+        replace(p, images=[np.full_like(image, 90) for image in p.images])
+        for p in read_photographs(tripod_calibration.session)
+    ]
+    found = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
+    ended = looked_from_machines_as_likely(tripod_calibration, found)
+    assert ended.estimate.statistics.look_scatter == 1
 
 
 @pytest.fixture(scope="module")
@@ -236,15 +266,12 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
     assert np.median(np.abs(off)) < 1
 
 
-def test_without_photographs_by_hand_none_is_searched(beside, monkeypatch):
-    monkeypatch.setattr(byhand, "search_by_hand", lambda *_: pytest.fail("searched"))
-    assert check.check_session(beside[0].parent / "tripod").stations
-
-
-def test_where_no_look_ends_as_much_again_as_noise_is_believed(folder, monkeypatch):
-    at_truth(monkeypatch, folder)
-    monkeypatch.setattr(turns, "_as_likely", lambda *_: iter(()))
-    assert calibrate_session(folder).estimate.statistics.look_scatter == 1
+def test_without_photographs_by_hand_none_is_searched(tripod_calibration):
+    session = tripod_calibration.session
+    rng = np.random.default_rng(0)
+    found = byhand.localize(session, read_photographs(session), Boards(), rng)
+    assert found.recognition is not None
+    assert found.places == {}
 
 
 def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
@@ -265,14 +292,13 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
         assert 0.01 < np.median(moved) < 0.4
 
 
-def test_a_machine_that_does_not_settle_is_refused(beside, monkeypatch):
-    """Here none does, for each look moves any machine by a little."""
-    monkeypatch.setattr(turns, "SETTLED_MACHINE_CHANGE", 1e-9)
-    monkeypatch.setattr(turns, "MOST_LOOKS_ASTRAY", 4)
-    calibration = calibrate_session(beside[0].parent / "tripod")
-    (reason,) = [r for r in calibration.verdict.reasons if "settle" in r]
-    assert not calibration.verdict.usable
-    assert "the last of 4 looks at its edges still moved it by" in reason
+def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
+    """By how far the last look moved it, in its deviations."""
+    found = turns_of(tripod_calibration, 0.0, ())
+    assert found._replace(change=0.9 * turns.SETTLED_MACHINE_CHANGE).doubts == ()
+    (reason,) = found._replace(change=2.5).doubts
+    assert "does not settle" in reason
+    assert "still moved it by 2.5 of its standard deviations" in reason
 
 
 def test_few_coarse_edges_do_not_tell_how_they_scatter():

@@ -281,6 +281,7 @@ def test_forearms_and_board_in_photographs(mixed):
     assert errors.calibrated.orientation < errors.drawing.orientation / 10
 
 
+@pytest.mark.slow
 def test_forearms_alone_in_photographs(mixed):
     found = pkmcal.calibrate(observing(mixed, "legs"))
     errors = compare_with_truth(found, mixed)
@@ -288,6 +289,7 @@ def test_forearms_alone_in_photographs(mixed):
     assert errors.calibrated.position < errors.drawing.position / 5
 
 
+@pytest.mark.slow
 def test_the_board_says_where_the_camera_stands(mixed):
     """With it, no pose by hand is needed to find the forearms."""
     path = observing(mixed, ["legs", "board"]) / "session.yaml"

@@ -146,6 +146,7 @@ def test_workers_that_die_are_replaced(monkeypatch):
     assert engine.run(setting, 4, 0).values("position", *JOINT_ESTIMATE_KEY).shape == (4,)
 
 
+@pytest.mark.slow
 def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
     monkeypatch.setenv("PKMCAL_TEST_PARENT", str(os.getpid()))
     pool = workers._Pool([Job(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
@@ -266,6 +267,7 @@ def test_a_scheduler_that_goes_away_is_told(tmp_path):
     assert list(tmp_path.glob("batches/*.npz"))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, one_process):
     distributed = pytest.importorskip("distributed")

@@ -19,7 +19,7 @@ from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
 from pkmcal.cameras import load_camera
 from pkmcal.identify.score import Departures, Freed
 from pkmcal.judge.new_data import _as_then
-from pkmcal.session.load import load_session
+from pkmcal.report.calibration import save
 from test_calibration import check_found
 
 CUT = (32, 20)
@@ -45,14 +45,21 @@ def turned(demo, tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def turned_found(turned):
-    return pkmcal.calibrate(turned)
+@pytest.fixture
+def turned_calibration(calibrated):
+    """The demonstration's calibration as if its photographs had been upside down."""
+    session, file = calibrated.session, "cameras/camera.yaml"
+    camera = session.stations[0].camera.turned_by_half()
+    one = UpsideDown(file, tuple(station.entry for station in session.stations), camera, 20.0)
+    return replace(calibrated, session=turned_round(session, {file: camera}), upside_down=(one,))
 
 
-def test_upside_down_photographs_are_known_by_their_cameras_centre(turned, turned_found):
-    """As good as upright ones, and told what file would be theirs."""
-    found = turned_found
+@pytest.mark.slow
+def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
+    """As good as upright ones, and told what file would be theirs. How sure it has to be is tested
+    below.
+    """
+    found = pkmcal.calibrate(turned)
     check_found(found, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
     (hint,) = [text for text in found.verdict.advice if "upside down" in text]
     assert hint.startswith(
@@ -75,6 +82,7 @@ def test_upright_photographs_are_left_as_they_are(calibrated):
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)
 
 
+@pytest.mark.slow
 def test_where_it_is_likely_it_is_said(demo, monkeypatch):
     """And the photographs are measured as they are."""
 
@@ -95,6 +103,14 @@ def test_where_it_is_likely_it_is_said(demo, monkeypatch):
     assert found.upside_down == ()
     own = load_camera(demo.session / "cameras" / "camera.yaml")
     np.testing.assert_array_equal(found.session.stations[0].camera.parameters, own.parameters)
+
+
+def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
+    camera = calibrated.session.stations[0].camera.turned_by_half()
+    one = UpsideDown("cameras/camera.yaml", ("station1",), camera, np.log(376.0))
+    assert not one.sure
+    assert "may be upside down against cameras/camera.yaml" in one.sentence
+    assert "at odds of 376 to 1" in one.sentence
 
 
 def lens(session, centre, covariance=None):
@@ -148,29 +164,29 @@ def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, si
     assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == known
 
 
-def test_the_file_that_is_told_is_the_one_that_is_written(turned_found, tmp_path):
+def test_the_file_that_is_told_is_the_one_that_is_written(turned_calibration, tmp_path):
     """Beside the result, where what loads a calibration looks for it; and said to programs."""
     folder = tmp_path / "calibration"
-    turned_found.save(folder)
-    own = turned_found.session.stations[0].camera
+    save(turned_calibration, folder)
+    own = turned_calibration.session.stations[0].camera
     saved = load(folder)
     (row,) = saved.document["cameras"]
     assert row["upside_down"] is True
     camera = load_camera(folder / "camera-camera.yaml")
     np.testing.assert_allclose(camera.parameters, own.parameters)
-    source = load_source(folder, turned_found.session.folder)
+    source = load_source(folder, turned_calibration.session.folder)
     for seen in source.cameras.values():
         np.testing.assert_allclose(seen.parameters, own.parameters)
 
 
 def test_new_photographs_are_taken_to_be_as_those_of_the_calibration_were(
-    turned, turned_found, tmp_path
+    turned_calibration, calibrated, tmp_path
 ):
     """As long as the file is the same; one that was set right is not turned again."""
-    turned_found.save(tmp_path / "calibration")
+    save(turned_calibration, tmp_path / "calibration")
     saved = load(tmp_path / "calibration")
-    session = load_session(turned)
-    own, upright = turned_found.session.stations[0].camera, session.stations[0].camera
+    session = calibrated.session
+    own, upright = turned_calibration.session.stations[0].camera, session.stations[0].camera
     right = turned_round(session, {"cameras/camera.yaml": own})
     for before, after in ((session, own), (right, own), (lens(session, (3.0, 3.0)), None)):
         for station, was in zip(_as_then(saved, before), before.stations, strict=True):

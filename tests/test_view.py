@@ -570,7 +570,7 @@ async function pulled(target, from, to) {
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the page was not opened in a browser")
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
     """One walks, pulls, takes back, pulls two joints to their places, and the machine snaps."""
     template, before = server._template, (session / "session.yaml").read_text()

@@ -274,11 +274,13 @@ class Settled(NamedTuple):
     """A session whose stations all stand where their photographs say, and the estimate of it that
     no known mistake explains better.
 
-    turned : cameras whose photographs are upside down, or may be.
+    stated : the estimate with the readings' noise as it is stated. turned : cameras whose
+    photographs are upside down, or may be.
     """
 
     seen: SeenSession
     turns: Turns
+    stated: Estimate
     richer: tuple[RicherModel, ...]
     turned: tuple[UpsideDown, ...]
 
@@ -309,18 +311,19 @@ def settle(
     richer = richer_models(seen.session, turns.measurements, stated)
     check_poses(seen.session, turns.measurements, stated, richer)
     check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
-    return Settled(seen, turns, richer, turned)
+    return Settled(seen, turns, stated, richer, turned)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
     """The calibration of a settled session."""
-    seen, turns, richer, turned = settled
+    seen, turns, stated, richer, turned = settled
     machine = seen.session.machine
     turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
     clock.lap("identify")
-    stated = as_stated(machine, turns.measurements, turns.estimate)
+    if turns is not settled.turns:
+        stated = as_stated(machine, turns.measurements, turns.estimate)
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
     found = _estimated(machine, turns, richer, method, seed, holdout, clock)
