@@ -7,7 +7,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.doubts import turning
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.estimate import UNIDENTIFIED_SIGMA, Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import charts
@@ -17,8 +17,6 @@ from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
-OPEN_POSE_SIGMA = 0.3
-"""m or rad; a place that is known no better is not told by the data."""
 MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
@@ -114,7 +112,7 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
     for value, spread in zip(values.tolist(), sigma.tolist(), strict=True):
         text = number(value * factor, decimals(spread * factor))
         known = f"{text} ± {brief(spread * factor)}" if spread else text
-        out.append("open" if spread > OPEN_POSE_SIGMA else known)
+        out.append("open" if spread > UNIDENTIFIED_SIGMA else known)
     return out
 
 
