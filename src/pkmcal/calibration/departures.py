@@ -47,9 +47,6 @@ from pkmcal.wording import amount
 
 FALSE_DEPARTURE_CHANCE = 0.005
 """Chance at which any departure at all is found in a session that has none."""
-LEAST_PROBE_NOISE = 0.1
-"""Part of a probe's stated noise that it may really have: new sessions state 20 um, and good probes
-repeat to 2."""
 MOST_TOOL_DEPARTURE = 1.0
 """Standard deviations by which a departure moves the tool, beyond which the result is refused."""
 
@@ -180,7 +177,7 @@ def model_violations(
         discrepancy_components(measurements, estimate),
         [declared(k).effect for k, _ in found],
         (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
-        LEAST_PROBE_NOISE if only_heights(estimate) else 1.0,
+        only_heights(estimate),
     )
     if discrepancy.scales and found:
         tests, found = tested(discrepancy.random)

@@ -24,10 +24,10 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import UNIDENTIFIED_SIGMA, Estimate, State
+from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import middle_pose, start_state
-from pkmcal.identify.unidentified import only_heights
+from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
@@ -256,7 +256,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             if tried is not None and _certain(
                 tried.state.T_mount[pair], tried.mount_covariance[pair]
             ):
-                change = _movement(tried.state.T_mount[pair], tried.mount_covariance[pair])
+                change = _movement(machine, tried.state.T_mount[pair], tried.mount_covariance[pair])
                 yield Doubt(
                     "board moved", pose_misfit(tried), station=int(s), before=place[0],
                     configuration=place[1], moved=change,
@@ -266,12 +266,12 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             yield from _camera_moved(machine, measurements, state, int(s), later, place)
 
 
-def _movement(T: Array, covariance: Array) -> Array:
+def _movement(machine: Machine, T: Array, covariance: Array) -> Array:
     """(omega, tau) (6,) from the one of two places (2, 4, 4) to the other, NaN where their
     covariances (2, 6, 6) do not determine it.
     """
-    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), 0.0)).max(axis=0)
-    return np.where(sigma < UNIDENTIFIED_SIGMA, pose_difference(T[1], T[0]), np.nan)
+    known = identified(machine, covariance).all(axis=0)
+    return np.where(known, pose_difference(T[1], T[0]), np.nan)
 
 
 def _certain(T: Array, covariance: Array) -> bool:
@@ -306,7 +306,7 @@ def _camera_moved(
         tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
     ):
         places = inverse(tried.state.T_camera_base[[s, -1]])
-        change = _movement(places, tried.station_covariance[[s, -1]])
+        change = _movement(machine, places, tried.station_covariance[[s, -1]])
         yield Doubt(
             "camera moved", pose_misfit(tried), station=s, before=place[0], configuration=place[1],
             moved=change,

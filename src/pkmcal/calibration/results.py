@@ -22,7 +22,8 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError, legible
 from pkmcal.files import check_writable, entries, json_text, json_value, resolved
 from pkmcal.geometry.rigid import inverse, skew
-from pkmcal.identify.estimate import UNIDENTIFIED_SIGMA, Estimate
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.load import Session, digests, session_digest
@@ -258,7 +259,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     for s, (name, file, number, response) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
-        known = _identified(covariance)
+        known = _sigma_where_identified(estimate, covariance)
         out.append(
             {
                 "name": name,
@@ -332,7 +333,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
             value, deviation = next(sizes)
             size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"
-        known = _identified(estimate.mount_covariance[m])
+        known = _sigma_where_identified(estimate, estimate.mount_covariance[m])
         out.append(
             {
                 "name": mount.name,
@@ -346,10 +347,11 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
     return out
 
 
-def _identified(covariance: Array) -> list[float | None]:
+def _sigma_where_identified(estimate: Estimate, covariance: Array) -> list[float | None]:
     """Standard deviations of a pose's six numbers, None where the data do not determine them."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    return [x if x < UNIDENTIFIED_SIGMA else None for x in sigma]
+    known = identified(estimate.machine, covariance)
+    return [x if sure else None for x, sure in zip(sigma, known, strict=True)]
 
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:

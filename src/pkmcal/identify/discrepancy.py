@@ -25,8 +25,10 @@ poses, needs no further evidence, for that something is left out is known alread
 contains it. It is sure, and worth naming, only where it explains the data better than noise alone
 does, and named violations, at the same level.
 
-A stated noise that is too large hides a discrepancy as well. Where what is stated is a guess, as a
-probe's, smaller ones are compared too, and then all of it has to be sure.
+Heights are one number of a configuration, and nearly all that a violation does to them a smooth
+surface does as well. So a violation takes part only where the data are surely better explained with
+it than by smooth functions and noise. A probe's noise is stated as a guess, and one that is too
+large hides the surface: smaller ones are compared too, and then all of it has to be sure.
 
 Covariance
 ----------
@@ -77,8 +79,10 @@ class DiscrepancyOptions:
     enlarged: float = 1.2
     # factors tried then, from what was stated to what is in use
     noise_factors: int = 5
-    # the same where smaller noise than what was stated is tried too
-    guessed_noise_factors: int = 9
+    # smallest part of a probe's stated noise that is tried, and how many factors: new sessions
+    # state 20 um, and good probes repeat to 2
+    least_probe_noise: float = 0.1
+    probe_noise_factors: int = 9
     # components in one session at most; more are a session with other troubles
     most: int = 4
     # scales tried for each component, geometrically between hardly visible and nothing else visible
@@ -170,15 +174,14 @@ def discrepancy_of(
     components: Sequence[Component],
     named: Sequence[Effect] = (),
     enlarged: tuple[float, float] = (1.0, 1.0),
-    least_pose_noise: float = 1.0,
+    heights: bool = False,
     options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
     named : effects of the model violations that were found otherwise, which take part with a scale
     each: what they explain better is theirs, and not in the result. enlarged : factors in use on
-    the stated noise of the readings and of the poses. least_pose_noise : the smallest factor on
-    that of the poses that may be true, 1 where the statement is to be trusted.
+    the stated noise of the readings and of the poses. heights : whether nothing else was measured.
     """
     rivals = [
         Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
@@ -191,29 +194,37 @@ def discrepancy_of(
     kind = (READING_ROWS_KIND, POSE_ROWS_KIND)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
-    for shares in _noise_shares(enlarged, least_pose_noise, options):
+    for shares in _noise_shares(enlarged, heights, options):
         other = _with_noise(assembled, shares)
         noises.append(_products(other, Information(other.problem, info.state), effects))
-    searches = [_Search(products, every, parts, options) for products in noises]
-    without = [_Search(products, rivals, parts[len(components) :], options) for products in noises]
-    for search in searches:
-        search.run(inflated)
-    for search in without:
-        search.run(None)
-    best = max(searches, key=lambda one: one.likelihood)
-    evidence = 2 * (best.likelihood - max(one.likelihood for one in without))
-    sure = evidence > options.least_ratio(len(every))
+    smooth_end = len(components)
+    best, smooth, named_only, noise_alone = (
+        max(
+            (_Search(products, *which, options, inflated) for products in noises),
+            key=lambda one: one.likelihood,
+        )
+        for which in (
+            (every, parts),
+            (components, parts[:smooth_end]),
+            (rivals, parts[smooth_end:]),
+            ((), ()),
+        )
+    )
+    beyond, against = options.least_ratio(len(every)), named_only
+    if heights and 2 * (best.likelihood - smooth.likelihood) <= beyond:
+        best, against = smooth, noise_alone
+    sure = 2 * (best.likelihood - against.likelihood) > beyond
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
-    if not scales or not (sure or inflated is not None or least_pose_noise == 1):
+    if not scales or (heights and inflated is None and not sure):
         return no_discrepancy(info)
     # scales by the noise that fits best, gains by the weights with which the estimate was made
-    smooth = ~np.any(best.root[ends[len(components)] :], axis=0)
-    root = best.root[: ends[len(components)], smooth]
-    gain = at_solution.gain[:, : ends[len(components)]] @ root
+    unnamed = ~np.any(best.root[ends[smooth_end] :], axis=0)
+    root = best.root[: ends[smooth_end], unnamed]
+    gain = at_solution.gain[:, : ends[smooth_end]] @ root
     mean, covariance = best.coefficients
-    mean, covariance = mean[smooth], covariance[np.ix_(smooth, smooth)]
+    mean, covariance = mean[unnamed], covariance[np.ix_(unnamed, unnamed)]
     spread = gain @ (np.outer(mean, mean) + covariance) @ gain.T
-    random = RandomEffects(tuple(effects[: len(components)]), root)
+    random = RandomEffects(tuple(effects[:smooth_end]), root)
     return Discrepancy(scales, spread, random, mean, covariance, sure)
 
 
@@ -229,15 +240,14 @@ class _Search:
         components: Sequence[Component],
         parts: Sequence[slice],
         options: DiscrepancyOptions,
+        enlarged: int | None,
     ) -> None:
+        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
         self.products, self.components, self.parts = products, components, parts
         self.options = options
         self.scales: list[ComponentScale] = []
         self.gain = 0.0
-        self.root = np.zeros((parts[-1].stop if parts else 0, 0))
-
-    def run(self, enlarged: int | None) -> None:
-        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        self.root = np.zeros((len(products.value), 0))
         beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
@@ -312,15 +322,15 @@ class _Search:
 
 
 def _noise_shares(
-    enlarged: tuple[float, float], least: float, options: DiscrepancyOptions
+    enlarged: tuple[float, float], heights: bool, options: DiscrepancyOptions
 ) -> list[tuple[float, float]]:
     """Factors on the noise in use, of readings and of poses, that are tried beside (1, 1): down to
-    what was stated, of the kind that is enlarged most; with ``least`` below 1 of both, of poses
-    down to that part of it.
+    what was stated, of the kind that is enlarged most; of heights both, the probe's further.
     """
     count = options.noise_factors
-    if least < 1:
-        low, count = (1 / enlarged[0], least / enlarged[1]), options.guessed_noise_factors
+    if heights:
+        low = 1 / enlarged[0], options.least_probe_noise / enlarged[1]
+        count = options.probe_noise_factors
     elif max(enlarged) > options.enlarged:
         most = int(np.argmax(enlarged))
         low = tuple(1 / enlarged[k] if k == most else 1.0 for k in range(2))

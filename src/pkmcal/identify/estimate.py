@@ -12,10 +12,6 @@ from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
-UNIDENTIFIED_SIGMA = 1.0
-"""m or rad; a place that is known no better is not known by the data: its value is a convention, or
-where the search began, and stands nowhere as a number."""
-
 
 @dataclass(frozen=True)
 class State:

@@ -12,7 +12,8 @@ from markupsafe import Markup
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.estimate import UNIDENTIFIED_SIGMA, Estimate
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
@@ -103,14 +104,16 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     """
     found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(found)[:3, 3] * 1e3
-    variance = np.diag(base_camera_covariance(found, covariance))[3:]
-    sigma = np.sqrt(np.maximum(variance, 0.0))  # rounding may leave less than none
+    covariance = base_camera_covariance(found, covariance)
+    known = identified(estimate.machine, covariance)
+    # rounding may leave less than none
+    sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
-        f"{number(v, decimals(1e3 * d))} ± {brief(1e3 * d)}" if d < UNIDENTIFIED_SIGMA else "open"
-        for v, d in zip(place.tolist(), sigma.tolist(), strict=True)
+        f"{number(v, decimals(d))} ± {brief(d)}" if sure else "open"
+        for v, d, sure in zip(place.tolist(), sigma.tolist(), known[3:], strict=True)
     )
-    return x, y, z, amount(turn, "rad") if turn < UNIDENTIFIED_SIGMA else "open"
+    return x, y, z, amount(turn, "rad") if known[:3].all() else "open"
 
 
 def _moved(rough: Array | None, found: Array) -> str:
