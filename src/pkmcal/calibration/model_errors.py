@@ -403,7 +403,8 @@ def bed_surface(
     variance = np.einsum("ni,ij,nj->n", by, discrepancy.covariance, by)
     return BedSurface(
         poses.configuration[felt],
-        *place.T,
+        place[:, 0],
+        place[:, 1],
         by @ discrepancy.mean,
         np.sqrt(np.maximum(variance, 0.0)),
     )
