@@ -11,12 +11,14 @@ import printers
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.model_errors import UNEVEN_BED, sentences
 from pkmcal.calibration.results import calibration_document
+from pkmcal.calibration.saved import load
+from pkmcal.calibration.source import load_source
 from pkmcal.check.check import check_session
 from pkmcal.files import json_value
 from pkmcal.geometry.rigid import pose
 from pkmcal.outcome import Level
 from pkmcal.printers.session import write_printer_session
-from pkmcal.report.calibration import report_of
+from pkmcal.report.calibration import report_of, save
 from pkmcal.session.moved import how_far
 
 SAYS = printers.Settings()
@@ -164,7 +166,7 @@ def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
         assert not [text for text in texts if re.search(r"\bnan\b|\binf\b", text)]
 
 
-def test_a_bed_stands_nowhere_along_itself(uneven):
+def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
     """Neither the bed's x, y and turn nor the tool's are numbers with a deviation."""
     _, _, found = uneven
     document = json_value(calibration_document(found))
@@ -172,6 +174,10 @@ def test_a_bed_stands_nowhere_along_itself(uneven):
     for one in (station, target):
         assert one["sigma_translation"][:2] == [None, None]
         assert one["sigma_rotation"][2] is None
+    save(found, tmp_path / "result")
+    loaded = load(tmp_path / "result").stations[0]
+    assert np.isinf(loaded.sigma_translation[:2]).all()
+    assert dict(load_source(tmp_path / "result").T_base_camera) == {}
     (places,) = [part for part in report_of(found).parts if part.name == "stations"]
     (row,) = places.tables[0].rows
     assert row.cells[:2] == ("open", "open")
