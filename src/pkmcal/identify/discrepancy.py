@@ -23,7 +23,7 @@ Where the estimate has enlarged the noise of readings or poses, the discrepancy 
 it: the two are compared by the restricted likelihood of both, and a component of the readings, or
 poses, needs no further evidence, for that something is left out is known already: the covariance
 contains it. It is sure, and worth naming, only where it explains the data better than noise alone
-does, and named violations, at the same level.
+does, at the same level.
 
 Heights are one number of a configuration, and nearly all that a violation does to them a smooth
 surface does as well. So a violation takes part only where the data are surely better explained with
@@ -210,10 +210,14 @@ def discrepancy_of(
             ((), ()),
         )
     )
-    beyond, against = options.least_ratio(len(every)), named_only
-    if heights and 2 * (best.likelihood - smooth.likelihood) <= beyond:
-        best, against = smooth, noise_alone
-    sure = 2 * (best.likelihood - against.likelihood) > beyond
+    beyond = options.least_ratio(len(every))
+    named_ratios = [one.ratio for one in best.scales if one.code.startswith(NAMED)]
+    evidence = 2 * (best.likelihood - noise_alone.likelihood) - sum(named_ratios)
+    if heights:
+        needless = 2 * (best.likelihood - smooth.likelihood) <= beyond
+        best, against = (smooth, noise_alone) if needless else (best, named_only)
+        evidence = 2 * (best.likelihood - against.likelihood)
+    sure = evidence > beyond
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
     if not scales or (heights and inflated is None and not sure):
         return no_discrepancy(info)
