@@ -309,7 +309,7 @@ def test_components_act_in_the_readings_units():
     assert len(set(codes)) == len(codes)
     for one in components:
         assert one.effect.count == len(one.roots[0])
-        if one.inflates == READING_ROWS_KIND:
+        if READING_ROWS_KIND in one.inflates:
             for root in one.roots:
                 size = np.sum((one.effect.readings @ root) ** 2, axis=-1)
                 assert np.mean(size) == pytest.approx(1, rel=0.2)

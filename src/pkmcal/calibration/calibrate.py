@@ -31,7 +31,7 @@ from pkmcal.calibration.doubts import (
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.model_errors import ModelError, sentences
+from pkmcal.calibration.model_errors import ModelError, explains_heights, sentences
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
@@ -52,6 +52,7 @@ from pkmcal.files import closest, resolved, shown
 from pkmcal.identify.bundle import as_ended, bundle
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import NO_RANDOM_EFFECTS, RandomEffects
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -443,15 +444,17 @@ def _judge(
         ]
         session = replace(session, stations=tuple(told))
     ended = as_ended(found.turns.measurements, found.estimate)
-    findings = _findings(found.turns.measurements, found.estimate, ended[1])
     departed: tuple[Departed, ...] = ()
     errors: tuple[ModelError, ...] = ()
+    uneven = NO_RANDOM_EFFECTS
+    without = found.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = found.turns
-        departed, errors, estimate = model_violations(
+        departed, errors, estimate, uneven = model_violations(
             session, turns.observation, turns.measurements, found.estimate, ended
         )
         found = found._replace(estimate=estimate)
+    findings = _findings(found.turns.measurements, without, ended[1], uneven)
     rejections = rejections_in_words(
         session,
         found.turns.measurements,
@@ -465,9 +468,10 @@ def _judge(
         findings,
         method,
         richer=found.richer,
+        explained=explains_heights(errors),
         doubts=(
             *scale_doubt(session, found.estimate),
-            *noise_doubt(session, found.estimate),
+            *(() if explains_heights(errors) else noise_doubt(session, found.estimate)),
             *found.turns.doubts,
             *chance_doubt(found.turns),
             *rejections.reasons,
@@ -481,7 +485,12 @@ def _judge(
             *(one.sentence for one in departed if not one.against),
             *sentences(errors),
             *outvoted(session, found.turns.measurements, found.estimate),
-            *noise_told(session, found.estimate, bool(departed or sentences(errors))),
+            *noise_told(
+                session,
+                found.estimate,
+                bool(departed or sentences(errors)),
+                explained=explains_heights(errors),
+            ),
             *lens_told(found.turns.cameras),
             *(one.sentence for one in (*turned, *found.turns.responses) if not one.sure),
         ),
@@ -513,10 +522,12 @@ def _judge(
     )
 
 
-def _findings(measurements: Measurements, estimate: Estimate, info: Information) -> Findings:
+def _findings(
+    measurements: Measurements, estimate: Estimate, info: Information, uneven: RandomEffects
+) -> Findings:
     """What the data tell of the machine, in words, and the paper's conditions.
 
-    info : of the estimate at its end.
+    info : of the estimate at its end. uneven : the model discrepancy, which bends a bed.
     """
     seen = seen_legs(
         measurements.edges,
@@ -532,7 +543,7 @@ def _findings(measurements: Measurements, estimate: Estimate, info: Information)
     if only_heights(estimate):
         from pkmcal.identify.bed import bed_of
 
-        bed = bed_of(measurements, estimate)
+        bed = bed_of(measurements, estimate, uneven)
     return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
 
 

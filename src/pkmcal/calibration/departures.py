@@ -17,7 +17,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.model_errors import (
+    UNEVEN_BED,
     ModelError,
+    bed_surface,
     discrepancy_components,
     model_errors,
     with_discrepancy,
@@ -26,7 +28,7 @@ from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import Information
-from pkmcal.identify.discrepancy import discrepancy_of, no_discrepancy
+from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
     MOST_DEPARTURES_SOUGHT,
@@ -98,12 +100,14 @@ class ModelViolations(NamedTuple):
     """What the data show that the model does not have.
 
     departures : violations that have a name, the surest first. errors : components of the model
-    discrepancy beside them. estimate : whose covariance contains the discrepancy.
+    discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
+    discrepancy's effects.
     """
 
     departures: tuple[Departed, ...]
     errors: tuple[ModelError, ...]
     estimate: Estimate
+    random: RandomEffects
 
 
 def model_violations(
@@ -168,23 +172,24 @@ def model_violations(
         return tests, [*found, *known]
 
     tests, found = tested(None)
-    discrepancy = no_discrepancy(ended[1])
-    if not only_heights(estimate):
-        scales = estimate.statistics.reading_scale, estimate.statistics.pose_scale
-        discrepancy = discrepancy_of(
-            *ended,
-            discrepancy_components(measurements, estimate),
-            [declared(k).effect for k, _ in found],
-            scales,
-        )
+    discrepancy = discrepancy_of(
+        *ended,
+        discrepancy_components(measurements, estimate),
+        [declared(k).effect for k, _ in found],
+        (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
+        only_heights(estimate),
+    )
     if discrepancy.scales and found:
         tests, found = tested(discrepancy.random)
     before = tool_of(session, estimate)
     estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
-    errors = model_errors(discrepancy, tool, before, units[0])
+    surface = None
+    if any(one.code == UNEVEN_BED for one in discrepancy.scales):
+        surface = bed_surface(measurements, estimate, discrepancy)
+    errors = model_errors(discrepancy, tool, before, units[0], surface)
     if not found:
-        return ModelViolations((), errors, estimate)
+        return ModelViolations((), errors, estimate, discrepancy.random)
     fits = tests.fitted([k for k, _ in found])
     last = len(fits) - len(tubes)
     fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
@@ -192,7 +197,7 @@ def model_violations(
         _departed(declared(k), score, fit, tool)
         for (k, score), fit in zip(found, fits, strict=True)
     )
-    return ModelViolations(departures, errors, estimate)
+    return ModelViolations(departures, errors, estimate, discrepancy.random)
 
 
 def tool_of(session: Session, estimate: Estimate) -> ToolError:

@@ -21,12 +21,13 @@ from pkmcal.calibration.gather import CameraRefinement
 from pkmcal.calibration.recognise import frozen_in
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
+from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import middle_pose, start_state
+from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
@@ -36,6 +37,7 @@ from pkmcal.mechanisms.reading_hypotheses import (
     reversed_motors,
 )
 from pkmcal.session.load import Session
+from pkmcal.session.moved import how_far
 from pkmcal.wording import SHOWN_UNITS, listed, number, ratio_in_per_cent
 
 SUSPECT_POSE_SCALE = 2.0
@@ -83,8 +85,8 @@ class Doubt:
     motor : column of the readings that counts the other way, or is exchanged with the other;
     constant : of the former, a reading and what it stands for together, m or rad. configuration :
     the first after a movement; before : the last before it. size : of the board, true over
-    written. moved : T (4, 4) of the board, or the station, from before to after. misfit : what is
-    left, in standard deviations.
+    written. moved : (6,) (omega, tau) of the board, or the station, from before to after, NaN where
+    the data do not determine it. misfit : what is left, in standard deviations.
     """
 
     kind: Literal["sign", "order", "board moved", "camera moved", "size"]
@@ -94,7 +96,7 @@ class Doubt:
     station: int = -1
     before: int = -1
     configuration: int = -1
-    moved: Array = field(default_factory=lambda: np.eye(4))
+    moved: Array = field(default_factory=lambda: np.zeros(6))
     size: float = 1.0
     constant: float = 0.0
 
@@ -149,8 +151,10 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
     """
     before = pose_misfit(estimate)
     found: Doubt | None = None
+    # heights do not know where a tracker stands: whether it moved, score tests say
+    whole = () if only_heights(estimate) else _movements(machine, measurements, estimate)
     for doubt in chain(
-        _movements(machine, measurements, estimate),
+        whole,
         _other_readings(machine, measurements),
         _sizes(machine, measurements, estimate),
     ):
@@ -257,7 +261,7 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             if tried is not None and _certain(
                 tried.state.T_mount[pair], tried.mount_covariance[pair]
             ):
-                change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
+                change = _movement(machine, tried.state.T_mount[pair], tried.mount_covariance[pair])
                 yield Doubt(
                     "board moved", pose_misfit(tried), station=int(s), before=place[0],
                     configuration=place[1], moved=change,
@@ -265,6 +269,14 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             if len(measurements.edges):
                 continue  # its edges would have to move with the camera
             yield from _camera_moved(machine, measurements, state, int(s), later, place)
+
+
+def _movement(machine: Machine, T: Array, covariance: Array) -> Array:
+    """(omega, tau) (6,) from the one of two places (2, 4, 4) to the other, NaN where their
+    covariances (2, 6, 6) do not determine it.
+    """
+    known = identified(machine, covariance).all(axis=0)
+    return np.where(known, pose_difference(T[1], T[0]), np.nan)
 
 
 def _certain(T: Array, covariance: Array) -> bool:
@@ -298,7 +310,8 @@ def _camera_moved(
     if tried is not None and _certain(
         tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
     ):
-        change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
+        places = inverse(tried.state.T_camera_base[[s, -1]])
+        change = _movement(machine, places, tried.station_covariance[[s, -1]])
         yield Doubt(
             "camera moved", pose_misfit(tried), station=s, before=place[0], configuration=place[1],
             moved=change,
@@ -457,11 +470,16 @@ def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> tuple[str, ...]:
+def noise_told(
+    session: Session, estimate: Estimate, departed: bool = False, *, explained: bool = False
+) -> tuple[str, ...]:
     """Sentences where the data do not allow a noise that session.yaml states.
 
-    departed : whether something was found that makes readings scatter.
+    departed : whether something was found that makes readings scatter. explained : whether an
+    uneven bed is what makes heights scatter, and not their noise.
     """
+    if explained:
+        return ()
     s, out = estimate.statistics, list[str]()
     units, file = set(session.machine.joint_units), "session.yaml"
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
@@ -586,10 +604,11 @@ def _lengths(value: float, units: set[str]) -> str:
     return " or ".join(each[unit] for unit in ("m", "rad") if unit in units)
 
 
-def _error(session: Session, doubt: Doubt, before: float) -> InputError:
-    """The mistake in words; before : misfit of the poses with it, in standard deviations."""
+def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
+    """The mistake in words; misfit_before : misfit of the poses with it, in standard deviations."""
     left = f"with that, the poses fit {doubt.misfit:.1f} times their noise"
-    found = f"poses that the readings miss by {before:.{int(before < 10)}f} times their noise"
+    times = f"{misfit_before:.{int(misfit_before < 10)}f}"
+    found = f"poses that the readings miss by {times} times their noise"
     joints = session.document["joints"]
     if doubt.kind == "sign":
         name = joints["columns"][doubt.motor]
@@ -631,13 +650,11 @@ def _error(session: Session, doubt: Doubt, before: float) -> InputError:
         )
     what = "the board was moved on the platform" if doubt.kind == "board moved" else \
         "the camera was moved"  # fmt: skip
-    turn = np.rad2deg(np.linalg.norm(rotation_vector(doubt.moved[:3, :3])))
-    shift = np.linalg.norm(doubt.moved[:3, 3]) * 1e3
     before, after = (session.configurations[k] for k in (doubt.before, doubt.configuration))
     return InputError(
         f"{what} between configuration {before} and {after}",
         where=f"session.yaml, stations.{session.station_names[doubt.station]}",
-        found=f"{shift:.1f} mm and {turn:.2f} degrees; {left}",
+        found=f"{how_far(doubt.moved).removeprefix(', ')}; {left}",
         expected="a board screwed to the platform, and a camera that stands still",
         next_step=f"Calibrate with the configurations before {after}, or with those from it on",
     )

@@ -2,19 +2,21 @@
 
 Errors of the readings over the workspace (legs that give way under load, commanded axes that
 droop), with the motors' last steps (backlash, lag), with time (warmth); a base that moves with the
-platform; stations that creep; legs that are no straight cylinders. Each is one entry of
+platform; stations that creep; legs that are no straight cylinders; a bed that is not flat. Heights
+know only the last: what else varies over the workspace lifts the tool as an uneven bed does. Each
+is one entry of
 :func:`discrepancy_components`; :mod:`pkmcal.identify.discrepancy` says how their scales are found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.aside import points_of_poses
 from pkmcal.geometry.cylinders import contour_point, line_through
 from pkmcal.geometry.rigid import apply, dot, skew
@@ -22,9 +24,10 @@ from pkmcal.identify.covariance import data_share, machine_covariance
 from pkmcal.identify.discrepancy import Component, Discrepancy
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.kinds import READING_ROWS_KIND
+from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.tool import ToolError
+from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Effect, Measurements
 from pkmcal.wording import amount, joined
@@ -34,9 +37,30 @@ CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
 the session's poses from their middle; the last one leaves functions that are nearly straight."""
 MOST_FUNCTIONS = 40
 """Smooth functions of the pose: in six dimensions straight and square ones are 27."""
+LENGTH_STEP = 1.5
+"""Factor from one correlation length of the bed to the next, from the points' mean distance, below
+which unevenness is noise, to LONGEST_BED_LENGTH, from which on it is nearly a parabola."""
+LONGEST_BED_LENGTH = 4.0
+"""In the root mean square distance of the points from their middle."""
 LANDMARK_POSES = 200
 """Poses, evenly of all, by which the functions are made where there are more."""
 PLACES_ALONG_EDGE_SPAN = 9
+
+
+@dataclass(frozen=True)
+class BedSurface:
+    """The unevenness of a bed at the points that were probed, all (n,): configuration, x and y of
+    the tool (m, base frame), height (m, up) with the mean taken off, and its standard deviation.
+
+    Where the machine's own parameters bend the bed as well, the height is what the surface's
+    smoothness makes of the rest, and the standard deviation says how little that is.
+    """
+
+    configuration: Integers
+    x: Array
+    y: Array
+    height: Array
+    sigma: Array
 
 
 @dataclass(frozen=True)
@@ -47,7 +71,8 @@ class ModelError:
     unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
     standard deviation of the platform's position, root mean square over the session's poses, with
     all components and without any. sure : whether it is named, or only contained in the covariance,
-    for larger noise of the readings or poses explains the data as well.
+    for larger noise of the readings or poses explains the data as well. length : correlation
+    length, m, and surface : the map, of a bed; None of all else.
     """
 
     code: str
@@ -57,6 +82,8 @@ class ModelError:
     tool_before: float
     unit: str
     sure: bool
+    length: float | None = None
+    surface: BedSurface | None = None
 
     def document(self) -> dict[str, Any]:
         """For programs."""
@@ -67,9 +94,13 @@ class ModelError:
             "sure": self.sure,
             "sigma_tool": self.tool,
             "sigma_tool_before": self.tool_before,
+            "length": self.length,
+            "surface": self.surface and asdict(self.surface),
         }
 
 
+UNEVEN_BED = "bed.surface"
+"""Code of the component that heights have."""
 SUBJECTS = {
     "readings.workspace": (
         "in the readings that vary smoothly over the workspace",
@@ -100,14 +131,19 @@ SUBJECTS = {
 
 
 def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
-    """One for the verdict, of all components, the largest by evidence first; none without sure
-    ones.
+    """For the verdict: one of the bed, one of all other components, the largest by evidence first;
+    none without sure ones.
     """
     if not any(one.sure for one in errors):
         return ()
+    beds = tuple(uneven_bed(one) for one in errors if one.code == UNEVEN_BED)
+    errors = tuple(one for one in errors if one.code != UNEVEN_BED)
+    if not errors:
+        return beds
     first = errors[0]
     parts = [f"{amount(one.scale, one.unit)} {SUBJECTS[one.code][0]}" for one in errors]
     return (
+        *beds,
         f"The model leaves out errors of {joined(parts)} (standard deviations). Those of the"
         " result contain what they may have done: the tool's is"
         f" {amount(first.tool, 'm')} in place of {amount(first.tool_before, 'm')}."
@@ -115,10 +151,58 @@ def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
     )
 
 
+def explains_heights(errors: tuple[ModelError, ...]) -> bool:
+    """Whether an uneven bed surely explains why heights scatter."""
+    return any(one.code == UNEVEN_BED and one.sure for one in errors)
+
+
+def uneven_bed(error: ModelError) -> str:
+    """The bed's unevenness in words."""
+    return (
+        f"The bed, or what the model leaves out, is uneven by {amount(error.scale, error.unit)}"
+        f" (standard deviation), varying smoothly over some {amount(error.length or 0.0, 'm')}."
+        " Standard deviations contain what it may have done to the result; its map is in the"
+        " report. Let the firmware probe its mesh once the new values are in."
+    )
+
+
 def discrepancy_components(measurements: Measurements, estimate: Estimate) -> list[Component]:
     """All components that a session can have."""
+    bed = _of_bed(measurements, estimate)
+    if only_heights(estimate):
+        return bed
     return [*_of_readings(measurements, estimate), *_of_stations(measurements, estimate),
-            *_of_legs(measurements, estimate)]  # fmt: skip
+            *_of_legs(measurements, estimate), *bed]  # fmt: skip
+
+
+def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
+    """A bed that is not flat, where heights were felt: a Gaussian process over x and y."""
+    poses = measurements.poses
+    felt = height_rows(measurements)
+    if not felt.size:
+        return []
+    xy = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
+    xy = xy - xy.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum(xy**2, axis=1))))
+    # n points all over a disc of that size are about so far from their neighbours
+    places = len(np.unique(xy.round(6), axis=0))
+    apart = np.sqrt(2 * np.pi / places)
+    count = int(np.ceil(np.log(LONGEST_BED_LENGTH / apart) / np.log(LENGTH_STEP)))
+    lengths = apart * LENGTH_STEP ** np.arange(max(count, 1))
+    basis, roots = smooth_functions(xy, lengths.tolist(), LANDMARK_POSES)
+    if not roots:
+        return []
+    effect = np.zeros((len(poses), 6, basis.shape[1]))
+    effect[felt, 5] = basis
+    either = READING_ROWS_KIND, POSE_ROWS_KIND  # a height is as much its readings' as its probe's
+    in_metres = tuple((size * lengths).tolist())
+    return [Component(UNEVEN_BED, Effect(poses=effect), roots, either, in_metres)]
+
+
+def height_rows(measurements: Measurements) -> Integers:
+    """Rows of the measured poses that are heights: of their six numbers only z was measured."""
+    known = np.any(measurements.poses.whiten != 0, axis=-2)
+    return np.flatnonzero(known[:, 5] & ~known[:, :5].any(axis=1))
 
 
 def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
@@ -141,7 +225,7 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
         "readings.workspace",
         Effect(readings=by_motor(basis)),
         tuple(np.kron(root, each) for root in roots),
-        READING_ROWS_KIND,
+        (READING_ROWS_KIND,),
     )
     step = np.diff(joints, axis=0, prepend=joints[:1])
     size = float(np.sqrt(np.mean(step[used] ** 2)))
@@ -153,20 +237,26 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
             "readings.step",
             Effect(readings=np.concatenate([alone, together], axis=2)),
             (np.eye(2 * m + 2) / 2,),
-            READING_ROWS_KIND,
+            (READING_ROWS_KIND,),
         )
     time = functions_of_time(n)[used]
     yield Component(
-        "readings.time", Effect(readings=by_motor(time)), (np.eye(2 * m),), READING_ROWS_KIND
+        "readings.time", Effect(readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS_KIND,)
     )
 
 
-def smooth_functions(points: Array) -> tuple[Array, tuple[Array, ...]]:
+def smooth_functions(
+    points: Array,
+    lengths: Sequence[float] = CORRELATION_LENGTHS,
+    most: int = MOST_FUNCTIONS,
+) -> tuple[Array, tuple[Array, ...]]:
     """Functions (K, p) of places (K, d) with a mean of zero and orthonormal over the places, and
     for each correlation length the root (p, p) of their coefficients' covariance, of functions
     with a mean square of one.
 
-    Principal functions of a squared exponential kernel of the shortest length, Nyström's way.
+    lengths : correlation lengths, the shortest first, in the root mean square distance of the
+    places from their middle. most : functions at most. Principal functions of a squared exponential
+    kernel of the shortest length, Nyström's way.
     """
     size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
     points = points / (size or 1.0)
@@ -177,21 +267,21 @@ def smooth_functions(points: Array) -> tuple[Array, tuple[Array, ...]]:
         return np.exp(-squares / (2 * length**2))
 
     middle = np.eye(len(marks)) - 1 / len(marks)
-    values, vectors = np.linalg.eigh(middle @ kernel(marks, CORRELATION_LENGTHS[0]) @ middle)
-    order = np.argsort(-values)[:MOST_FUNCTIONS]
+    values, vectors = np.linalg.eigh(middle @ kernel(marks, lengths[0]) @ middle)
+    order = np.argsort(-values)[:most]
     order = order[values[order] > 1e-6 * max(float(values.max()), 1e-6)]
     turn = middle @ vectors[:, order] / np.sqrt(values[order])
     if not order.size:
         return np.zeros((len(points), 0)), ()
-    functions = kernel(points, CORRELATION_LENGTHS[0]) @ turn
+    functions = kernel(points, lengths[0]) @ turn
     functions = functions - functions.mean(axis=0)
     q, r = np.linalg.qr(functions)
     scale = np.sqrt(len(points))
-    at_marks = (kernel(marks, CORRELATION_LENGTHS[0]) @ turn) @ np.linalg.inv(r) * scale
+    at_marks = (kernel(marks, lengths[0]) @ turn) @ np.linalg.inv(r) * scale
     at_marks = at_marks - at_marks.mean(axis=0)
     back = np.linalg.pinv(at_marks)
     roots: list[Array] = []
-    for length in CORRELATION_LENGTHS:
+    for length in lengths:
         spread = back @ (middle @ kernel(marks, length) @ middle) @ back.T
         value, way = np.linalg.eigh(spread)
         value = np.maximum(value, 0.0)
@@ -299,12 +389,38 @@ def with_discrepancy(
     )
 
 
+def bed_surface(
+    measurements: Measurements, estimate: Estimate, discrepancy: Discrepancy
+) -> BedSurface:
+    """The bed's map, by the discrepancy's coefficients given the data."""
+    felt, poses = height_rows(measurements), measurements.poses
+    heights = [
+        np.zeros((len(felt), effect.count)) if effect.poses is None else effect.poses[felt, 5]
+        for effect in discrepancy.random.effects
+    ]
+    by = np.concatenate(heights, axis=1) @ discrepancy.random.root
+    place = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
+    variance = np.einsum("ni,ij,nj->n", by, discrepancy.covariance, by)
+    return BedSurface(
+        poses.configuration[felt],
+        place[:, 0],
+        place[:, 1],
+        by @ discrepancy.mean,
+        np.sqrt(np.maximum(variance, 0.0)),
+    )
+
+
 def model_errors(
-    discrepancy: Discrepancy, tool: ToolError, before: ToolError, unit: str
+    discrepancy: Discrepancy,
+    tool: ToolError,
+    before: ToolError,
+    unit: str,
+    surface: BedSurface | None,
 ) -> tuple[ModelError, ...]:
     """The components found, with what they make of the tool's standard deviation.
 
-    tool, before : with the discrepancy and without. unit : of the readings.
+    tool, before : with the discrepancy and without. unit : of the readings. surface : of the bed,
+    where it is among them.
     """
     with_, without = (float(np.sqrt(np.nanmean(x.position**2))) for x in (tool, before))
     return tuple(
@@ -316,6 +432,8 @@ def model_errors(
             without,
             unit if one.code.startswith("readings") else "m",
             discrepancy.sure,
+            one.length,
+            surface if one.code == UNEVEN_BED else None,
         )
         for one in discrepancy.scales
     )

@@ -23,6 +23,7 @@ from pkmcal.errors import InputError, legible
 from pkmcal.files import check_writable, entries, json_text, json_value, resolved
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.load import Session, digests, session_digest
@@ -52,7 +53,8 @@ CALIBRATION_CONVENTIONS = (
     "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
     " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not"
     " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
-    " of its outer frame."
+    " of its outer frame. Where sigma is null, the data do not determine the value: it is a"
+    " convention."
 )
 EDGE_COLUMNS = (
     "station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt", "coarse",
@@ -65,8 +67,6 @@ POSE_COLUMNS = (
 """Of a row in residuals.poses, the last six whitened together, in standard deviations."""
 EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
 EDGE_RESIDUALS = slice(EDGE_COLUMNS.index("shift"), EDGE_COLUMNS.index("tilt") + 1)
-UNTOLD_TARGET_SIGMA = 1.0
-"""m or rad; a target's place that is known no better is not told by the data."""
 
 
 def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
@@ -259,7 +259,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     for s, (name, file, number, response) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
-        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        known = _sigma_where_identified(estimate, covariance)
         out.append(
             {
                 "name": name,
@@ -267,8 +267,8 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
                 "response": response,
                 "binning": None if response is None else calibration.observation.binning[s],
                 "T_base_camera": inverse(T_camera_base),
-                "sigma_rotation": sigma[:3],
-                "sigma_translation": sigma[3:],
+                "sigma_rotation": known[:3],
+                "sigma_translation": known[3:],
                 "photographs": number,
                 **_focal_scale(calibration, s),
             }
@@ -333,8 +333,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
             value, deviation = next(sizes)
             size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"
-        sigma = np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0.0))
-        known = [float(x) if x < UNTOLD_TARGET_SIGMA else None for x in sigma]
+        known = _sigma_where_identified(estimate, estimate.mount_covariance[m])
         out.append(
             {
                 "name": mount.name,
@@ -346,6 +345,13 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _sigma_where_identified(estimate: Estimate, covariance: Array) -> list[float | None]:
+    """Standard deviations of a pose's six numbers, None where the data do not determine them."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    known = identified(estimate.machine, covariance)
+    return [x if sure else None for x, sure in zip(sigma, known, strict=True)]
 
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:

@@ -39,7 +39,8 @@ SAVED_NUMBER_ROUNDING = 1e-9
 """Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
 change by hand a millionth."""
 
-Row3 = tuple[float, float, float]
+Sigma3 = tuple[float | None, float | None, float | None]
+"""None where the data do not determine the number."""
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Factor = Annotated[float, Field(gt=0)]
@@ -49,7 +50,8 @@ Factor = Annotated[float, Field(gt=0)]
 class SavedStation:
     """One camera's pose as found: T_base_camera (4, 4), m.
 
-    sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes.
+    sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes; infinite
+    where the data do not determine the number.
     """
 
     name: str
@@ -200,8 +202,8 @@ class _Station(_Part):
     name: str
     camera: str
     T_base_camera: Matrix4
-    sigma_rotation: Row3
-    sigma_translation: Row3
+    sigma_rotation: Sigma3
+    sigma_translation: Sigma3
     response: Response | None = None
     binning: Annotated[int, Field(ge=1)] | None = None
     focal_scale: Factor = 1.0
@@ -364,8 +366,8 @@ def load(source: Path | str) -> SavedCalibration:
                 station.name,
                 station.camera,
                 np.array(station.T_base_camera),
-                np.array(station.sigma_rotation),
-                np.array(station.sigma_translation),
+                _deviations(station.sigma_rotation),
+                _deviations(station.sigma_translation),
             )
             for station in saved.stations
         ),
@@ -375,6 +377,11 @@ def load(source: Path | str) -> SavedCalibration:
         T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
         document=document.data,
     )
+
+
+def _deviations(values: Sigma3) -> Array:
+    """Standard deviations (3,), infinite where the file has none."""
+    return np.array([np.inf if value is None else value for value in values])
 
 
 def _mechanism(saved: _Saved) -> MechanismDocument:

@@ -157,14 +157,15 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
         for name, file in files.items()
         if (found := _camera_file(folder, file, _session_folder(saved, session))) is not None
     }
+    sigma = {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
+    # where a bed is along itself, heights leave to convention: that is no place to export
+    placed = [s for s in saved.stations if np.isfinite(sigma[s.name]).all()]
     return MachineSource(
         machine=saved.machine,
         sigma=saved.sigma,
         cameras=MappingProxyType(cameras),
-        T_base_camera=MappingProxyType({s.name: s.T_base_camera for s in saved.stations}),
-        sigma_camera=MappingProxyType(
-            {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
-        ),
+        T_base_camera=MappingProxyType({s.name: s.T_base_camera for s in placed}),
+        sigma_camera=MappingProxyType({s.name: sigma[s.name] for s in placed}),
         headline=saved.verdict.headline,
         usable=saved.verdict.usable,
         origin=resolved(folder).name,

@@ -82,6 +82,11 @@ class LensDeparture(NamedTuple):
     says: Callable[[Array, Array], str]
 
 
+def _pixels(value: float, sigma: float) -> str:
+    """A length in an image, in words where the data do not determine it."""
+    return f"{value:+.1f} ± {sigma:.1f} px" if np.isfinite(sigma) else "an unknown number of pixels"
+
+
 @dataclass(frozen=True)
 class Camera(ABC):
     """Intrinsics of one central camera.
@@ -208,8 +213,8 @@ class Camera(ABC):
                 eye[:, 2:4],
                 USUAL_CENTRE * self.image_size[0],
                 lambda v, s: (
-                    f"a centre fits that is {v[0]:+.1f} ± {s[0]:.1f} px in x and"
-                    f" {v[1]:+.1f} ± {s[1]:.1f} px in y beside its own"
+                    f"a centre fits that is {_pixels(v[0], s[0])} in x and {_pixels(v[1], s[1])} in"
+                    " y beside its own"
                 ),
             ),
             LensDeparture(

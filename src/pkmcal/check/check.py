@@ -21,9 +21,11 @@ from pkmcal.boards.stations import board_of, station_board
 from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.calibration.byhand import Localization, localize
 from pkmcal.calibration.calibrate import CalibrationProgress, Clock, Settled, settle
+from pkmcal.calibration.departures import model_violations
 from pkmcal.calibration.doubts import turning
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import SeenSession
+from pkmcal.calibration.model_errors import explains_heights, sentences
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
     board_images,
@@ -38,6 +40,7 @@ from pkmcal.check.look import Look, StationLook
 from pkmcal.check.words import board_findings, joint_findings, station_findings
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
@@ -482,6 +485,30 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
 
 def _verdict_of_poses(settled: Settled) -> list[Finding]:
     """Whether the mechanism, its parameters adjusted, explains the poses that were measured."""
+    if settled.seen.session.heights_alone:
+        return _verdict_of_heights(settled)
+    return _unexplained_poses(settled)
+
+
+def _verdict_of_heights(settled: Settled) -> list[Finding]:
+    """The model violations and the uneven bed that `calibrate` will find."""
+    turns = settled.turns
+    found = model_violations(
+        settled.seen.session,
+        turns.observation,
+        turns.measurements,
+        turns.estimate,
+        as_ended(turns.measurements, turns.estimate),
+    )
+    return [
+        *(doubtful(one.sentence) for one in found.departures),
+        *(doubtful(text) for text in sentences(found.errors)),
+        *([] if explains_heights(found.errors) else _unexplained_poses(settled)),
+    ]
+
+
+def _unexplained_poses(settled: Settled) -> list[Finding]:
+    """A finding where measured poses scatter more than their noise."""
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []

@@ -335,7 +335,7 @@ def prior_rows(
         ("shading", u.columns("shading"), np.linalg.cholesky(shaded)),
         ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
         ("size", u.columns("sizes"), np.ones(u.n_sizes)),
-        ("mount", places, np.full(len(places), _size(machine) if len(places) else 1.0)),
+        ("mount", places, np.full(len(places), machine_size(machine) if len(places) else 1.0)),
         ("level", tilts, np.full(len(tilts), LEVEL_SIGMA)),
     )
     rows: list[Array] = []
@@ -353,7 +353,7 @@ def prior_rows(
     return prior, np.zeros(len(prior)), tuple(kinds)
 
 
-def _size(machine: Machine) -> float:
+def machine_size(machine: Machine) -> float:
     """How large a machine is, m: from the platform to the farthest joint on the base, and from the
     tool to the farthest on the platform.
     """

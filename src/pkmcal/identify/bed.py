@@ -2,24 +2,27 @@
 
 What the mechanism file holds because a firmware cannot hold it otherwise, towers that lean and
 motors that go further than told, bends the bed all the same. So deviations are those of a wider
-model, in which all that has a tolerance is free: its best values say how far the machine as
-estimated is off, as far as the heights show that, and its covariance what they leave open.
+model, in which all that has a tolerance is free and the bed is as uneven as the data show it: its
+best values say how far the machine as estimated is off, as far as the heights show that, and its
+covariance what they leave open.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.bundle import as_ended
-from pkmcal.identify.covariance import Information, reduced_rows
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.solver.elimination import rows_on_shared
+from pkmcal.solver.elimination import divisions, rows_on_shared
+from pkmcal.solver.ranks import column_space
 
 PLACES_OVER_BED = 60
 """Places all over the bed: where nobody probed counts as well."""
@@ -80,8 +83,8 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
     return poses, by, _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
 
 
-def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
-    """The bed of an estimate from heights alone."""
+def bed_of(measurements: Measurements, estimate: Estimate, uneven: RandomEffects) -> Bed:
+    """The bed of an estimate from heights alone; uneven : the model discrepancy found."""
     machine = estimate.machine
     poses, by, height = _bent(estimate)
     xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
@@ -94,7 +97,7 @@ def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
     drawing = _drawing_root(machine, by)
-    off, root = _wider(measurements, estimate, drawing)
+    off, root = _wider(measurements, estimate, drawing, uneven)
     return Bed(
         radius=float(np.linalg.norm(xy, axis=1).max()),
         sigma=_deviation(height, off, root, len(xy)),
@@ -151,21 +154,55 @@ def _drawing_root(machine: Machine, by: Array) -> Array:
     )
 
 
-def _wider(measurements: Measurements, estimate: Estimate, drawing: Array) -> tuple[Array, Array]:
-    """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary: how far
-    the best values are from the estimate's (P,), and a root (P, m) of their covariance.
+def _wider(
+    measurements: Measurements, estimate: Estimate, drawing: Array, uneven: RandomEffects
+) -> tuple[Array, Array]:
+    """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary, and the
+    bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P, m) of
+    their covariance.
     """
-    _, info = as_ended(measurements, estimate)
-    rows, left = reduced_rows(Information(*info.problem.opened(info.state)), ("machine",))
+    rows, left = _rows_beside(measurements, estimate, uneven)
     table = estimate.machine.parameters
-    at = np.zeros(drawing.shape[1])  # the estimate, in the drawing's deviations
+    n, m = drawing.shape
+    at = np.zeros(m + rows.shape[1] - n)  # the estimate, in the drawing's deviations; a flat bed
     free = table.to_free(estimate.machine.values) / table.tolerances_free()
     at[: free.size] = free
-    both = np.concatenate([rows @ drawing, np.eye(len(at))])
+    both = np.concatenate(
+        [np.concatenate([rows[:, :n] @ drawing, rows[:, n:]], axis=1), np.eye(len(at))]
+    )
     _, s, vt = np.linalg.svd(both, full_matrices=False)
     half = vt.T / s
     best = -half @ (half.T @ (both.T @ np.concatenate([left, at])))
-    return drawing @ best, drawing @ half
+    return drawing @ best[:m], drawing @ half[:m]
+
+
+def _rows_beside(
+    measurements: Measurements, estimate: Estimate, uneven: RandomEffects
+) -> tuple[Array, Array]:
+    """What the heights say of all parameters and of the l random effects, these in their prior
+    deviations: rows (r, P + l) and residuals (r,). Poses, the bed's place and all other unknowns
+    are eliminated; nothing that is known beforehand of the parameters is in them.
+    """
+    assembled, info = as_ended(measurements, estimate)
+    problem, state = info.problem.opened(info.state)
+    columns = columns_of(replace(assembled, problem=problem), state, uneven.effects)
+    machine, count = problem.unknowns.columns("machine"), problem.unknowns.count
+    parts: list[tuple[Array, Array]] = []
+    for cut, piece in zip(
+        divisions(*problem.extent), Information(problem, state).pieces(), strict=True
+    ):
+        linear = piece.linear
+        own, value = eliminated_beside(linear, columns(cut, linear) @ uneven.root)
+        parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))
+        known = ~linear.shared_by[:, machine].any(axis=1)
+        if not cut.start:
+            prior = np.pad(linear.shared_by[known], ((0, 0), (0, uneven.root.shape[1])))
+            parts.append((prior, linear.shared_value[0][known]))
+    rows, left = (np.concatenate(part) for part in zip(*parts, strict=True))
+    used = np.append(machine, np.arange(count, rows.shape[1]))
+    q = column_space(np.delete(rows, used, axis=1))
+    rows = rows[:, used]
+    return rows - q @ (q.T @ rows), left - q @ (q.T @ left)
 
 
 def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) -> float | None:

@@ -25,6 +25,11 @@ poses, needs no further evidence, for that something is left out is known alread
 contains it. It is sure, and worth naming, only where it explains the data better than noise alone
 does, at the same level.
 
+Heights are one number of a configuration, and nearly all that a violation does to them a smooth
+surface does as well. So a violation takes part only where the data are surely better explained with
+it than by smooth functions and noise. A probe's noise is stated as a guess, and one that is too
+large hides the surface: smaller ones are compared too, and then all of it has to be sure.
+
 Covariance
 ----------
 The discrepancy has moved the unknowns by ``J^+ G w``. With m and C the mean and the covariance of w
@@ -47,7 +52,13 @@ from pkmcal.arrays import Array
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
-from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside, shared_basis
+from pkmcal.identify.score import (
+    NO_RANDOM_EFFECTS,
+    RandomEffects,
+    columns_of,
+    eliminated_beside,
+    shared_basis,
+)
 from pkmcal.measurements import Effect
 from pkmcal.solver.elimination import divisions
 
@@ -68,6 +79,10 @@ class DiscrepancyOptions:
     enlarged: float = 1.2
     # factors tried then, from what was stated to what is in use
     noise_factors: int = 5
+    # smallest part of a probe's stated noise that is tried, and how many factors: new sessions
+    # state 20 um, and good probes repeat to 2
+    least_probe_noise: float = 0.1
+    probe_noise_factors: int = 9
     # components in one session at most; more are a session with other troubles
     most: int = 4
     # scales tried for each component, geometrically between hardly visible and nothing else visible
@@ -90,25 +105,29 @@ class Component:
 
     code : for programs. effect : what the k functions do to the measurements. roots : the L (k, l)
     to choose from, of functions with a mean square of one over the session's configurations.
-    inflates : kind of rows whose noise such an error enlarges, as READING_ROWS_KIND.
+    inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS_KIND. lengths : of
+    the same number as roots, m, the correlation length of each; empty where there is none.
     """
 
     code: str
     effect: Effect
     roots: tuple[Array, ...]
-    inflates: int | None = None
+    inflates: tuple[int, ...] = ()
+    lengths: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class ComponentScale:
     """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
-    logarithm of the likelihood ratio against no such component.
+    logarithm of the likelihood ratio against no such component. length : correlation length of the
+    likeliest root, m; None where the component has none.
     """
 
     code: str
     scale: float
     ratio: float
     root: Array
+    length: float | None = None
 
 
 @dataclass(frozen=True)
@@ -116,13 +135,16 @@ class Discrepancy:
     """What the data show of the components.
 
     scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : their effects. sure : whether they explain the data better than larger
-    noise alone does.
+    shared unknowns. random : their effects, with the root (c, l) of their prior covariance. mean,
+    covariance : (l,) and (l, l) of the coefficients of that root's columns given the data. sure :
+    whether they explain the data better than larger noise alone does.
     """
 
     scales: tuple[ComponentScale, ...]
     shared: Array
     random: RandomEffects
+    mean: Array
+    covariance: Array
     sure: bool = False
 
 
@@ -143,7 +165,7 @@ class _Products:
 def no_discrepancy(info: Information) -> Discrepancy:
     """None at all."""
     na = info.problem.unknowns.count
-    return Discrepancy((), np.zeros((na, na)), RandomEffects((), np.zeros((0, 0))))
+    return Discrepancy((), np.zeros((na, na)), NO_RANDOM_EFFECTS, np.zeros(0), np.zeros((0, 0)))
 
 
 def discrepancy_of(
@@ -152,13 +174,14 @@ def discrepancy_of(
     components: Sequence[Component],
     named: Sequence[Effect] = (),
     enlarged: tuple[float, float] = (1.0, 1.0),
+    heights: bool = False,
     options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
     named : effects of the model violations that were found otherwise, which take part with a scale
     each: what they explain better is theirs, and not in the result. enlarged : factors in use on
-    the stated noise of the readings and of the poses.
+    the stated noise of the readings and of the poses. heights : whether nothing else was measured.
     """
     rivals = [
         Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
@@ -168,31 +191,45 @@ def discrepancy_of(
     ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
     parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
     at_solution = _products(assembled, info, effects)
-    kinds = (READING_ROWS_KIND, POSE_ROWS_KIND)
-    kind, factor = max(zip(kinds, enlarged, strict=True), key=lambda pair: pair[1])
+    kind = (READING_ROWS_KIND, POSE_ROWS_KIND)[int(np.argmax(enlarged))]
+    inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
-    if factor > options.enlarged:
-        for share in np.geomspace(1 / factor, 1, options.noise_factors)[:-1].tolist():
-            other = _with_noise(assembled, kind, share)
-            noises.append(_products(other, Information(other.problem, info.state), effects))
-    searches = [_Search(products, every, parts, options) for products in noises]
-    for search in searches:
-        search.run(kind if factor > options.enlarged else None)
-    best = max(searches, key=lambda one: one.products.likelihood + one.gain)
-    noise_alone = max(one.products.likelihood for one in searches)
-    evidence = 2 * (best.products.likelihood - noise_alone) + sum(
-        one.ratio for one in best.scales if not one.code.startswith(NAMED)
+    for shares in _noise_shares(enlarged, heights, options):
+        other = _with_noise(assembled, shares)
+        noises.append(_products(other, Information(other.problem, info.state), effects))
+    smooth_end = len(components)
+    best, smooth, named_only, noise_alone = (
+        max(
+            (_Search(products, *which, options, inflated) for products in noises),
+            key=lambda one: one.likelihood,
+        )
+        for which in (
+            (every, parts),
+            (components, parts[:smooth_end]),
+            (rivals, parts[smooth_end:]),
+            ((), ()),
+        )
     )
+    beyond = options.least_ratio(len(every))
+    named_ratios = [one.ratio for one in best.scales if one.code.startswith(NAMED)]
+    evidence = 2 * (best.likelihood - noise_alone.likelihood) - sum(named_ratios)
+    if heights:
+        needless = 2 * (best.likelihood - smooth.likelihood) <= beyond
+        best, against = (smooth, noise_alone) if needless else (best, named_only)
+        evidence = 2 * (best.likelihood - against.likelihood)
+    sure = evidence > beyond
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
-    if not scales:
+    if not scales or (heights and inflated is None and not sure):
         return no_discrepancy(info)
     # scales by the noise that fits best, gains by the weights with which the estimate was made
-    smooth = ~np.any(best.root[ends[len(components)] :], axis=0)
-    root = best.root[: ends[len(components)], smooth]
-    gain = at_solution.gain[:, : ends[len(components)]] @ root
-    spread = gain @ best.second_moment[np.ix_(smooth, smooth)] @ gain.T
-    random = RandomEffects(tuple(effects[: len(components)]), root)
-    return Discrepancy(scales, spread, random, evidence > options.least_ratio(len(every)))
+    unnamed = ~np.any(best.root[ends[smooth_end] :], axis=0)
+    root = best.root[: ends[smooth_end], unnamed]
+    gain = at_solution.gain[:, : ends[smooth_end]] @ root
+    mean, covariance = best.coefficients
+    mean, covariance = mean[unnamed], covariance[np.ix_(unnamed, unnamed)]
+    spread = gain @ (np.outer(mean, mean) + covariance) @ gain.T
+    random = RandomEffects(tuple(effects[:smooth_end]), root)
+    return Discrepancy(scales, spread, random, mean, covariance, sure)
 
 
 class _Search:
@@ -207,15 +244,14 @@ class _Search:
         components: Sequence[Component],
         parts: Sequence[slice],
         options: DiscrepancyOptions,
+        enlarged: int | None,
     ) -> None:
+        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
         self.products, self.components, self.parts = products, components, parts
         self.options = options
         self.scales: list[ComponentScale] = []
         self.gain = 0.0
-        self.root = np.zeros((parts[-1].stop if parts else 0, 0))
-
-    def run(self, enlarged: int | None) -> None:
-        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        self.root = np.zeros((len(products.value), 0))
         beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
@@ -225,15 +261,16 @@ class _Search:
             for one, part in zip(self.components, self.parts, strict=True):
                 if one.code in codes:
                     continue
-                for root in one.roots:
+                for k, root in enumerate(one.roots):
                     scale, ratio = self._scale(
                         root.T @ squared[part, part] @ root,
                         root.T @ value[part],
                         root.T @ self.products.whole[part, part] @ root,
                     )
-                    least = 0.0 if one.inflates == enlarged and enlarged is not None else beyond
+                    least = 0.0 if enlarged in one.inflates else beyond
                     if ratio > least and (best is None or ratio > best.ratio):
-                        best = ComponentScale(one.code, scale, ratio, root)
+                        length = one.lengths[k] if one.lengths else None
+                        best = ComponentScale(one.code, scale, ratio, root, length)
             if best is None:
                 return
             self.scales.append(best)
@@ -261,11 +298,17 @@ class _Search:
         return np.linalg.inv(np.eye(len(information)) + information)
 
     @property
-    def second_moment(self) -> Array:
-        """(l, l) mean square of the taken coefficients given the data, in prior deviations."""
+    def likelihood(self) -> float:
+        """Logarithm of the restricted likelihood with all that are taken up."""
+        return self.products.likelihood + self.gain
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """Mean (l,) and covariance (l, l) of the taken coefficients given the data, in prior
+        deviations.
+        """
         covariance = self._posterior
-        mean = -covariance @ (self.root.T @ self.products.value[: len(self.root)])
-        return np.outer(mean, mean) + covariance
+        return -covariance @ (self.root.T @ self.products.value[: len(self.root)]), covariance
 
     def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
         """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
@@ -282,14 +325,30 @@ class _Search:
         return (float(np.sqrt(square[best])), float(ratio[best])) if ratio[best] > 0 else (0.0, 0.0)
 
 
-def _with_noise(assembled: Assembled, kind: int, factor: float) -> Assembled:
-    """The problem with the noise of readings, or poses, times a factor."""
-    problem = assembled.problem
-    if kind == READING_ROWS_KIND:
-        problem = replace(problem, joint_noise=problem.joint_noise * factor)
+def _noise_shares(
+    enlarged: tuple[float, float], heights: bool, options: DiscrepancyOptions
+) -> list[tuple[float, float]]:
+    """Factors on the noise in use, of readings and of poses, that are tried beside (1, 1): down to
+    what was stated, of the kind that is enlarged most; of heights both, the probe's further.
+    """
+    count = options.noise_factors
+    if heights:
+        low = 1 / enlarged[0], options.least_probe_noise / enlarged[1]
+        count = options.probe_noise_factors
+    elif max(enlarged) > options.enlarged:
+        most = int(np.argmax(enlarged))
+        low = tuple(1 / enlarged[k] if k == most else 1.0 for k in range(2))
     else:
-        poses = problem.pose_data
-        problem = replace(problem, pose_data=replace(poses, weight=poses.weight / factor**2))
+        return []
+    readings, poses = (np.geomspace(end, 1, count)[:-1].tolist() for end in low)
+    return list(zip(readings, poses, strict=True))
+
+
+def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled:
+    """The problem with the noise of readings, and of poses, times a factor each."""
+    problem = assembled.problem
+    poses = replace(problem.pose_data, weight=problem.pose_data.weight / factors[1] ** 2)
+    problem = replace(problem, joint_noise=problem.joint_noise * factors[0], pose_data=poses)
     return replace(assembled, problem=problem)
 
 

@@ -49,6 +49,9 @@ SEEN_SQUARE_SHARE = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
 it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
 a ten-thousandth is left."""
+ROUNDING_LENGTH_SHARE = 1e-9
+"""Length of a departure's column, as a share of its longest one, below which it is rounding: what a
+tracker that feels heights is shifted by along the bed, say."""
 UNTOLD_HIDDEN_SHARE = 0.01
 """Part of a number that lies in directions which the data do not see, from which it is not told."""
 MOST_DEPARTURES_SOUGHT = 4
@@ -71,7 +74,7 @@ class Score:
 @dataclass(frozen=True)
 class Freed:
     """A departure as the data tell it: value, sigma (k,), and moved (P,), what taking it up does to
-    the machine's parameters, m and rad. What the data do not see has an infinite sigma.
+    the machine's parameters, m and rad. What the data do not see is NaN, its sigma infinite.
     """
 
     value: Array
@@ -84,6 +87,9 @@ class RandomEffects(NamedTuple):
 
     effects: tuple[Effect, ...]
     root: Array
+
+
+NO_RANDOM_EFFECTS = RandomEffects((), np.zeros((0, 0)))
 
 
 class Departures:
@@ -113,7 +119,7 @@ class Departures:
         to be small. variance : factor on that of all residuals, for what else they are known to be
         wrong by.
         """
-        beside = beside or RandomEffects((), np.zeros((0, 0)))
+        beside = beside or NO_RANDOM_EFFECTS
         self._variance, self._scatter = variance, dict[int, float]()
         basis = _basis_beside(assembled, info, beside)
         self._problem = assembled, info, listed, basis, beside
@@ -177,7 +183,7 @@ class Departures:
         sigma[free.hidden > UNTOLD_HIDDEN_SHARE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
-            Freed(v, s, self._moves @ (made.with_basis(k).T @ v))
+            Freed(np.where(np.isfinite(s), v, np.nan), s, self._moves @ (made.with_basis(k).T @ v))
             for k, v, s in zip(freed, np.split(value, cuts), np.split(sigma, cuts), strict=True)
         ]
 
@@ -222,8 +228,13 @@ class Departures:
             clusters += int(np.count_nonzero(products.any(axis=-1)))
         if clusters < 2:
             return 1.0
-        squared = part.T @ free.squared @ part
-        usual = np.trace(np.linalg.pinv(squared) @ scatter) / n
+        scale = free.scale[own]
+        size, ways = np.linalg.eigh(part.T @ free.squared @ part / scale / scale[:, None])
+        shown = size > SEEN_SQUARE_SHARE
+        if not shown.any():
+            return 1.0
+        ways = ways[:, shown] / scale[:, None]
+        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[shown])
         return max(1.0, float(usual) / self._variance * clusters / (clusters - 1))
 
 
@@ -319,8 +330,8 @@ class _Products:
 
 @dataclass(frozen=True)
 class _Left:
-    """What all else leaves of some columns: scale (c,) their lengths before, squared (c, c)
-    products with each other, value (c,) with the residuals.
+    """What all else leaves of some columns: scale (c,) their lengths before, infinite where they
+    are rounding, squared (c, c) products with each other, value (c,) with the residuals.
     """
 
     scale: Array
@@ -330,10 +341,13 @@ class _Left:
     @classmethod
     def of(cls, made: _Products, freed: Sequence[int]) -> _Left:
         """What the basis leaves of some departures."""
-        lengths = [np.zeros(0), *(np.sqrt(np.diag(made.between(k, k))) for k in freed)]
+        lengths = [np.zeros(0)]
+        for k in freed:
+            length = np.sqrt(np.maximum(np.diag(made.between(k, k)), 0.0))
+            least = ROUNDING_LENGTH_SHARE * length.max(initial=0.0)
+            lengths.append(np.where(length > least, length, np.inf))
         squared = [np.zeros((0, 0)), *(made.left(k, freed) for k in freed)][len(freed) > 0 :]
-        scale = np.maximum(np.concatenate(lengths), 1e-150)
-        return cls(scale, np.concatenate(squared), made.with_residuals(freed))
+        return cls(np.concatenate(lengths), np.concatenate(squared), made.with_residuals(freed))
 
     def _directions(self) -> tuple[Array, Array]:
         """Parts of the squared columns that are left in each direction, and the directions."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.identify.assembly import machine_size
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import NamedChanges, Situation, all_radii, candidates
@@ -37,6 +38,8 @@ HARDLY_TOLD_INFORMATION = 1 / 3
 """Information below which a direction counts as not told: the data then decide less than a tenth
 of its variance. Poses that only shift seem to turn by their noise, so directions that nothing fixes
 come out with a trace of information."""
+UNIDENTIFIED_SHARE = 0.5
+"""Part of what is known beforehand of a place or turn from which the data do not determine it."""
 NEW_CHANGE_SINE = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
 STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
@@ -129,6 +132,17 @@ def only_heights(estimate: Estimate) -> bool:
     """Whether nothing but heights was measured: what is not measured leaves no residual."""
     poses = estimate.pose_residuals
     return not estimate.edge_weights.size and len(poses) > 0 and not poses[:, :5].any()
+
+
+def identified(machine: Machine, covariance: Array) -> Booleans:
+    """Which of the six numbers of poses the data determine, (..., 6); covariance (..., 6, 6), rad
+    and m. The others are conventions, or where the search began, and stand nowhere as numbers.
+
+    Of a target's place no more than the machine's size is known beforehand, and of a turn nothing:
+    a number that is known no better than half of that is not known by the data.
+    """
+    sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
+    return sigma < UNIDENTIFIED_SHARE * np.repeat([1.0, machine_size(machine)], 3)
 
 
 def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machine) -> Array:

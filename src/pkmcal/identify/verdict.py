@@ -74,6 +74,7 @@ def judge(
     method: str = "bundle",
     *,
     richer: tuple[RicherModel, ...] = (),
+    explained: bool = False,
     doubts: tuple[str, ...] = (),
     cautions: tuple[str, ...] = (),
     hints: tuple[str, ...] = (),
@@ -82,6 +83,8 @@ def judge(
 
     findings : what the data tell of the machine.
     richer : models of the machine that were tried because this one is too poor for the poses.
+    explained : whether the model discrepancy surely explains why heights scatter; the standard
+    deviations then contain it.
     doubts : further reasons against it, cautions : further warnings, hints : further advice, found
     in the session.
     """
@@ -93,7 +96,8 @@ def judge(
     else:
         left = [f"{s.text} {s.advice}" for s in large]
         left = left or _platform_unknown(estimate, findings.by_drawing)
-    reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
+    against = [] if explained else _poses_against(estimate, richer)
+    reasons = tuple(_reasons(estimate, method, left) + against) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
     matter = tuple(s for s in small if s.matters)
     if matter:
@@ -101,7 +105,7 @@ def judge(
         matter = tuple(s for s in matter if s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate),
-        *_poses_doubted(estimate, richer),
+        *(() if explained else _poses_doubted(estimate, richer)),
         *(_touch_unnoticed(bed) if bed else ()),
         *cautions,
         *(f"{s.text} {s.advice}" for s in matter),

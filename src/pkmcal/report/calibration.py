@@ -30,6 +30,7 @@ from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.report import (
+    bed,
     field,
     identifiability,
     parameters,
@@ -140,6 +141,7 @@ def report_of(
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         held,
+        bed.section(session, c.model_errors),
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
@@ -170,7 +172,7 @@ def calibration_cards(
 ) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
     session, observation = calibration.session, calibration.observation
-    estimate, bed = calibration.estimate, calibration.findings.bed  # where only heights were felt
+    estimate, flatness = calibration.estimate, calibration.findings.bed  # of heights alone
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(
@@ -188,7 +190,7 @@ def calibration_cards(
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
     found = (
-        _flat(bed, tool) if bed else None,
+        _flat(flatness, tool) if flatness else None,
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
         moved,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.doubts import turning
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import charts
@@ -17,8 +18,6 @@ from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
-OPEN_POSE_SIGMA = 0.3
-"""m or rad; a place that is known no better is not told by the data."""
 MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
@@ -88,8 +87,9 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
     state, rows = estimate.state, list[Row]()
     for m, name in enumerate(mount_names(session, len(state.T_mount))):
         T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
-        place = _texts(T[:3, 3], sigma[3:], 1e3)
-        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], 180 / np.pi)
+        known = identified(estimate.machine, estimate.mount_covariance[m])
+        place = _texts(T[:3, 3], sigma[3:], known[3:], 1e3)
+        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], known[:3], 180 / np.pi)
         rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
     return Table(
         "Where it sits",
@@ -108,13 +108,13 @@ def mount_names(session: Session, n: int) -> list[str]:
     return ["board"] * (n - len(trackers)) + trackers
 
 
-def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
-    """Numbers with their deviations, ``open`` where the data do not tell them."""
+def _texts(values: Array, sigma: Array, known: Booleans, factor: float) -> list[str]:
+    """Numbers with their deviations, ``open`` where the data do not determine them."""
     out: list[str] = []
-    for value, spread in zip(values.tolist(), sigma.tolist(), strict=True):
+    for value, spread, sure in zip(values.tolist(), sigma.tolist(), known, strict=True):
         text = number(value * factor, decimals(spread * factor))
-        known = f"{text} ± {brief(spread * factor)}" if spread else text
-        out.append("open" if spread > OPEN_POSE_SIGMA else known)
+        text = f"{text} ± {brief(spread * factor)}" if spread else text
+        out.append(text if sure else "open")
     return out
 
 

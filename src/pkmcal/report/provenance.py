@@ -13,16 +13,15 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
 from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
-from pkmcal.wording import brief, count, decimals, number
+from pkmcal.wording import amount, brief, count, decimals, number
 
-OPEN_PLACE_SIGMA = 1e3
-"""mm; a place that is known no better is not told by the data."""
 SIGMA_MEANING_TEXT = Markup(
     "<strong>What σ means here.</strong> The standard deviations say how much the result would"
     " scatter if the same photographs and readings were taken again. They know the noise of the"
@@ -100,17 +99,21 @@ def stations(
 
 
 def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
-    """A station's place with its deviations (mm), and the deviation of its turn (degrees)."""
+    """A station's place with its deviations (mm), and the deviation of its turn (degrees); what the
+    data do not determine is open.
+    """
     found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(found)[:3, 3] * 1e3
-    variance = np.diag(base_camera_covariance(found, covariance))[3:]
-    sigma = np.sqrt(np.maximum(variance, 0.0)) * 1e3  # rounding may leave less than none
-    turn = float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3)))
+    covariance = base_camera_covariance(found, covariance)
+    known = identified(estimate.machine, covariance)
+    # rounding may leave less than none
+    sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
+    turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
-        f"{number(v, decimals(d))} ± {brief(d) if d < OPEN_PLACE_SIGMA else 'open'}"
-        for v, d in zip(place.tolist(), sigma.tolist(), strict=True)
+        f"{number(v, decimals(d))} ± {brief(d)}" if sure else "open"
+        for v, d, sure in zip(place.tolist(), sigma.tolist(), known[3:], strict=True)
     )
-    return x, y, z, f"{brief(turn)}°" if turn < 90 else "open"
+    return x, y, z, amount(turn, "rad") if known[:3].all() else "open"
 
 
 def _moved(rough: Array | None, found: Array) -> str:

@@ -31,12 +31,27 @@ def movement_departures(
         before, after = (configurations[int(used[k + d])] for d in (-1, 0))
 
         def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:
-            turn, shift = np.linalg.norm(value[:3]), np.linalg.norm(value[3:])
             return (
-                f"The {what} of {name} stood elsewhere after configuration {b}, by some"
-                f" {amount(float(shift), 'm')} and {amount(float(turn), 'rad')}",
+                f"The {what} of {name} stood elsewhere after configuration {b}{how_far(value)}",
                 f"Make two stations of it, one up to {b} and one from {a} on",
             )
 
         effect = Effect(station=station, since=int(used[k]))
         yield Departure("station moved", name, says, effect)
+
+
+def how_far(change: Array) -> str:
+    """How far a pose moved, as the end of a sentence.
+
+    change : (omega, tau), rad and m; NaN where the data do not determine it.
+    """
+    turn, shift = change[:3], change[3:]
+    sizes = [
+        amount(float(np.linalg.norm(part[np.isfinite(part)])), unit)
+        for part, unit in ((shift, "m"), (turn, "rad"))
+        if np.isfinite(part).any()
+    ]
+    if not sizes:
+        return ", by how much these data do not determine"
+    partly = "" if np.isfinite(change).all() else ", as far as these data determine it"
+    return f", by some {' and '.join(sizes)}{partly}"

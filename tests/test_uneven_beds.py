@@ -1,0 +1,195 @@
+"""Beds that are not flat are no fault of the machine; a fault that explains more is still named."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+import printers
+from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.model_errors import UNEVEN_BED, sentences
+from pkmcal.calibration.results import calibration_document
+from pkmcal.calibration.saved import load
+from pkmcal.calibration.source import load_source
+from pkmcal.check.check import check_session
+from pkmcal.files import json_value
+from pkmcal.geometry.rigid import pose
+from pkmcal.outcome import Level
+from pkmcal.printers.session import write_printer_session
+from pkmcal.report.calibration import report_of, save
+from pkmcal.session.moved import how_far
+
+SAYS = printers.Settings()
+POINTS, NOISE = 49, 0.008
+SIZE, LENGTH = 0.05, 50.0
+"""mm, of a bed: standard deviation and correlation length."""
+
+
+def surface(xy, seed):
+    """Heights (n,) mm of an uneven bed at places (n, 2) mm."""
+    square = ((xy[:, None] - xy[None]) ** 2).sum(axis=-1)
+    covariance = SIZE**2 * (np.exp(-square / 2 / LENGTH**2) + 1e-8 * np.eye(len(xy)))
+    return np.linalg.cholesky(covariance) @ np.random.default_rng(seed).normal(size=len(xy))
+
+
+def kit_of(folder, *, bed=0.0, scale=(1.0, 1.0, 1.0), seed=0):
+    """A session of a printer that is as its firmware says but for its motors' scales; bed : (n,) mm
+    above the plane.
+    """
+    true = printers.machine(SAYS, scale=scale)
+    readings = printers.felt(true, printers.bed(POINTS), NOISE, np.random.default_rng(seed))
+    readings = readings + np.broadcast_to(bed, POINTS)[:, None]
+    (folder / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
+    write_printer_session(folder / "kit", folder / "printer.cfg")
+    return folder / "kit"
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """An uneven bed, the session in which it was felt, and its calibration; its residuals look like
+    a motor's other scale.
+    """
+    heights = surface(printers.bed(POINTS), 2)
+    kit = kit_of(tmp_path_factory.mktemp("uneven"), bed=heights)
+    return heights, kit, calibrate_session(kit)
+
+
+def flatness(found):
+    """Root mean square height (m) of the true tool over the disc that was probed, where the
+    calibrated machine is told to go along a plane, the plane's own tilt and height aside.
+    """
+    k = np.arange(200)
+    r, a = found.findings.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
+    xy = np.column_stack([r * np.cos(a), r * np.sin(a)])
+    there = pose(np.eye(3), np.column_stack([xy, np.zeros(200)]))
+    z = printers.machine(SAYS).forward(found.machine.inverse(there))[:, 2, 3]
+    plane = np.column_stack([xy, np.ones(200)])
+    return float(np.sqrt(np.mean((z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]) ** 2)))
+
+
+def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
+    _, _, found = uneven
+    assert found.verdict.usable
+    assert found.departures == ()
+    (error,) = found.model_errors
+    assert (error.code, error.sure) == (UNEVEN_BED, True)
+    assert 1e-3 * SIZE / 3 < error.scale < 3e-3 * SIZE
+    assert 1e-3 * LENGTH / 3 < error.length < 3e-3 * LENGTH
+    assert sentences(found.model_errors)[0] in found.verdict.warnings
+
+
+def test_deviations_contain_the_unevenness(uneven):
+    """Of the bed as it will be, and of the parameters, all of which are right from the first."""
+    _, _, found = uneven
+    assert flatness(found) < 3 * found.findings.bed.sigma
+    sigma = np.sqrt(np.diag(found.estimate.covariance))
+    off = np.abs(found.machine.values - found.session.machine.values)
+    assert np.all(off <= 3 * sigma + 1e-12)
+
+
+def test_the_map_is_the_bed_as_far_as_its_deviations_say(uneven):
+    heights, _, found = uneven
+    document = json_value(calibration_document(found))
+    (error,) = document["model_errors"]
+    assert error["code"] == UNEVEN_BED
+    table = {name: np.array(values) for name, values in error["surface"].items()}
+    # what is of a plane, and the mean, is no unevenness
+    order = table["configuration"]
+    plane = np.column_stack([table["x"], table["y"], np.ones(POINTS)])
+    off = table["height"] - 1e-3 * heights[order]
+    off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
+    assert np.sqrt(np.mean((off / table["sigma"]) ** 2)) < 2
+    np.testing.assert_allclose(1e3 * plane[:, :2], printers.bed(POINTS)[order], atol=1.0)
+    assert "bed" in [part.name for part in report_of(found).parts]
+
+
+def test_check_finds_what_calibrate_finds(uneven):
+    _, kit, found = uneven
+    findings = check_session(kit).findings
+    assert all(one.level is not Level.WRONG for one in findings)
+    assert sentences(found.model_errors)[0] in [one.text for one in findings]
+
+
+def test_a_flat_bed_is_flat(tmp_path):
+    found = calibrate_session(kit_of(tmp_path))
+    assert found.verdict.usable
+    assert found.departures == found.model_errors == ()
+    assert "bed" not in [part.name for part in report_of(found).parts]
+
+
+def test_a_wrong_motor_is_named_where_it_explains_more_than_an_uneven_bed(tmp_path):
+    kit = kit_of(tmp_path, scale=(1.0, 1.0, 1.03))
+    found = calibrate_session(kit)
+    (violation,) = found.departures
+    assert (violation.kind, violation.of) == ("reading scale", "stepper_c")
+    assert abs(violation.value[0] - 0.03) < 4 * violation.sigma[0]
+    assert violation.against
+    assert not found.verdict.usable
+    assert violation.sentence in [one.text for one in check_session(kit).findings]
+
+
+# ------------------------------------------------------------------ what is not determined
+
+
+@pytest.fixture(scope="module")
+def dropped(tmp_path_factory):
+    """A bed that sank by half a millimetre while it was probed."""
+    fell = np.where(np.arange(POINTS) < 25, 0.0, -0.5)
+    return calibrate_session(kit_of(tmp_path_factory.mktemp("dropped"), bed=fell))
+
+
+def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
+    (violation,) = dropped.departures
+    assert violation.kind == "station moved"
+    rx, ry, turn, x, y, z = violation.value
+    assert np.isnan([turn, x, y]).all()
+    assert np.isinf(violation.sigma[2:5]).all()
+    assert np.isfinite([rx, ry]).all()
+    assert abs(z) == pytest.approx(0.5e-3, abs=4 * violation.sigma[5])
+    assert violation.score.dof == 3
+    document = json_value(violation.document())
+    assert document["value"][2:5] == document["sigma"][2:5] == [None] * 3
+    assert "as far as these data determine it" in violation.sentence
+
+
+def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
+    """Neither in a verdict nor in any table of the report."""
+    for found in (dropped, uneven[2]):
+        verdict, parts = found.verdict, report_of(found).parts
+        texts = [verdict.headline, *verdict.reasons, *verdict.warnings, *verdict.advice]
+        for part in parts:
+            texts += part.text
+            texts += [str(c) for table in part.tables for row in table.rows for c in row.cells]
+        assert not [text for text in texts if re.search(r"\d{7}", text)]
+        assert not [text for text in texts if re.search(r"\bnan\b|\binf\b", text)]
+
+
+def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
+    """Neither the bed's x, y and turn nor the tool's are numbers with a deviation."""
+    _, _, found = uneven
+    document = json_value(calibration_document(found))
+    (station,), (target,) = document["stations"], document["targets"]
+    for one in (station, target):
+        assert one["sigma_translation"][:2] == [None, None]
+        assert one["sigma_rotation"][2] is None
+    save(found, tmp_path / "result")
+    loaded = load(tmp_path / "result").stations[0]
+    assert np.isinf(loaded.sigma_translation[:2]).all()
+    assert dict(load_source(tmp_path / "result").T_base_camera) == {}
+    (places,) = [part for part in report_of(found).parts if part.name == "stations"]
+    (row,) = places.tables[0].rows
+    assert row.cells[:2] == ("open", "open")
+
+
+def test_a_movement_is_a_number_where_it_is_determined():
+    change = np.array([1e-3, 0, 0, 3e-3, 4e-3, 0])
+    assert how_far(change) == ", by some 5.0 mm and 0.057°"
+    nowhere = np.full(6, np.nan)
+    assert not re.search(r"\d", how_far(nowhere))
+    for part in (slice(0, 3), slice(3, 6)):
+        some = change.copy()
+        some[part] = np.nan
+        assert ("mm" in how_far(some)) == (part.start == 0)
+        assert ("°" in how_far(some)) == (part.start == 3)
