@@ -259,6 +259,7 @@ class _Statistics(_Part):
     noise_scale: Factor = 1.0
     pose_scale: Factor = 1.0
     reading_scale: Factor = 1.0
+    link_scale: Factor = 1.0
     chi2: float = 0.0
     dof: float = 0.0
     chi2_edges: float = 0.0
@@ -269,6 +270,8 @@ class _Statistics(_Part):
     n_drawing: float = 0.0
     chi2_poses: float = 0.0
     n_poses: float = 0.0
+    chi2_links: float = 0.0
+    n_links: float = 0.0
     steps: int = 0
     stopped: str = ""
 

@@ -201,12 +201,13 @@ class _Cases(NamedTuple):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
+        links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
         pose_loss = full / np.maximum(as_pairs(problem.kinds.poses), 1e-9) ** 2
         edges = measurements.edges
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
-            weight = Kinds(edge_weight.copy(), pose_weight.copy())
+            weight = Kinds(edge_weight.copy(), pose_weight.copy(), links)
             if unit.pose >= 0:
                 places = assembled.places.poses
                 row, place = int(places.row[unit.pose]), int(places.place[unit.pose])
@@ -223,7 +224,8 @@ class _Cases(NamedTuple):
                 rows.append(-1)
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
-            new = problem.weighted(Kinds(weight.edges[None], weight.poses[None])).among(cut)
+            new = Kinds(weight.edges[None], weight.poses[None], links)
+            new = problem.weighted(new).among(cut)
             changes.append(
                 _normal_equations(new, there).plus(
                     _normal_equations(problem.among(cut), there), -1.0
@@ -248,7 +250,7 @@ class _Cases(NamedTuple):
                     continue
                 weight = part.pose_data.weight.copy()
                 weight[:, :, place] = 0.0
-                without = part.weighted(Kinds(part.data.weight, weight))
+                without = part.weighted(Kinds(part.data.weight, weight, part.link_data.weight))
                 change = _normal_equations(without, there).plus(before, -1.0)
                 row = np.arange(len(self.in_use))[cut][in_use]
                 yield change.at(in_use), self.pose_loss[row, place], row

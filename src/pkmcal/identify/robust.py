@@ -197,7 +197,8 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
     usual, _, _ = robust_cost(part, state, scaled=scaled)
     every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.kinds)
     one = np.ones(len(runs))
-    other = RobustStart(state, Kinds(*(p.astype(float) for p in every)), Kinds(one, one), 0)
+    every = Kinds(*(p.astype(float) for p in every))
+    other = RobustStart(state, every, Kinds(one, one, one), 0)
     poses, before = bool(problem.kinds.poses.present.any()), np.full(len(runs), np.inf)
     for _ in range(MOST_REWEIGHTINGS):
         parts = zip(other.weight, other.scale, strict=True)

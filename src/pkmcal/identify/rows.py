@@ -46,7 +46,8 @@ BlockNumbers = TypeVar("BlockNumbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "
 
 
 class Kinds(NamedTuple, Generic[Item]):
-    """Something of each kind of measurement: of the edges, and of the boards' poses.
+    """Something of each sort of rows: of the edges, of the poses of boards and targets, and of what
+    links configurations.
 
     An estimate weighs, counts and scales all kinds alike. Readings are none: no robust weight lets
     them go.
@@ -54,6 +55,7 @@ class Kinds(NamedTuple, Generic[Item]):
 
     edges: Item
     poses: Item
+    links: Item
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,9 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             expected="a session with photographs, or with a table of poses",
             next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
         )
-    held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), start)
+    # links tell the difference of two poses, not the pose at either's readings
+    soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
+    held = hold(machine, soft, start)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])

@@ -10,6 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.rigid import perturb
+from pkmcal.measurements.links import LinkSet
 
 SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
@@ -282,7 +283,8 @@ class Measurements:
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
     gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
-    they were measured, in BREATHING_SIGMA; empty where none breathes. level : (S,) stations whose z
+    they were measured, in BREATHING_SIGMA; empty where none breathes. links : measurements that
+    link two configurations, one set for each kind. level : (S,) stations whose z
     axis is the base's, exactly; empty where there is none. look_variance : by what part of its
     variance by noise a result varies besides, with where its edges were looked for.
     """
@@ -300,8 +302,26 @@ class Measurements:
     breathing_at: Array = field(default_factory=lambda: np.zeros(0))
     level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     look_variance: float = 0.0
+    links: tuple[LinkSet, ...] = ()
 
     __repr__ = short_repr
+
+    @property
+    def n_links(self) -> int:
+        """Number of measurements that link two configurations."""
+        return sum(len(links) for links in self.links)
+
+    def links_among(self, keep: Booleans) -> Booleans:
+        """(n,) links of which both configurations are among those to keep, (K,)."""
+        none = np.zeros((0, 2), dtype=int)
+        ends = np.concatenate([none, *(links.configuration for links in self.links)])
+        return keep[ends].all(axis=1)
+
+    def with_links(self, keep: Booleans) -> Measurements:
+        """The same with some of the links, (n,)."""
+        parts = np.split(keep, np.cumsum([len(links) for links in self.links])[:-1])
+        found = zip(self.links, parts, strict=False)
+        return replace(self, links=tuple(links.select(mine) for links, mine in found))
 
     @property
     def n_cameras(self) -> int:

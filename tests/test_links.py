@@ -1,0 +1,190 @@
+"""Measurements that link two configurations: their rows, and unknowns that two of them share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.identify import problem as problems
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.noise import components
+from pkmcal.identify.rows import Kinds
+from pkmcal.identify.start import start_state
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
+from pkmcal.measurements.distances import DistanceSet
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.solver import elimination, search
+
+POINT = np.array([0.02, -0.01, 0.05])
+SIGMA, READING_NOISE = 3e-5, 1e-5
+POSE_SIGMA = np.repeat([1e-3, 3e-4], 3)
+T_TRACKER_BASE = look_at(np.array([0.9, 0.2, 0.4]), np.array([0.0, 0.0, 0.3]), np.eye(3)[2])
+
+
+def marks(T, point=POINT):
+    """Places (n, 3) of a tool's point at poses (n, 4, 4)."""
+    return T[:, :3, :3] @ point + T[:, :3, 3]
+
+
+def measured(machine, poses, pairs, rng, noise=1.0, target=True):
+    """Distances of the tool's point between pairs, readings, and a target's poses at all."""
+    n, pairs = len(poses), np.array(pairs)
+    at = marks(poses)
+    value = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1)
+    value = value + noise * SIGMA * rng.normal(size=len(pairs))
+    mount = np.full(len(pairs), int(target))
+    links = DistanceSet(
+        "distances.csv", pairs, mount, value, np.full(len(pairs), SIGMA), 2 + np.arange(len(pairs))
+    )
+    joints = machine.inverse(poses)
+    joints = joints + noise * READING_NOISE * rng.normal(size=joints.shape)
+    none = np.zeros(n if target else 0, dtype=int)
+    error = noise * POSE_SIGMA * rng.normal(size=(len(none), 6))
+    seen = perturb(T_TRACKER_BASE @ poses[: len(none)], error)
+    whiten = np.broadcast_to(np.diag(1 / POSE_SIGMA), (len(none), 6, 6))
+    mounts = (Mount("target", "platform"), Mount("distances", "platform"))[1 - int(target) :]
+    return Measurements(
+        EdgeSet.empty(), joints, READING_NOISE, int(target), np.zeros(int(target), dtype=int),
+        poses=PoseSet(none, np.arange(len(none)), none, seen, whiten), mounts=mounts,
+        links=(links,),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return load_mechanism("gough-stewart")
+
+
+@pytest.fixture(scope="module")
+def case(machine):
+    """Twelve configurations, of which five are linked; a state beside the solution."""
+    rng = np.random.default_rng(3)
+    poses = perturb(machine.home(), rng.normal(size=(12, 6)) * np.repeat([0.1, 0.03], 3))
+    data = measured(machine, poses, [(0, 3), (3, 7), (7, 0), (9, 3), (11, 0)], rng)
+    start = start_state(machine, data, T_TRACKER_BASE[None])
+    assembled = assemble(machine, data, default_gauge(machine))
+    batch = batch_of(machine, assembled, start)
+    u = assembled.problem.unknowns
+    step = np.zeros((1, u.count))
+    step[:, u.mounts] = 1e-2 * rng.normal(size=(1, u.mounts.stop - u.mounts.start))
+    step[:, u.linked] = 1e-3 * rng.normal(size=(1, u.n_linked))
+    own = 1e-3 * rng.normal(size=(1, 12, 6))
+    return assembled, assembled.problem.moved(batch, step, own), data
+
+
+def test_the_residual_is_the_distance_of_the_marks(case):
+    assembled, state, data = case
+    links, T = data.links[0], state.T_base_platform[0]
+    at = marks(T, state.T_mount[0, 1, :3, 3])
+    apart = np.linalg.norm(at[links.configuration[:, 1]] - at[links.configuration[:, 0]], axis=1)
+    rows = assembled.problem.unweighted(state).links[0]
+    found = assembled.places.links.taken(rows)[:, 0]
+    np.testing.assert_allclose(found, (apart - links.value) / SIGMA, rtol=1e-9, atol=1e-7)
+
+
+def test_jacobian_against_differences(case):
+    """All rows by all unknowns, shared and own, against central differences of the residuals."""
+    assembled, state, _ = case
+    problem = assembled.problem
+    linear = problem.linearize(state)
+    na, (count, d) = problem.unknowns.count, linear.by_own.shape[1::2]
+
+    def value(step):
+        shared, own = step[:na][None], step[na:].reshape(1, count, d)
+        return problem.residuals(problem.moved(state, shared, own)).value[0]
+
+    # a linked configuration's own unknowns are shared, and no others
+    linked = problem.link_blocks.linked
+    assert linked.tolist() == [0, 3, 7, 9, 11]
+    assert not linear.by_own[0, linked].any()
+    assert problem.unknowns.n_linked == 6 * len(linked)
+    h, u = 1e-6, problem.unknowns
+    columns = [*range(u.mounts.start, u.linked.stop), *range(na, na + count * d)]
+    for k in columns:
+        step = np.zeros(na + count * d)
+        step[k] = h
+        by = (value(step) - value(-step)) / (2 * h)
+        if k < na:
+            expected = linear.by_shared[0, ..., k]
+        else:
+            expected = np.zeros_like(by)
+            row, own = divmod(k - na, d)
+            expected[row] = linear.by_own[0, row, :, own]
+        size = max(np.abs(expected).max(), 1.0)
+        np.testing.assert_allclose(by, expected, atol=2e-6 * size)
+
+
+def dense(problem, state):
+    """The whole Jacobian (n, m), nothing eliminated, by the unknowns (na + K d,) that do anything:
+    linked configurations have no own ones.
+    """
+    linear = problem.linearize(state)
+    _, count, r, d = linear.by_own.shape
+    na = problem.unknowns.count
+    whole = np.zeros((count * r + len(linear.shared_by), na + count * d))
+    whole[: count * r, :na] = linear.by_shared[0].reshape(-1, na)
+    whole[count * r :, :na] = linear.shared_by
+    for k in range(count):
+        whole[k * r : (k + 1) * r, na + k * d : na + (k + 1) * d] = linear.by_own[0, k]
+    used = whole.any(axis=0)
+    return whole[:, used], used
+
+
+def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
+    """Elimination changes nothing: covariance, rows and degrees of freedom as of all unknowns."""
+    assembled, state, data = case
+    problem = assembled.problem
+    whole, used = dense(problem, state)
+    covariance = np.linalg.inv(whole.T @ whole)
+    shared = np.flatnonzero(used[: problem.unknowns.count])
+    na = len(shared)
+    scale = np.sqrt(np.diag(covariance)[:na])
+    scale = np.outer(scale, scale)
+    info = Information(problem, state)
+    np.testing.assert_allclose(
+        info.covariance[0][np.ix_(shared, shared)] / scale, covariance[:na, :na] / scale, atol=2e-5
+    )
+    hat = np.einsum("ij,jk,ik->i", whole, covariance, whole)
+    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    freedom = components(info, weight).freedom[0]
+    _, count, r, _ = problem.linearize(state).by_own.shape
+    left = (1 - hat[: count * r]).reshape(count, r)
+    links = problem.kinds.links
+    expected = left[:, links.rows][links.present].sum()
+    assert 0 < expected < len(data.links[0])
+    assert freedom[3] == pytest.approx(expected, rel=1e-5)
+    poses = left[:, problem.kinds.poses.rows].sum()
+    assert freedom[1] == pytest.approx(poses, rel=1e-5)
+    assert freedom[2] == pytest.approx(left[:, problem.closure_rows].sum(), rel=1e-4)
+
+
+def test_pieces_say_what_the_whole_says(case, monkeypatch):
+    """With three configurations at a time, links lead from one piece into another."""
+    assembled, state, _ = case
+    problem = assembled.problem
+    one = search.minimise(problem, state)
+    before = Information(problem, state)
+    expected = before.rows[0][0].T @ before.rows[0][0], before.by_kind.trace
+    monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 3 * problem.n_rows)
+    info = Information(problem, state)
+    assert len(list(info.pieces())) == 4
+    normal = info.rows[0][0].T @ info.rows[0][0]
+    np.testing.assert_allclose(normal, expected[0], rtol=1e-8, atol=1e-8 * np.abs(normal).max())
+    np.testing.assert_allclose(info.by_kind.trace, expected[1], rtol=1e-9)
+    other = search.minimise(problem, state)
+    assert other.cost[0] == pytest.approx(one.cost[0], rel=1e-9)
+    np.testing.assert_allclose(other.state.z, one.state.z, atol=1e-9)
+
+
+def test_without_links_a_configuration_is_eliminated(machine, case):
+    """The same data without links: no unknown is shared, and the estimate is another."""
+    _, _, data = case
+    plain = assemble(machine, replace(data, links=()), default_gauge(machine)).problem
+    assert plain.unknowns.n_linked == 0
+    assert plain.structure.strips.linked is None
+    assert problems.Problem is type(plain)
