@@ -51,7 +51,7 @@ def test_hypotheses_weigh_as_their_solutions_do(found):
     def solved(rejected):
         weight = np.full(n, in_use)
         weight[rejected] = 0.0
-        weights = Kinds(np.zeros(0), weight)
+        weights = Kinds(np.zeros(0), weight, np.zeros(0))
         other = assembled.trusting(weights)
         other = replace(other, prior=problem.prior, prior_target=problem.prior_target)
         one = minimise(other.as_noisy_as_at(info.state), info.state)

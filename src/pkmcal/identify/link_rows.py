@@ -51,9 +51,10 @@ class LinkBlocks:
         """Those of some configurations; all linked ones stay among the unknowns."""
         first, stop, _ = configurations.indices(len(self.number))
         keep = (self.at.row >= first) & (self.at.row < stop)
-        sizes = np.cumsum([len(one) for one in self.sets])[:-1]
+        ends = np.cumsum([len(one) for one in self.sets])
         sets = tuple(
-            one.select(mine) for one, mine in zip(self.sets, np.split(keep, sizes), strict=True)
+            one.select(keep[end - len(one) : end])
+            for one, end in zip(self.sets, ends.tolist(), strict=True)
         )
         at = Places(
             self.at.row[keep] - first, self.at.place[keep], (stop - first, self.at.shape[1])

@@ -319,9 +319,12 @@ class Measurements:
 
     def with_links(self, keep: Booleans) -> Measurements:
         """The same with some of the links, (n,)."""
-        parts = np.split(keep, np.cumsum([len(links) for links in self.links])[:-1])
-        found = zip(self.links, parts, strict=False)
-        return replace(self, links=tuple(links.select(mine) for links, mine in found))
+        ends = np.cumsum([len(links) for links in self.links]).tolist()
+        parts = [
+            links.select(keep[end - len(links) : end])
+            for links, end in zip(self.links, ends, strict=True)
+        ]
+        return replace(self, links=tuple(parts))
 
     @property
     def n_cameras(self) -> int:
