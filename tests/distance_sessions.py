@@ -64,5 +64,3 @@ def stretch(true, found):
     plane = np.column_stack([1e-3 * xy, np.ones(30)])
     slope = np.linalg.lstsq(plane, there, rcond=None)[0]
     return np.trace(slope[:2]) / 2 - 1
-
-

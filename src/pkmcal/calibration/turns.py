@@ -647,7 +647,7 @@ def _images_given_up(measurements: Measurements, estimate: Estimate) -> tuple[Re
     return tuple(
         Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
         for unit in rejected_units(measurements, estimate)
-        if unit.pose < 0
+        if unit.is_image
     )
 
 

@@ -34,6 +34,11 @@ from pkmcal.measurements.links import LinkSet
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import listed
 
+POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
+    ("x", "y", "z"),
+    ("qw", "qx", "qy", "qz"),
+    ("rx", "ry", "rz"),
+)
 LEAST_NOISE = 1e-12
 NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
 """m or rad; nothing measures better, nor is of any use that measures worse."""
@@ -42,11 +47,13 @@ NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
 class MeasurementKind(ABC):
     """A kind of measurement.
 
-    code : for programs. label : its plural in reports and messages. unit : of its numbers. numbers
+    code : for programs. one : what one of them is called, label : its plural, in reports and
+    messages. unit : of its numbers. numbers
     : how many each measurement has at most. joins : configurations that each depends on.
     """
 
     code: ClassVar[str]
+    one: ClassVar[str]
     label: ClassVar[str]
     unit: ClassVar[Literal["px", "m", "m or rad"]]
     numbers: ClassVar[int]
@@ -70,14 +77,19 @@ class TargetKind(MeasurementKind):
 
     headers : columns beside the configuration's, in any order, of each form of the table. known :
     which of (omega, tau) of T_tracker_target are measured. fewest_rows : that fix the tracker's
-    place and leave something that is known. turns : whether the table tells turns, which need a
-    stated noise.
+    place and leave something that is known. levels : whether the tracker's z axis may be stated to
+    be the base's.
     """
 
     headers: ClassVar[tuple[tuple[str, ...], ...]]
     known: ClassVar[tuple[int, ...]]
     fewest_rows: ClassVar[int]
-    turns: ClassVar[bool] = False
+    levels: ClassVar[bool] = False
+
+    @classmethod
+    def turns(cls) -> bool:
+        """Whether turns are measured, which need a stated noise."""
+        return any(k < 3 for k in cls.known)
 
     @classmethod
     def whiten(cls, position: float, rotation: float | None) -> Array:

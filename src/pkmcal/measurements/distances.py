@@ -82,6 +82,7 @@ class Distances(LinkKind):
     """Distances between two positions of the tool."""
 
     code: ClassVar = "distances"
+    one: ClassVar = "distance"
     label: ClassVar = "distances"
     unit: ClassVar = "m"
     key: ClassVar = "distances"

@@ -311,11 +311,23 @@ class Measurements:
         """Number of measurements that link two configurations."""
         return sum(len(links) for links in self.links)
 
+    @property
+    def link_ends(self) -> Integers:
+        """(n, 2) configurations of all links."""
+        none = np.zeros((0, 2), dtype=int)
+        return np.concatenate([none, *(links.configuration for links in self.links)])
+
+    def link_at(self, number: int) -> tuple[LinkSet, int]:
+        """The set of a link, by its number among all, and its number there."""
+        for links in self.links:
+            if number < len(links):
+                return links, number
+            number -= len(links)
+        raise IndexError(number)
+
     def links_among(self, keep: Booleans) -> Booleans:
         """(n,) links of which both configurations are among those to keep, (K,)."""
-        none = np.zeros((0, 2), dtype=int)
-        ends = np.concatenate([none, *(links.configuration for links in self.links)])
-        return keep[ends].all(axis=1)
+        return keep[self.link_ends].all(axis=1)
 
     def with_links(self, keep: Booleans) -> Measurements:
         """The same with some of the links, (n,)."""

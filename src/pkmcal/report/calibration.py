@@ -26,12 +26,14 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.measurements import Observation
+from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.report import (
     field,
     identifiability,
+    linked,
     parameters,
     photographed,
     pictures,
@@ -139,6 +141,7 @@ def report_of(
         parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
+        *linked.sections(session, c.measurements, estimate),
         held,
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
@@ -194,7 +197,7 @@ def calibration_cards(
         moved,
         _tool_change(session, estimate, tool),
         _data(session, observation, estimate),
-        _fit(estimate),
+        _fit(session, estimate),
     )
     return tuple(card for card in found if card)
 
@@ -282,7 +285,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     readings alone.
     """
     taken = session.images_taken
-    if not session.station_names:
+    if not session.station_names and not session.links:
         return Figure(
             "What is it based on?",
             ((str(len(session.configurations)), "poses"),),
@@ -291,8 +294,10 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             " measured",
         )
     if not taken:
-        quiet, n = int(np.sum(estimate.pose_weights < KEPT_EDGE_WEIGHT)), len(observation.poses)
-        kinds = sorted({table.kind for table in session.trackers})
+        weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
+        quiet, n = int(np.sum(weights < KEPT_EDGE_WEIGHT)), len(weights)
+        kinds = sorted({table.target.label for table in session.trackers})
+        kinds += [measurement_kinds()[links.kind].label for links in session.links]
         return Figure(
             "What is it based on?",
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
@@ -307,6 +312,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
         for thing, weights, n, more in (
             ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
             ("pose", estimate.pose_weights, len(estimate.pose_weights), ""),
+            *((one, part, len(part), "") for one, part in linked.weights(session, estimate)),
         )
         if len(weights)
     ]
@@ -319,7 +325,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     )
 
 
-def _fit(estimate: Estimate) -> Figure:
+def _fit(session: Session, estimate: Estimate) -> Figure:
     """Chi-square per degree of freedom, of the noise as stated."""
     s = estimate.statistics
     scaled = [
@@ -328,6 +334,7 @@ def _fit(estimate: Estimate) -> Figure:
             ("edges", s.noise_scale),
             ("poses", s.pose_scale),
             ("readings", s.reading_scale),
+            (provenance.link_labels(session), s.link_scale),
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]

@@ -44,6 +44,7 @@ from pkmcal.files import (
 from pkmcal.geometry.rigid import pose
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
@@ -167,7 +168,7 @@ class Session:
     @property
     def heights_alone(self) -> bool:
         """Whether nothing but heights of a bed was measured."""
-        felt = bool(self.trackers) and all(table.kind == "heights" for table in self.trackers)
+        felt = bool(self.trackers) and all(table.kind == Heights.code for table in self.trackers)
         return felt and not self.stations and not self.links
 
     @property
