@@ -7,18 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.geometry.rigid import look_at, perturb, pose
 from pkmcal.identify import problem as problems
 from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import components
+from pkmcal.identify.reduced_edges import reduced_edges
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver import elimination, search
+from pkmcal.solver.strips import normal_equations
+from test_identify_scene import make_scene
 
 POINT = np.array([0.02, -0.01, 0.05])
 SIGMA, READING_NOISE = 3e-5, 1e-5
@@ -179,6 +183,79 @@ def test_pieces_say_what_the_whole_says(case, monkeypatch):
     other = search.minimise(problem, state)
     assert other.cost[0] == pytest.approx(one.cost[0], rel=1e-9)
     np.testing.assert_allclose(other.state.z, one.state.z, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def with_edges():
+    """Edges of tied and of free machines, two distances, and a mount: a problem and its state."""
+    rng = np.random.default_rng(5)
+    scene = make_scene(rng, configurations=6, n_stations=2)
+    plain, poses = scene.measurements(rng), scene.poses[0]
+    pairs = np.array([(1, 4), (4, 2)])
+    at = marks(poses)
+    value = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1) + SIGMA
+    sigma = np.full(2, SIGMA)
+    links = DistanceSet("d.csv", pairs, np.zeros(2, dtype=int), value, sigma, np.array([2, 3]))
+    data = replace(plain, links=(links,), mounts=(Mount("distances", "platform"),), shaded=True)
+    start = start_state(scene.machine, data, scene.T_camera_base)
+    start = replace(start, T_mount=pose(np.eye(3), POINT)[None])
+    return scene.machine, data, start
+
+
+def test_edges_of_linked_configurations(with_edges):
+    """Strips of edges by unknowns that are shared: as with the whole Jacobian in memory."""
+    machine, data, start = with_edges
+    assembled = assemble(machine, data, default_gauge(machine))
+    problem, state = assembled.problem, batch_of(machine, assembled, start)
+    compact = problem.compact(state)
+    normal = normal_equations([compact], np.zeros(1))
+    whole, used = dense(problem, state)
+    linear = compact.linear()
+    value = np.concatenate([linear.value[0].ravel(), linear.shared_value[0]])
+    shared = np.flatnonzero(used[: problem.unknowns.count])
+    na = len(shared)
+    j, own = whole[:, :na], whole[:, na:]
+    q = np.linalg.qr(own)[0]
+    left = j - q @ (q.T @ j)
+    matrix, size = normal.matrix[0][np.ix_(shared, shared)], np.linalg.norm(left, axis=0)
+    scale = np.outer(size, size)
+    np.testing.assert_allclose(matrix / scale, left.T @ left / scale, atol=1e-9)
+    gradient = normal.gradient[0][shared]
+    np.testing.assert_allclose(gradient / size, left.T @ value / size, rtol=1e-6, atol=1e-5)
+    info = Information(problem, state)
+    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    unit = whole / np.linalg.norm(whole, axis=0)
+    inverse = np.linalg.inv(unit.T @ unit)
+    hat = np.einsum("ij,jk,ik->i", unit, inverse, unit)
+    _, count, r, _ = linear.by_own.shape
+    left = (1 - hat[: count * r]).reshape(count, r)
+    freedom = components(info, weight).freedom[0]
+    edges, links = problem.kinds.edges, problem.kinds.links
+    of_edges = left[:, edges.rows][np.repeat(edges.present, 2, axis=1)].sum()
+    assert freedom[0] == pytest.approx(of_edges, rel=1e-5)
+    of_links = left[:, links.rows][links.present].sum()
+    assert freedom[3] == pytest.approx(of_links, rel=1e-4, abs=1e-6)
+    taken = sum(
+        float(np.sum(piece.own**2)) + sum(float(np.sum(t**2)) for _, t in piece.shared(info.root))
+        for piece in reduced_edges(info)
+    )
+    assert taken == pytest.approx(weight.edges.sum() * 2 - freedom[0], rel=1e-5)
+
+
+def test_the_tool_point_of_a_machine_that_turns_is_estimated(machine):
+    """Distances of new pairs are predicted, with the point where it is to half a millimetre."""
+    rng = np.random.default_rng(8)
+    poses = perturb(machine.home(), rng.normal(size=(40, 6)) * np.repeat([0.1, 0.03], 3))
+    pairs = [(k, k + 1) for k in range(39)] + [(k, k + 7) for k in range(33)]
+    data = measured(machine, poses, pairs, rng)
+    estimate = bundle(machine, data, start_state(machine, data, T_TRACKER_BASE[None]))
+    assert estimate.statistics.link_scale < 1.3
+    assert np.sqrt(np.diag(estimate.mount_covariance[1])[3:]).max() < 5e-4
+    T = perturb(machine.home(), rng.normal(size=(20, 6)) * np.repeat([0.1, 0.03], 3))
+    found = estimate.machine.forward(machine.inverse(T))
+    at, expected = marks(found, estimate.state.T_mount[1, :3, 3]), marks(T)
+    apart, known = (np.linalg.norm(x[1:] - x[:-1], axis=1) for x in (at, expected))
+    assert np.sqrt(np.mean((apart - known) ** 2)) < SIGMA
 
 
 def test_without_links_a_configuration_is_eliminated(machine, case):

@@ -39,9 +39,9 @@ END_COLUMNS, VALUE_COLUMN, SIGMA_COLUMN = ("from", "to"), "distance", "sigma"
 LONGEST_IN_SIZES = 4.0
 """Longest distance in times of the machine's size: a tool reaches no further than the machine is
 large to either side, and a nominal model may be wrong by a factor of two."""
-OTHER_UNIT_RATIO = 30.0
+OTHER_UNIT_RATIO = 10.0
 """Ratio of measured to nominal distances, all of them, from which they are in another unit: inches
-for millimetres make 25.4, which a nominal model explains as little as a thousand."""
+for millimetres make 25.4, and no nominal model is wrong by ten."""
 
 
 class DistancesDocument(Schema):
