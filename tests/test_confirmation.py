@@ -13,7 +13,7 @@ from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.confirmation import FAR_FROM_NOMINAL, rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 from pkmcal.printers.session import write_printer_session
 from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss, minimise
 

@@ -15,10 +15,10 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import components
 from pkmcal.identify.reduced_edges import reduced_edges
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.measurements.distances import DistanceSet
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver import elimination, search
 from pkmcal.solver.strips import normal_equations

@@ -20,8 +20,8 @@ from pkmcal.identify.noise import (
     components,
     noise_shares,
 )
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.start import start_state
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import load_mechanism
 from pose_sessions import T_CAMERA_BASE, measured, upright
 from test_identify_scene import JOINT_NOISE, exact, make_scene

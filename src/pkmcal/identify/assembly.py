@@ -10,13 +10,15 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
-from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.link_rows import LinkBlocks, LinkData
 from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBES_ALIKE, Measurements
+from pkmcal.measurements.edges import EdgeBlocks, EdgeData
+from pkmcal.measurements.line_cells import LineCells
+from pkmcal.measurements.poses import PoseBlocks, PoseData
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3

@@ -44,11 +44,11 @@ from pkmcal.identify.noise import (
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.reinstated import innovations
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise

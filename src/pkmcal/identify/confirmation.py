@@ -34,9 +34,9 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import as_pairs
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.search import NO_WEIGHT_DISTANCE, final_loss
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements.readings import joint_rows
 from pkmcal.solver.elimination import divisions, flat
 from pkmcal.solver.strips import Compact, Eliminated, eliminated
 

@@ -32,7 +32,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.kinds import KindRows, kind_rows
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 
 NOISE_CONTRADICTION_CHANCE = 0.01 / 3
 """Probability of contradicting a noise that is stated right: one in a hundred, shared by the three

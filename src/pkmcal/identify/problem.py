@@ -1,7 +1,7 @@
 """The joint estimation as one least-squares problem: all unknowns, all rows, and a step.
 
 Rows of a configuration are its edges, then its limbs' closures, then its boards' poses
-(:mod:`pkmcal.identify.rows`), then what links it to another configuration, if its name stands
+(:mod:`pkmcal.measurements`), then what links it to another configuration, if its name stands
 second there (:mod:`pkmcal.identify.link_rows`). Of J the Jacobian, in blocks::
 
                             machine, stations,          own unknowns of
@@ -39,26 +39,20 @@ from pkmcal.identify.gauge import (
     turned_back,
 )
 from pkmcal.identify.link_rows import LinkBlocks, LinkData, link_rows
-from pkmcal.identify.rows import (
-    EdgeBlocks,
-    EdgeData,
-    EdgeRows,
-    Kinds,
-    MeasurementKind,
-    PoseBlocks,
-    PoseData,
-    PoseRows,
-    ViewData,
-    by_noise,
-    edge_rows,
-    joint_rows,
-    least_joint_noise,
-    pose_rows,
-    rows_at_blocks,
-)
 from pkmcal.identify.structure import Structure, numbered_columns
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import LinkRows
+from pkmcal.measurements.edges import (
+    EdgeBlocks,
+    EdgeData,
+    EdgeRows,
+    ViewData,
+    edge_rows,
+    rows_at_blocks,
+)
+from pkmcal.measurements.poses import PoseBlocks, PoseData, PoseRows, pose_rows
+from pkmcal.measurements.readings import by_noise, joint_rows, least_joint_noise
+from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.mechanisms.closure import (
     Closure,
     by_own,
@@ -134,21 +128,17 @@ class Problem:
         return cast(Structure, self.kept)
 
     @cached_property
-    def kinds(self) -> Kinds[MeasurementKind]:
+    def kinds(self) -> Kinds[RowsOfKind]:
         """The kinds of measurement: edges' rows come first in a configuration, links' last."""
         edges, poses, links = self.data, self.pose_data, self.link_data
         closures = self.closure_rows
         last = closures.stop + 6 * self.pose_blocks.present.shape[1]
         return Kinds(
-            MeasurementKind(
-                slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten
-            ),
-            MeasurementKind(
+            RowsOfKind(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
+            RowsOfKind(
                 slice(closures.stop, last), self.pose_blocks.present, poses.weight, poses.whiten
             ),
-            MeasurementKind(
-                slice(last, None), self.link_blocks.present, links.weight, links.whiten
-            ),
+            RowsOfKind(slice(last, None), self.link_blocks.present, links.weight, links.whiten),
         )
 
     @property
@@ -265,7 +255,7 @@ class Problem:
     def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses, links = self._edges(state, c), self._poses(state), self._links(state)
-        of_edges = edges.value(state)
+        of_edges = edges.value(state.optics, state.shading, state.breathing)
         parts = (
             _in_rows(rows_at_blocks(self.blocks, of_edges)[..., None]),
             self._by_noise(c, c.rows.value[..., None]),
@@ -429,7 +419,8 @@ class Problem:
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        rows = rows_at_blocks(self.blocks, edges.value(state))
+        rows = edges.value(state.optics, state.shading, state.breathing)
+        rows = rows_at_blocks(self.blocks, rows)
         links = plain._links(state).value[..., None]  # noqa: SLF001
         return Kinds(rows, plain._poses(state).value, links)  # noqa: SLF001
 

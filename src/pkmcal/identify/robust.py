@@ -20,8 +20,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds, MeasurementKind
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.solver.search import (
     FULL_WEIGHT_DISTANCE,
     final_loss,
@@ -78,7 +78,7 @@ def clean_norm(share: float, count: Integers) -> Array:
     return out
 
 
-def as_pairs(kind: MeasurementKind) -> Array:
+def as_pairs(kind: RowsOfKind) -> Array:
     """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE
     as of pairs.
     """

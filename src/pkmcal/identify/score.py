@@ -39,9 +39,9 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
-from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
+from pkmcal.measurements.readings import by_noise
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 

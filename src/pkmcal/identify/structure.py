@@ -11,8 +11,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.gauge import move_generators
 from pkmcal.identify.link_rows import LinkBlocks
-from pkmcal.identify.rows import EdgeBlocks
 from pkmcal.identify.unknowns import Unknowns
+from pkmcal.measurements.edges import EdgeBlocks
 from pkmcal.mechanisms.closure import platform_ends
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.solver.strips import StripLayout

@@ -28,9 +28,9 @@ from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
 from pkmcal.solver.search import Stop, minimise

@@ -25,10 +25,10 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
-from pkmcal.identify.rows import PERFECT_CLOSURE_SIGMA
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.held import Held, hold, too_little
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result

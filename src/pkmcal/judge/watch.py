@@ -24,12 +24,12 @@ from pkmcal.calibration.saved import Known, SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.identify.assembly import seen_configurations
-from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
 from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import check_new, known_rows, measured_new_data
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
+from pkmcal.measurements.rows import Kinds
 from pkmcal.outcome import Verdict
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
