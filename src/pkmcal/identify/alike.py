@@ -3,8 +3,8 @@
 What moves one edge of a line, a highlight or something mirrored, moves its neighbours too: errors
 of two edges whose normals are an angle apart are alike by ``exp(-angle / SHADING_ALIKE_ANGLE)``
 (:class:`~pkmcal.measurements.line_cells.LineCells`), the shift's by the part of it that is shading,
-the tilt's by a part ``c`` that the data tell. The estimate counts every edge by itself, and the shading
-of its shift as often as edges share it. Were its normal matrix inverted, that would be the
+the tilt's by a part ``c`` that the data tell. The estimate counts every edge by itself, and the
+shading of its shift as often as edges share it. Were its normal matrix inverted, that would be the
 covariance where it makes the same of all of them; but where a platform's pose takes up what they
 have in common it is far too careful, and of tilts too sure.
 

@@ -1,8 +1,8 @@
 """Silhouette edges of legs in images: the kind, its measurements and their rows.
 
 Two rows an edge, ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the
-edge's covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all edge
-points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
+edge's covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
+edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
 """
 
 from __future__ import annotations
