@@ -72,7 +72,7 @@ class MotorKind(MeasurementKind):
     key: ClassVar[str]
 
 
-class TargetKind(MeasurementKind):
+class TargetKind(MeasurementKind, ABC):
     """A tracker's table, under ``stations.*.tracker``.
 
     headers : columns beside the configuration's, in any order, of each form of the table. known :
@@ -112,7 +112,7 @@ class TargetKind(MeasurementKind):
         return T_tracker_target[:, [k - 3 for k in cls.known if k >= 3], 3]
 
 
-class LinkKind(MeasurementKind):
+class LinkKind(MeasurementKind, ABC):
     """Numbers that link two configurations, under a key of their own in session.yaml.
 
     key, schema : of session.yaml. Each measurement is one number with a standard deviation of its

@@ -142,7 +142,8 @@ class Measurements:
 
     def links_among(self, keep: Booleans) -> Booleans:
         """(n,) links of which both configurations are among those to keep, (K,)."""
-        return keep[self.link_ends].all(axis=1)
+        first, second = self.link_ends.T
+        return keep[first] & keep[second]
 
     def with_links(self, keep: Booleans) -> Measurements:
         """The same with some of the links, (n,)."""

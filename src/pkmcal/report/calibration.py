@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -25,7 +26,7 @@ from pkmcal.files import output_lock, write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
-from pkmcal.measurements import Observation
+from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
@@ -141,7 +142,7 @@ def report_of(
         parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
-        *linked.sections(session, c.measurements, estimate),
+        *linked.sections(session, _links(c), estimate),
         held,
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
@@ -196,7 +197,7 @@ def calibration_cards(
         _tool_sigma(session, estimate, tool),
         moved,
         _tool_change(session, estimate, tool),
-        _data(session, observation, estimate),
+        _data(session, observation, estimate, _links(calibration)),
         _fit(session, estimate),
     )
     return tuple(card for card in found if card)
@@ -280,7 +281,14 @@ def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figur
     )
 
 
-def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
+def _links(calibration: Calibration) -> tuple[LinkSet, ...]:
+    """What links configurations in the estimate, by kind."""
+    return calibration.measurements.links if calibration.session.links else ()
+
+
+def _data(
+    session: Session, observation: Observation, estimate: Estimate, links: Sequence[LinkSet]
+) -> Figure:
     """Photographs and edges, used and not; of a session without any, the trackers' poses, or the
     readings alone.
     """
@@ -312,7 +320,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
         for thing, weights, n, more in (
             ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
             ("pose", estimate.pose_weights, len(estimate.pose_weights), ""),
-            *((one, part, len(part), "") for one, part in linked.weights(session, estimate)),
+            *((one, part, len(part), "") for one, part in linked.weights(links, estimate)),
         )
         if len(weights)
     ]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import LinkSet, Measurements
+from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
@@ -17,11 +19,11 @@ DISPLAY_UNITS = {"m": ("mm", 1e3)}
 """Unit on the page and factor to it, by a kind's own."""
 
 
-def sections(session: Session, measurements: Measurements, estimate: Estimate) -> tuple[Part, ...]:
-    """A section for each kind that the session has."""
+def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> tuple[Part, ...]:
+    """A section for each kind. every : the links of the estimate."""
     out: list[Part] = []
     first = 0
-    for links in measurements.links:
+    for links in every:
         mine = slice(first, first + len(links))
         first += len(links)
         if not len(links):
@@ -50,11 +52,11 @@ def sections(session: Session, measurements: Measurements, estimate: Estimate) -
     return tuple(out)
 
 
-def weights(session: Session, estimate: Estimate) -> list[tuple[str, Array]]:
+def weights(every: Sequence[LinkSet], estimate: Estimate) -> list[tuple[str, Array]]:
     """Of each kind what one of them is called, and the weights."""
     out: list[tuple[str, Array]] = []
     first = 0
-    for links in session.links:
+    for links in every:
         one = measurement_kinds()[links.kind].one
         out.append((one, estimate.link_weights[first : first + len(links)]))
         first += len(links)

@@ -728,6 +728,9 @@ def _resolved(
 ) -> dict[str, Any]:
     """session.yaml with everything that was found for it, in plain data."""
     document = schema.model_dump(mode="json")
+    for kind in kinds_of(LinkKind).values():  # a digest does not depend on which kinds there are
+        if document[kind.key] is None:
+            del document[kind.key]
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
     for station in stations:
