@@ -39,6 +39,8 @@ POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
     ("qw", "qx", "qy", "qz"),
     ("rx", "ry", "rz"),
 )
+DISPLAY_UNITS = {"m": ("mm", 1e3), "px": ("px", 1.0)}
+"""Unit in reports and the factor to it, by a kind's own unit."""
 LEAST_NOISE = 1e-12
 NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
 """m or rad; nothing measures better, nor is of any use that measures worse."""

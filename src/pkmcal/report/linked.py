@@ -9,14 +9,11 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import LinkSet
-from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, capital, count, decimals, number
-
-DISPLAY_UNITS = {"m": ("mm", 1e3)}
-"""Unit on the page and factor to it, by a kind's own."""
 
 
 def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> tuple[Part, ...]:
