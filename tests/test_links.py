@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,14 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import components
 from pkmcal.identify.reduced_edges import reduced_edges
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
+from pkmcal.measurements import (
+    EdgeSet,
+    LinkRows,
+    LinkSet,
+    Measurements,
+    Mount,
+    PoseSet,
+)
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import load_mechanism
@@ -240,6 +247,57 @@ def test_edges_of_linked_configurations(with_edges):
         for piece in reduced_edges(info)
     )
     assert taken == pytest.approx(weight.edges.sum() * 2 - freedom[0], rel=1e-5)
+
+
+@dataclass(frozen=True)
+class Steps(LinkSet):
+    """Differences of height of the tool's point, m: a second kind of link, of these tests only."""
+
+    @property
+    def kind(self):
+        return "steps"
+
+    def rows(self, first, second, mount):
+        point = mount[..., :3, 3:]
+        arms = [(T[..., :3, :3] @ point)[..., 0] for T in (first, second)]
+        rise = (arms[1] + second[..., :3, 3] - arms[0] - first[..., :3, 3])[..., 2]
+        e = np.broadcast_to(np.eye(3)[2], arms[0].shape) / self.sigma[:, None]
+        by = [np.concatenate([np.cross(arm, e), e], axis=-1) for arm in arms]
+        turned = (second[..., :3, :3] - first[..., :3, :3]).mT @ e[..., None]
+        by_mount = np.concatenate([np.zeros_like(e), turned[..., 0]], axis=-1)
+        return LinkRows((rise - self.value) / self.sigma, -by[0], by[1], by_mount)
+
+
+def test_two_kinds_of_links_stand_side_by_side(machine):
+    """Each link has its own row and number, also where some configurations are left out."""
+    rng = np.random.default_rng(11)
+    poses = perturb(machine.home(), rng.normal(size=(12, 6)) * np.repeat([0.1, 0.03], 3))
+    data = measured(machine, poses, [(0, 3), (3, 7), (7, 0)], rng, noise=0.0)
+    pairs = np.array([(3, 0), (5, 7)])
+    rise = marks(poses)[pairs[:, 1], 2] - marks(poses)[pairs[:, 0], 2]
+    rise[1] += 1e-3  # twenty deviations
+    steps = Steps("s.csv", pairs, np.ones(2, dtype=int), rise, np.full(2, 5e-5), np.arange(2))
+    data = replace(data, links=(*data.links, steps))
+    start = start_state(machine, data, T_TRACKER_BASE[None])
+    start = replace(start, T_mount=np.stack([start.T_mount[0], pose(np.eye(3), POINT)]))
+    assembled = assemble(machine, data, default_gauge(machine))
+    rows = assembled.problem.unweighted(batch_of(machine, assembled, start)).links[0]
+    np.testing.assert_allclose(
+        assembled.places.links.taken(rows)[:, 0], [0, 0, 0, 0, -20], atol=1e-3
+    )
+    found, number = data.link_at(4)
+    assert found.kind == "steps"
+    assert number == 1
+    estimate = bundle(machine, data, start)
+    assert estimate.link_residuals.shape == estimate.link_weights.shape == (5,)
+    keep = np.ones(12, dtype=bool)
+    keep[7] = False
+    part = data.with_links(data.links_among(keep))
+    assert [len(links) for links in part.links] == [1, 1]
+    less = assemble(machine, part, default_gauge(machine))
+    assert less.problem.unknowns.n_linked == 12
+    piece = assembled.problem.among(slice(4, 12))
+    assert [len(one) for one in piece.link_blocks.sets] == [1, 1]
 
 
 def test_the_tool_point_of_a_machine_that_turns_is_estimated(machine):

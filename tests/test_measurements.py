@@ -19,6 +19,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.measurements.contract import (
+    DISPLAY_UNITS,
     ImageKind,
     LinkKind,
     MotorKind,
@@ -184,6 +185,7 @@ def test_keys_of_links_are_in_the_session(kind):
     fields = session_schema().model_fields
     assert kind.key in fields
     assert issubclass(kind.schema, Schema)
+    assert kind.unit in DISPLAY_UNITS
     assert not fields[kind.key].is_required()
 
 
