@@ -26,7 +26,7 @@ from pkmcal.measurements import (
 )
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.measurements.rows import Kinds
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.solver import elimination, search
 from pkmcal.solver.strips import normal_equations
 from test_identify_scene import make_scene
@@ -128,6 +128,39 @@ def test_jacobian_against_differences(case):
             expected[row] = linear.by_own[0, row, :, own]
         size = max(np.abs(expected).max(), 1.0)
         np.testing.assert_allclose(by, expected, atol=2e-6 * size)
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_links_of_every_machine(name):
+    """Derivatives of distances alone against differences, hinges and cranks included."""
+    machine, rng = load_mechanism(name), np.random.default_rng(1)
+    reach = np.where(np.array(machine.joint_units) == "m", 0.01, 0.06)
+    joints = machine.inverse(machine.home()[None]) + reach * rng.normal(size=(7, machine.n_joints))
+    if machine.redundancy:  # whose readings have to agree
+        joints = machine.inverse(machine.forward(joints))
+    found = machine.forward_result(joints)
+    joints, poses = joints[found.converged][:5], found.T_base_platform[found.converged][:5]
+    assert len(joints) == 5
+    data = measured(machine, poses, [(0, 3), (3, 1), (4, 0)], rng, noise=0.0, target=False)
+    data = replace(data, joints=joints)
+    start = start_state(machine, data, np.zeros((0, 4, 4)))
+    start = replace(start, T_mount=pose(np.eye(3), POINT)[None])
+    assembled = assemble(machine, data, default_gauge(machine))
+    problem = assembled.problem
+    state, u, rows = batch_of(machine, assembled, start), problem.unknowns, problem.kinds.links.rows
+    np.testing.assert_allclose(problem.residuals(state).value[0][:, rows], 0, atol=1e-6)
+    own = np.zeros((1, 5, problem.layout.own_motion.shape[1]))
+    step = np.zeros((1, u.count))
+    step[:, u.mounts.start : u.linked.stop] = 1e-4 * rng.normal(size=u.linked.stop - u.mounts.start)
+    here = problem.moved(state, step, own)
+    step = 1e-3 * step[:, ::-1].copy() + 1e-3 * step
+    ahead, back = (
+        problem.residuals(problem.moved(here, sign * step, own)).value[0] for sign in (1, -1)
+    )
+    expected = (ahead - back)[:, rows] / 2
+    by = (problem.linearize(here).by_shared[0] @ step[0])[:, rows]
+    assert np.abs(expected).max() > 0
+    np.testing.assert_allclose(by, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def dense(problem, state):
