@@ -15,10 +15,13 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.gather import refinement_of
 from pkmcal.calibration.recognise import known_stations
+from pkmcal.calibration.source import load_source
 from pkmcal.calibration.turns import identify_poses
 from pkmcal.errors import InputError
+from pkmcal.export.contract import make_export
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.session.load import load_session
+from test_heights import flat, pasted
 
 BUILT = printers.Settings(radius=105.6, angle=(210.3, 329.8, 90.0), rod=(270.3, 269.8, 270.1))
 ENDS = (0.8, -0.5, 0.4)
@@ -151,6 +154,16 @@ def test_commands_say_what_was_measured(kit):
     assert {target["name"] for target in saved["targets"]} == {"probe", "distances"}
     page = (kit / "calibration" / "report.html").read_text(encoding="utf-8")
     assert 'id="distances"' in page
+
+
+def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
+    """Klipper's values by heights and distances: flat, level, at Z 0, and as large as told."""
+    done = run("calibrate", kit, "--force")
+    assert done.code == 0, done.out + done.err
+    (text,) = make_export(load_source(kit / "calibration"), "klipper").files.values()
+    z = flat(true, pasted(text))
+    assert np.std(z) < 0.015
+    assert abs(np.mean(z)) < 0.015
 
 
 def test_held_out_configurations_take_their_distances_with_them(kit):

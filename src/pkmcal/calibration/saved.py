@@ -304,10 +304,19 @@ class _Readings(_Part):
     columns: tuple[str, ...] = ()
 
 
+class _Tracker(_Part):
+    level: bool = False
+
+
+class _SessionStation(_Part):
+    tracker: _Tracker | None = None
+
+
 class _Session(_Part):
     folder: str = ""
     digest: str = ""
     joints: _Readings | None = None
+    stations: dict[str, _SessionStation] | None = None
 
 
 class _Saved(_Part):
