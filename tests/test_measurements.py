@@ -29,7 +29,7 @@ from pkmcal.measurements.contract import (
 )
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.session.schema import session_schema
+from pkmcal.session.schema import OBSERVE_WORDS, session_schema
 from test_identify_scene import make_scene
 
 T_STATION_BASE = look_at(np.array([0.9, 0.2, 0.4]), np.array([0.0, 0.0, 0.3]), np.eye(3)[2])
@@ -178,6 +178,12 @@ def test_a_target_is_whitened_where_it_is_measured(kind):
     sigma = np.where(measured < 3, 1e-3, 2e-4)
     np.testing.assert_allclose(np.diag(whiten)[measured], 1 / sigma)
     assert kind.turns() == bool(np.any(measured < 3))
+
+
+def test_words_and_keys_of_a_session_are_those_of_kinds():
+    assert {kind.observe for kind in kinds_of(ImageKind).values()} == set(OBSERVE_WORDS)
+    fields = session_schema().model_fields
+    assert all(kind.key in fields for kind in kinds_of(MotorKind).values())
 
 
 @named(sorted(kinds_of(LinkKind).items()))

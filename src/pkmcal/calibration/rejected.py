@@ -70,8 +70,9 @@ def unused_configurations(
     names = [session.configurations[k] for k in np.flatnonzero(unused)]
     if not names:
         return ()
+    had = "had no usable photograph" if session.stations else "had nothing measured"
     return (
-        f"{count(len(names), 'configuration')} had no usable photograph and did not take part:"
+        f"{count(len(names), 'configuration')} {had} and did not take part:"
         f" {listed(names, MOST_UNITS_NAMED)}.",
     )
 
