@@ -118,7 +118,8 @@ class LinkKind(MeasurementKind, ABC):
     """Numbers that link two configurations, under a key of their own in session.yaml.
 
     key, schema : of session.yaml. Each measurement is one number with a standard deviation of its
-    own, and hangs on a point of the platform that is estimated with the machine.
+    own, and hangs on a point of the platform that is estimated with the machine. Where residuals
+    ask for larger deviations, all kinds of links share one factor.
     """
 
     key: ClassVar[str]
