@@ -156,6 +156,17 @@ def test_commands_say_what_was_measured(kit):
     assert 'id="distances"' in page
 
 
+def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, found):
+    """Three determine the size and leave nothing over; eighteen check each other."""
+    pairs = [(7, 10), (8, 11), (9, 12)]
+    kit = distance_sessions.write(tmp_path, true, np.random.default_rng(3), pairs=pairs)
+    few = calibrate_session(kit)
+    assert few.estimate.statistics.dof_links < 0.3
+    assert few.verdict.usable
+    assert any("one of the distances is wrong" in text for text in few.verdict.warnings)
+    assert not any("one of the distances is wrong" in text for text in found.verdict.warnings)
+
+
 def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
     """Klipper's values by heights and distances: flat, level, at Z 0, and as large as told."""
     done = run("calibrate", kit, "--force")

@@ -19,6 +19,9 @@ from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 from pkmcal.wording import count, listed
 
+LEAST_CHECKED_SHARE = 0.1
+"""Degrees of freedom that a link leaves on average, below which a wrong one goes unnoticed up to
+``4.13 / sqrt(0.1)``, thirteen, of its standard deviations (Baarda 1968)."""
 MOST_UNITS_NAMED = 6
 """Units that a sentence names; the report and calibration.json have all."""
 
@@ -44,11 +47,13 @@ def rejections_in_words(
     at_minimum : whether the estimate is the joint problem's best, as hypotheses about it need.
     """
     units = rejected_units(measurements, estimate)
+    unchecked = _unchecked_links(measurements, estimate) if at_minimum else ()
     if not units:
-        return RejectionWords((), ())
+        return RejectionWords((), unchecked)
     warnings = tuple(_naming_sentences(session, measurements, units))
     if not at_minimum:
         return RejectionWords((), warnings)
+    warnings += unchecked
     if findings.bed:
         tool, sigma, what = bed_by_parameters(estimate), findings.bed.sigma, "the bed"
     else:
@@ -59,6 +64,21 @@ def rejections_in_words(
     if found.shift <= sigma:
         return RejectionWords((), warnings)
     return RejectionWords((_doubt_sentence(session, measurements, found, sigma, what),), warnings)
+
+
+def _unchecked_links(measurements: Measurements, estimate: Estimate) -> tuple[str, ...]:
+    """A sentence on links that determine what no other measurement does, so that a wrong one leaves
+    hardly any residual.
+    """
+    s = estimate.statistics
+    if not measurements.n_links or s.dof_links >= LEAST_CHECKED_SHARE * s.n_links:
+        return ()
+    kinds = [measurement_kinds()[links.kind] for links in measurements.links]
+    labels = listed([kind.label for kind in kinds])
+    return (
+        f"Nothing would show that one of the {labels} is wrong: they determine what no other"
+        " measurement does. Measure each of them again, or more of them.",
+    )
 
 
 def unused_configurations(

@@ -60,9 +60,9 @@ def link_findings(session: Session, poses: Array | None) -> list[Finding]:
         joined = count(len(np.unique(links.configuration)), "configuration")
         text = f"{links.label}: {count(len(links), kind.one)} between {joined}"
         if poses is not None:
-            ends = (poses[links.configuration[:, k]][None] for k in (0, 1))
+            first, second = (poses[links.configuration[:, k]][None] for k in (0, 1))
             still = np.broadcast_to(np.eye(4), (1, len(links), 4, 4))
-            off = links.rows(*ends, still).value[0] * links.sigma
+            off = links.rows(first, second, still).value[0] * links.sigma
             unit, factor = DISPLAY_UNITS[kind.unit]
             rms = float(np.sqrt(np.mean(off**2))) * factor
             text += (
