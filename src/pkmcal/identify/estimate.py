@@ -90,10 +90,10 @@ class Statistics:
     reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     look_scatter: float = 0.0
-    chi2_links: float = 0.0
-    n_links: float = 0.0
-    dof_links: float = 0.0
-    link_scale: float = 1.0
+    chi2_links: float = field(default=0.0, repr=False)
+    n_links: float = field(default=0.0, repr=False)
+    dof_links: float = field(default=0.0, repr=False)
+    link_scale: float = field(default=1.0, repr=False)
     link_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
 
     @property
