@@ -13,7 +13,7 @@ from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.confirmation import FAR_FROM_NOMINAL, rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 from pkmcal.printers.session import write_printer_session
 from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss, minimise
 
@@ -51,7 +51,7 @@ def test_hypotheses_weigh_as_their_solutions_do(found):
     def solved(rejected):
         weight = np.full(n, in_use)
         weight[rejected] = 0.0
-        weights = Kinds(np.zeros(0), weight)
+        weights = Kinds(np.zeros(0), weight, np.zeros(0))
         other = assembled.trusting(weights)
         other = replace(other, prior=problem.prior, prior_target=problem.prior_target)
         one = minimise(other.as_noisy_as_at(info.state), info.state)

@@ -15,10 +15,10 @@ from pkmcal.identify.alike import covariance_of_alike
 from pkmcal.identify.assembly import SHIFT_SIGMA, assemble, lines
 from pkmcal.identify.bundle import as_ended, bundle, solve_batch
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.line_shading import common_shading
-from pkmcal.identify.rows import EdgeData
 from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, TUBES_ALIKE, concatenate
+from pkmcal.measurements.edges import EdgeData
+from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import minimise
 from test_identify_scene import make_scene
 

@@ -14,7 +14,7 @@ from pkmcal.files import csv_text, limits, read_csv, read_json, read_yaml, valid
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.session.photographs import photograph_header
-from pkmcal.session.schema import SessionDocument
+from pkmcal.session.schema import session_schema
 from pkmcal.session.starter import write_session
 
 
@@ -75,7 +75,7 @@ def test_yaml_of_too_many_values_is_read_no_further(tmp_path, text, monkeypatch)
 def test_of_many_faults_in_a_file_the_first_are_looked_at(tmp_path):
     path = tmp_path / "session.yaml"
     path.write_text("".join(f"k{k}: 1\n" for k in range(2000)))
-    message = fault(validated_document, read_yaml(path), SessionDocument)
+    message = fault(validated_document, read_yaml(path), session_schema())
     assert "line 1, k0" in message
     assert int(re.findall(r"and (\d+) more", message)[0]) < limits.MOST_FAULTS_NAMED
 

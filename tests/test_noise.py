@@ -12,7 +12,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.kinds import LINK_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.noise import (
     LEAST_NOISE_FREEDOM,
     NOISE_CONTRADICTION_CHANCE,
@@ -20,10 +20,11 @@ from pkmcal.identify.noise import (
     components,
     noise_shares,
 )
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.start import start_state
+from pkmcal.measurements.distances import DistanceSet
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import load_mechanism
-from pose_sessions import T_CAMERA_BASE, measured, upright
+from pose_sessions import T_CAMERA_BASE, T_PLATFORM_BOARD, measured, upright
 from test_identify_scene import JOINT_NOISE, exact, make_scene
 from test_pose_sessions import make
 
@@ -170,24 +171,36 @@ def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
         assert found.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
 
 
-def pose_problem(name):
-    """A built-in machine's table of poses, at a state near the truth."""
+def pose_problem(name, pairs=()):
+    """A built-in machine's table of poses, at a state near the truth; pairs : of configurations
+    between which a distance of the board was measured.
+    """
     rng = np.random.default_rng(5)
     truth = load_mechanism(name)
     case = measured(truth, upright(rng.uniform(*WITHIN, (9, 4))), rng)
-    start = start_state(truth, case.measurements, T_CAMERA_BASE[None])
-    assembled = assemble(truth, case.measurements, default_gauge(truth))
+    data = case.measurements
+    if pairs:
+        ends, n = np.array(pairs), len(pairs)
+        place = (case.poses @ T_PLATFORM_BOARD)[:, :3, 3]
+        apart = np.linalg.norm(place[ends[:, 1]] - place[ends[:, 0]], axis=1)
+        apart += 3e-5 * rng.normal(size=n)
+        none = np.zeros(n, dtype=int)
+        links = DistanceSet("distances.csv", ends, none, apart, np.full(n, 3e-5), none)
+        data = replace(data, links=(links,))
+    start = start_state(truth, data, T_CAMERA_BASE[None])
+    assembled = assemble(truth, data, default_gauge(truth))
     return assembled.problem, batch_of(truth, assembled, start)
 
 
-@pytest.mark.parametrize("name", ["edges", "h4", "h4-rods"])
+@pytest.mark.parametrize("name", ["edges", "h4", "h4-rods", "h4 with distances"])
 def test_traces_are_those_of_the_hat_matrix(name):
     """Of all rows as one dense matrix; h4-rods has two rods a motor, of which half a row each is
     the reading's and the rest of no kind."""
     if name == "edges":
         problem, state = batch(4, 1e-4, 1e-4, runs=1)
     else:
-        problem, state = pose_problem(name)
+        pairs = [(0, 3), (3, 5), (5, 0), (7, 2)] if name == "h4 with distances" else []
+        problem, state = pose_problem(name.split()[0], pairs)
     linear = problem.linearize(state)
     _, k, r, na = linear.by_shared.shape
     d, c = linear.by_own.shape[-1], len(linear.shared_by)
@@ -198,7 +211,7 @@ def test_traces_are_those_of_the_hat_matrix(name):
     jac /= np.maximum(np.linalg.norm(jac, axis=0), 1e-300)
     u, s, _ = np.linalg.svd(jac, full_matrices=False)
     q = u[: k * r, s > 1e-10 * s[0]]
-    edges, poses = (kind.rows for kind in problem.kinds)
+    edges, poses, links = (kind.rows for kind in problem.kinds)
     m, n = problem.layout.n_readings, problem.layout.n_equations
     pick = np.zeros((k, m, r))
     unit = np.broadcast_to(np.eye(n)[:, None], (n, k, n))
@@ -206,16 +219,17 @@ def test_traces_are_those_of_the_hat_matrix(name):
         [problem.joint_rows(row[None], state)[0] for row in unit], 0, -1
     )
     every = np.eye(k * r).reshape(k, r, k * r)
-    of = [every[:, edges], every[:, poses], pick @ every]
+    of = [every[:, edges], every[:, poses], pick @ every, every[:, links]]
     of = [part.reshape(-1, k * r) for part in of]
     used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
     found = components(Information(problem, state), weight)
     left = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
-    freedom = np.array([np.trace(left[i][i]) for i in range(3)])
+    freedom = np.array([np.trace(left[i][i]) for i in range(4)])
     np.testing.assert_allclose(found.freedom[0], freedom, atol=1e-5)
-    for kind, part in ((READING_ROWS_KIND, of[2]), (POSE_ROWS_KIND, of[1])):
+    for kind in (READING_ROWS_KIND, POSE_ROWS_KIND, LINK_ROWS_KIND):
+        part = of[kind]
         shares = noise_shares(Information(problem, state), kind)
         if not part.size:
             assert not shares.z.size

@@ -8,6 +8,7 @@ import pytest
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, identifiability, reduced_rows
 from pkmcal.identify.noise import components
+from pkmcal.measurements.rows import Kinds
 from pkmcal.papers import linear
 from pkmcal.solver import elimination
 from pkmcal.solver.elimination import condensed, rows_on_shared
@@ -63,8 +64,8 @@ def test_residuals_by_themselves_are_the_same(runs, in_pieces):
 
 def test_what_weights_do_not_change_is_kept():
     problem, truth, _ = problem_of()
-    weighted = problem.weighted(problem.kinds._replace(
-        edges=0.5 * problem.data.weight, poses=problem.pose_data.weight))  # fmt: skip
+    weights = 0.5 * problem.data.weight, problem.pose_data.weight, problem.link_data.weight
+    weighted = problem.weighted(Kinds(*weights))
     assert weighted.structure is problem.structure
     part = problem.among(slice(0, 2))
     assert part.structure is weighted.among(slice(0, 2)).structure is not problem.structure

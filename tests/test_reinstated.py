@@ -10,7 +10,7 @@ import pytest
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.reinstated import innovations
 from pkmcal.identify.robust import as_pairs, norms
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.search import minimise
 from test_noise import pose_problem
 

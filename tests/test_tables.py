@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from faults import fault, written
 from pkmcal.errors import InputError
-from pkmcal.files import csv_text, documents, read_csv, write_text
+from pkmcal.files import csv_text, documents, read_csv, read_pairs, write_text
 from pkmcal.files.limits import MOST_ROWS
 
 HEADER = "configuration,leg1,leg2\n"
@@ -154,3 +154,14 @@ def test_a_number_beyond_any_quantity_is_named_however_plain(tmp_path, cell):
     path = written(tmp_path / "t.csv", HEADER + f"1,1,2\n2,1,{cell}\n")
     with pytest.raises(InputError, match=r"line 3, column .*: this number is too large"):
         read_csv(path)
+
+
+def test_pairs_of_configurations_are_read_as_tables_are(tmp_path):
+    """A byte-order mark, Windows line ends, blanks, quotes, empty lines, a unit in the head."""
+    text = '\ufefffrom,to, distance [mm]\r\n\r\n0001 ,"0002",40.5\r\n0002,0001,40.25\r\n'
+    (tmp_path / "pairs.csv").write_bytes(text.encode("utf-8"))
+    table = read_pairs(tmp_path / "pairs.csv", ("from", "to"), ("distance",), ("sigma",))
+    assert table.pairs == (("0001", "0002"), ("0002", "0001"))
+    assert table.columns == ("distance",)
+    np.testing.assert_allclose(table.values, [[0.0405], [0.04025]], rtol=1e-15)
+    assert table.where(1, 0) == "pairs.csv, line 4, column distance"

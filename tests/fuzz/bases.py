@@ -100,7 +100,7 @@ def by_exif(folder: Path) -> None:
 
 
 def measured(folder: Path, seed: int, count: int) -> None:
-    """A hexapod seen by a laser tracker."""
+    """A hexapod seen by a laser tracker, with distances between places of its tool's point."""
     rng, drawing = np.random.default_rng(seed), load_mechanism("gough-stewart")
     built = np.random.default_rng(0).normal(size=len(drawing.values))
     truth = drawing.with_values(drawing.values + 0.5 * drawing.parameters.tolerance * built)
@@ -124,7 +124,12 @@ def measured(folder: Path, seed: int, count: int) -> None:
     station = {"poses": "poses.csv", "noise": {"position": 2e-5, "rotation": 1e-4}}
     session = {"pkmcal": 1, "mechanism": "mechanism.yaml",
                "joints": {"file": "joints.csv", "noise": 3e-6},
-               "stations": {"tracker": {"tracker": station}}}  # fmt: skip
+               "stations": {"tracker": {"tracker": station}},
+               "distances": {"file": "distances.csv", "noise": 3e-5}}  # fmt: skip
+    marks = (T @ np.array([0.0, 0.0, 0.05, 1.0]))[:, :3]
+    pairs = [(k, k + 2) for k in range(0, count - 2, 2)]
+    rows = [f"{names[a]},{names[b]},{np.linalg.norm(marks[b] - marks[a])!s}" for a, b in pairs]
+    (folder / "distances.csv").write_text("\n".join(["from,to,distance", *rows]) + "\n")
     (folder / "session.yaml").write_text(yaml_text(session))
 
 

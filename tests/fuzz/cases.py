@@ -47,7 +47,8 @@ OWN = ("session.yaml", "mechanism.yaml", "joints.csv", "cameras/*.yaml", "images
 LEGS = tuple(f"legs/{name}" for name in OWN)
 HAND = ("hand/session.yaml", "hand/images/**/*.jpg", "hand/joints.csv")
 TRACKER = tuple(
-    f"tracker/{n}" for n in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv")
+    f"tracker/{n}"
+    for n in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv", "distances.csv")
 )
 LATER = tuple(f"later/{n}" for n in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv"))
 BOARD = ("board/session.yaml", "board/board.yaml", "board/cameras/camera.yaml", "board/joints.csv",

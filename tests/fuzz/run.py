@@ -255,7 +255,7 @@ def _files_of(case: Case) -> set[str]:
         names |= {path.name, path.stem}
         if path.parts[0] in ("legs", "hand", "tracker", "later", "board"):
             names |= {"session.yaml", "joints.csv", "images/", "mechanism.yaml", "cameras/"}
-            names |= {"poses.csv", "board.yaml"}
+            names |= {"poses.csv", "board.yaml", "distances.csv"}
     return names
 
 

@@ -190,8 +190,11 @@ def _frozen(t, rng):
 
 def _scaled(t, rng):
     factor = rng.choice([1e3, -1.0, 57.3, 1e300, 1e-300, 0.0])
+    column = t.column
+    if t.table[0][column] in ("from", "to"):
+        column = len(t.table[0]) - 1  # names cannot be scaled
     for cells in t.table[1:]:
-        cells[t.column] = repr(float(cells[t.column]) * factor)
+        cells[column] = repr(float(cells[column]) * factor)
 
 
 def _long(t, rng):

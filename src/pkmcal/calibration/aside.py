@@ -187,14 +187,15 @@ def _check(n: int, left: int, total: int, what: str) -> None:
 
 
 def select(measurements: Measurements, keep: Booleans) -> Measurements:
-    """The measurements of some configurations (K,); readings keep their rows.
+    """The measurements of some configurations (K,); readings keep their rows. Links stay where both
+    of their configurations do.
 
     Boards on the base hang on no configuration and stay.
     """
     edges, poses = measurements.edges, measurements.poses
     on_base = ~measurements.on_platform[poses.mount]
     return replace(
-        measurements,
+        measurements.with_links(measurements.links_among(keep)),
         edges=edges.select(keep[edges.configuration]),
         poses=poses.select(keep[poses.configuration] | on_base),
     )

@@ -147,7 +147,7 @@ def _looked(
 
     with ThreadPoolExecutor(THREADS) as pool:
         edges = dict(zip(stations, pool.map(look, stations), strict=True))
-    only = replace(session.of_stations(stations), trackers=())
+    only = replace(session.of_stations(stations), trackers=(), links=())
     shown = boards.of(np.array(stations, dtype=int))
     numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
     measurements = measurements_of(only, shown, numbered)

@@ -21,6 +21,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import (
     BREATHING_SIGMA,
     EdgeSet,
+    LinkSet,
     Measurements,
     Mount,
     Observation,
@@ -185,7 +186,7 @@ def measurements_of(
     cameras: CameraRefinement | None = None,
 ) -> Measurements:
     """What is measured; no cameras at a first look, which is too coarse to refine any."""
-    # What targets are fixed to: the board, then each tracker's own.
+    # What targets are fixed to: the board, then each tracker's own, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
     breathing = np.zeros(0)
@@ -203,6 +204,10 @@ def measurements_of(
     for k, table in enumerate(session.trackers, start=len(session.stations)):
         sets.append(table.poses(k, len(mounts)))
         mounts.append(Mount(table.name, "platform"))
+    links: list[LinkSet] = []
+    for one in session.links:
+        links.append(one.at_mount(len(mounts)))
+        mounts.append(Mount(one.kind, "platform"))
     measurements = Measurements(
         edges=edges,
         joints=session.joints,
@@ -211,6 +216,7 @@ def measurements_of(
         camera_of_station=session.camera_of_station,
         poses=concatenate(sets),
         mounts=tuple(mounts),
+        links=tuple(links),
         level=np.array(
             [False] * len(session.stations) + [table.level for table in session.trackers],
             dtype=bool,

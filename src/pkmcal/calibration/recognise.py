@@ -14,6 +14,7 @@ from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
+from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.evidence import StationView
@@ -413,7 +414,7 @@ def _by_poses(session: Session, boards: Boards, known: Array) -> Array:
 
 def _tracker_starts(session: Session) -> list[Array | None]:
     """First poses of trackers whose points or heights do not tell their turn."""
-    if not session.trackers:
+    if not session.trackers and not session.links:
         return []
     try:
         found = session.machine.forward_result(session.joints)
@@ -422,6 +423,8 @@ def _tracker_starts(session: Session) -> list[Array | None]:
     poses = np.where(found.converged[:, None, None], found.T_base_platform, np.nan)
     for table in session.trackers:
         check_lengths(table, poses)
+    for links in session.links:
+        kinds_of(LinkKind)[links.kind].check_start(links, poses)
     return [table.start(poses) for table in session.trackers]
 
 

@@ -25,6 +25,7 @@ from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import BREATHING_SIGMA
+from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.session.photographs import label_of
@@ -61,6 +62,9 @@ EDGE_COLUMNS = (
 )  # fmt: skip
 """Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations;
 coarse is 1 where the edge was not measured but told by its silhouette, else 0."""
+LINK_COLUMNS = ("from", "to", "weight", "value", "sigma", "residual")
+"""Of a row in residuals of what links two configurations: these as numbers from 1, the value and
+its stated standard deviation in SI, the residual in standard deviations."""
 POSE_COLUMNS = (
     "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
 )  # fmt: skip
@@ -283,7 +287,7 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     """
     session, estimate = calibration.session, calibration.estimate
     nowhere = {station.name for station in session.stations if station.handheld}
-    nowhere |= {table.name for table in session.trackers if table.kind == "heights"}
+    nowhere |= {table.name for table in session.trackers if table.kind == Heights.code}
     names = session.station_names
     kept = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
@@ -449,7 +453,23 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
             estimate.pose_weights,
             estimate.pose_residuals,
         ),
+        **_link_residuals(calibration),
     }
+
+
+def _link_residuals(calibration: Calibration) -> dict[str, Any]:
+    """Those of each kind of link that the session has, under its name."""
+    estimate, links = calibration.estimate, calibration.measurements.links
+    out: dict[str, Any] = {"link_columns": LINK_COLUMNS} if links else {}
+    first = 0
+    for one in links:
+        mine = slice(first, first + len(one))
+        first = mine.stop
+        reals = (estimate.link_weights[mine], one.value, one.sigma, estimate.link_residuals[mine])
+        ends = (one.configuration + 1).tolist()
+        values = np.column_stack(reals).tolist()
+        out[one.kind] = [[*pair, *row] for pair, row in zip(ends, values, strict=True)]
+    return out
 
 
 def rejected_photographs(session: Session) -> list[dict[str, Any]]:

@@ -261,6 +261,7 @@ class _Statistics(_Part):
     noise_scale: Factor = 1.0
     pose_scale: Factor = 1.0
     reading_scale: Factor = 1.0
+    link_scale: Factor = 1.0
     chi2: float = 0.0
     dof: float = 0.0
     chi2_edges: float = 0.0
@@ -271,6 +272,8 @@ class _Statistics(_Part):
     n_drawing: float = 0.0
     chi2_poses: float = 0.0
     n_poses: float = 0.0
+    chi2_links: float = 0.0
+    n_links: float = 0.0
     steps: int = 0
     stopped: str = ""
 
@@ -303,10 +306,19 @@ class _Readings(_Part):
     columns: tuple[str, ...] = ()
 
 
+class _Tracker(_Part):
+    level: bool = False
+
+
+class _SessionStation(_Part):
+    tracker: _Tracker | None = None
+
+
 class _Session(_Part):
     folder: str = ""
     digest: str = ""
     joints: _Readings | None = None
+    stations: dict[str, _SessionStation] | None = None
 
 
 class _Saved(_Part):

@@ -21,6 +21,7 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera, written_camera
 from pkmcal.errors import InputError, legible
 from pkmcal.files import closest, resolved
+from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
@@ -173,9 +174,27 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
         reasons=() if saved.verdict.usable else saved.verdict.reasons,
         calibrated=True,
         frames=saved.gauge,
-        bed=(saved.document.get("bed") or {}).get("z"),
+        bed=_bed(saved),
         session=session_words if told else "",
     )
+
+
+def _bed(saved: SavedCalibration) -> float | None:
+    """Height of the platform's origin over a bed that was felt, m, base frame, where it is 0 there;
+    None where none was felt, or none that is level.
+    """
+    if saved.document.get("bed"):
+        return saved.document["bed"].get("z")
+    stations = (saved.document.get("session") or {}).get("stations") or {}
+    targets = saved.document.get("targets") or []
+    mounts = {one.get("name"): one.get("T_platform_target") for one in targets}
+    for station in saved.stations:
+        tracker = (stations.get(station.name) or {}).get("tracker") or {}
+        mount = mounts.get(station.name)
+        if tracker.get("level") is True and mount is not None:  # then its table is of heights
+            target = np.array(mount)
+            return -float(inverse(station.T_base_camera)[2, 3] + target[2, 3])
+    return None
 
 
 def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:

@@ -457,7 +457,8 @@ def _reached(session: Session, measurements: Measurements, start: State) -> Stat
     if drawn.all():
         return start
     poses = measurements.poses
-    first = replace(measurements, poses=poses.select(drawn[poses.configuration]))
+    first = measurements.with_links(measurements.links_among(drawn))
+    first = replace(first, poses=poses.select(drawn[poses.configuration]))
     estimate = bundle(session.machine, first, start)
     found = estimate.machine.forward_result(session.joints)
     bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
@@ -646,7 +647,7 @@ def _images_given_up(measurements: Measurements, estimate: Estimate) -> tuple[Re
     return tuple(
         Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
         for unit in rejected_units(measurements, estimate)
-        if unit.pose < 0
+        if unit.is_image
     )
 
 

@@ -37,7 +37,12 @@ from pkmcal.check.advice import advice
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck
 from pkmcal.check.forecast import forecast
 from pkmcal.check.look import Look, StationLook
-from pkmcal.check.words import board_findings, joint_findings, station_findings
+from pkmcal.check.words import (
+    board_findings,
+    joint_findings,
+    link_findings,
+    station_findings,
+)
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.bundle import as_ended
@@ -91,6 +96,7 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     seen = _observed(session, photographs, motion.poses, seed, told)
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
+    findings += link_findings(session, motion.poses)
     findings += [note(text) for text in numbering_told(session)]
     told("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
+from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
 from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import listed
+from pkmcal.wording import brief, count, listed
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
@@ -45,6 +47,30 @@ KINEMATICS_SENTENCE = (
     "The drawing's machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
     " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
 )
+
+
+def link_findings(session: Session, poses: Array | None) -> list[Finding]:
+    """How far what links configurations is from the nominal machine, a sentence for each kind.
+
+    poses : T_base_platform (K, 4, 4) by the nominal machine, None where it has none.
+    """
+    out: list[Finding] = []
+    for links in session.links:
+        kind = measurement_kinds()[links.kind]
+        joined = count(len(np.unique(links.configuration)), "configuration")
+        text = f"{links.label}: {count(len(links), kind.one)} between {joined}"
+        if poses is not None:
+            first, second = (poses[links.configuration[:, k]][None] for k in (0, 1))
+            still = np.broadcast_to(np.eye(4), (1, len(links), 4, 4))
+            off = links.rows(first, second, still).value[0] * links.sigma
+            unit, factor = DISPLAY_UNITS[kind.unit]
+            rms = float(np.sqrt(np.mean(off**2))) * factor
+            text += (
+                f"; by the readings and the drawing they are {brief(rms)} {unit} off (root mean"
+                " square)"
+            )
+        out.append(note(f"{text}."))
+    return out
 
 
 def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:

@@ -85,11 +85,11 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
     from pkmcal.files import read_yaml, validated_document, wanted_file
-    from pkmcal.session.schema import SessionDocument
+    from pkmcal.session.schema import session_schema
     from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
-    schema = validated_document(session, SessionDocument)
+    schema = validated_document(session, session_schema())
     seen = [schema.cameras[name] for name in schema.observers("board")]
     if not seen or schema.board is None:
         raise InputError(

@@ -44,7 +44,7 @@ from pkmcal.files.quantities import (
 from pkmcal.files.refusals import next_step_after
 from pkmcal.files.regular import check_regular, resolved
 from pkmcal.files.schema import Schema, validated_document
-from pkmcal.files.tables import CsvTable, csv_text, read_csv
+from pkmcal.files.tables import CsvTable, PairTable, csv_text, read_csv, read_pairs
 from pkmcal.files.writing import (
     alone_in,
     check_own_folder,
@@ -75,6 +75,7 @@ __all__ = [
     "Exif",
     "Keys",
     "Metres",
+    "PairTable",
     "Point",
     "Radians",
     "Reading",
@@ -101,6 +102,7 @@ __all__ = [
     "read_csv",
     "read_exif",
     "read_json",
+    "read_pairs",
     "read_text",
     "read_yaml",
     "remember",

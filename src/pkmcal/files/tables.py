@@ -91,7 +91,7 @@ def read_csv(
         )
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
-    _check_header(header, columns, f"{label}, line {header_line}")
+    _check_header(header, columns, f"{label}, line {header_line}", (CONFIGURATION_COLUMN,))
     check_count(len(header), MOST_COLUMNS, "columns", f"{label}, line {header_line}")
     lines: dict[str, int] = {}
     values = array("d")
@@ -124,6 +124,57 @@ def read_csv(
     return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()), units)
 
 
+@dataclass(frozen=True)
+class PairTable(CsvTable):
+    """Rows that name two configurations each, in ``pairs``; ``names`` has both as one text, not
+    all different.
+    """
+
+    pairs: tuple[tuple[str, str], ...] = ()
+
+
+def read_pairs(
+    path: Path | str,
+    heads: tuple[str, str],
+    columns: Sequence[str],
+    optional: Sequence[str] = (),
+    label: str | None = None,
+) -> PairTable:
+    """Read a table whose rows name two configurations, under ``heads``, and then have numbers.
+
+    columns : all of them needed; optional : that may be there; in any order.
+    """
+    path = Path(path)
+    label = label or path.name
+    rows = _rows((line for block in text_blocks(path, label) for line in io.StringIO(block)), label)
+    example = ",".join((*heads, *columns))
+    header_line, header = next(rows, (0, None))
+    if header is None:
+        raise InputError("the file is empty", where=label, expected=f"a header: {example}")
+    found = [split_head(head) for head in header[2:]]
+    header[2:] = [name for name, _ in found]
+    _check_header(
+        header, [*columns, *(c for c in optional if c in header)], f"{label}, line {header_line}",
+        heads,
+    )  # fmt: skip
+    pairs, lines, values = list[tuple[str, str]](), list[int](), list[list[float]]()
+    for line, cells in rows:
+        where = f"{label}, line {line}"
+        numbers = _numbers(cells, header, where, len(heads))
+        _check_length(cells[:2], where)
+        factors = (unit.factor if unit else 1.0 for _, unit in found)
+        values.append([x * factor for x, factor in zip(numbers, factors, strict=True)])
+        pairs.append((cells[0], cells[1]))
+        lines.append(line)
+        check_count(len(lines), MOST_ROWS, "rows", where)
+    if not lines:
+        raise InputError("there are no rows under the header", where=label)
+    names = tuple(f"{a} to {b}" for a, b in pairs)
+    units = tuple(unit for _, unit in found)
+    numbers = np.array(values)
+    return PairTable(label, tuple(header[2:]), names, numbers, tuple(lines), units, tuple(pairs))
+
+
 def csv_text(columns: Sequence[str], names: Sequence[str], values: Array) -> str:
     """Write a table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
     stream = io.StringIO()
@@ -152,7 +203,10 @@ def _rows(lines: Iterable[str], label: str) -> Iterator[tuple[int, list[str]]]:
         ) from None
 
 
-def _check_header(header: list[str], columns: Sequence[str] | None, where: str) -> None:
+def _check_header(
+    header: list[str], columns: Sequence[str] | None, where: str, first: tuple[str, ...]
+) -> None:
+    """First : names of the columns that name configurations."""
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
             raise InputError(
@@ -163,13 +217,16 @@ def _check_header(header: list[str], columns: Sequence[str] | None, where: str) 
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
             )
-    if header[0] != CONFIGURATION_COLUMN:
+    if tuple(header[: len(first)]) != first:
+        several = len(first) > 1
+        other = "columns have other names" if several else "column has another name"
         raise InputError(
-            "the header's first column has another name" if len(header) > 1 else "no header",
+            f"the header's first {other}" if len(header) > 1 else "no header",
             where=where,
-            found=shown(header[0]),
-            expected=CONFIGURATION_COLUMN,
-            next_step=f"Begin the file with the line {CONFIGURATION_COLUMN},<one column a number>",
+            found=shown(",".join(header[: len(first)])),
+            expected=",".join(first),
+            next_step=f"Begin the file with the line {','.join(first)},"
+            + (",".join(columns or ()) if several else "<one column a number>"),
         )
     _check_length(header, where)
     if "" in header:
@@ -178,10 +235,10 @@ def _check_header(header: list[str], columns: Sequence[str] | None, where: str) 
     twice = [name for name, times in Counter(header).items() if times > 1]
     if twice:
         raise InputError(f"the header names {listed(twice)} twice", where=where)
-    if len(header) == 1:
-        raise InputError("there is no column of numbers", where=where, found=CONFIGURATION_COLUMN)
+    if len(header) == len(first):
+        raise InputError("there is no column of numbers", where=where, found=",".join(first))
     if columns is not None:
-        _check_columns(header[1:], columns, where)
+        _check_columns(header[len(first) :], columns, where)
 
 
 def _check_columns(found: Sequence[str], known: Sequence[str], where: str) -> None:
@@ -212,8 +269,8 @@ def _quickly(cells: list[str]) -> list[float] | None:
     return numbers if max(map(abs, numbers), default=0.0) <= LARGEST_WRITTEN_NUMBER else None
 
 
-def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
-    """The row's numbers, (m,)."""
+def _numbers(cells: list[str], header: list[str], where: str, first: int = 1) -> list[float]:
+    """The row's numbers, (m,), behind the ``first`` cells, which are names."""
     if len(cells) != len(header):
         raise InputError(
             "the row has another number of cells than the header",
@@ -221,11 +278,13 @@ def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
             found=f"{len(cells)} cells",
             expected=f"{len(header)} ({', '.join(header)})",
         )
-    if not cells[0]:
-        raise InputError(f"the {header[0]} has no name", where=where)
+    for cell, column in zip(cells[:first], header[:first], strict=True):
+        if not cell:
+            who = f"the {column}" if first == 1 else f"the configuration under {column}"
+            raise InputError(f"{who} has no name", where=where)
     return [
         _number(cell, f"{where}, column {column}")
-        for cell, column in zip(cells[1:], header[1:], strict=True)
+        for cell, column in zip(cells[first:], header[first:], strict=True)
     ]
 
 

@@ -2,9 +2,9 @@
 
 What moves one edge of a line, a highlight or something mirrored, moves its neighbours too: errors
 of two edges whose normals are an angle apart are alike by ``exp(-angle / SHADING_ALIKE_ANGLE)``
-(:class:`~pkmcal.identify.line_cells.LineCells`), the shift's by the part of it that is shading, the
-tilt's by a part ``c`` that the data tell. The estimate counts every edge by itself, and the shading
-of its shift as often as edges share it. Were its normal matrix inverted, that would be the
+(:class:`~pkmcal.measurements.line_cells.LineCells`), the shift's by the part of it that is shading,
+the tilt's by a part ``c`` that the data tell. The estimate counts every edge by itself, and the
+shading of its shift as often as edges share it. Were its normal matrix inverted, that would be the
 covariance where it makes the same of all of them; but where a platform's pose takes up what they
 have in common it is far too careful, and of tilts too sure.
 
@@ -30,9 +30,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.covariance import Information
-from pkmcal.identify.line_cells import LineCells
 from pkmcal.identify.reduced_edges import reduced_edges
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
+from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import take
 
 MOST_TILTS_COMPARED = 800

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar, cast
 
 import numpy as np
 
@@ -11,11 +10,15 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
-from pkmcal.identify.line_cells import LineCells
+from pkmcal.identify.link_rows import LinkBlocks, LinkData
+from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBES_ALIKE, Measurements
+from pkmcal.measurements.edges import EdgeBlocks, EdgeData
+from pkmcal.measurements.line_cells import LineCells
+from pkmcal.measurements.poses import PoseBlocks, PoseData
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -23,41 +26,14 @@ SHIFT_SIGMA = 0.3
 LEVEL_SIGMA = 1e-6
 """rad, of a bed that is level by definition: a tenth of a micrometre over a printer's bed."""
 
-FilledNumbers = TypeVar("FilledNumbers", Array, Integers)
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where N measurements stand among K' configurations of G places each: row, place (N,)."""
-
-    row: Integers
-    place: Integers
-    shape: tuple[int, int]
-
-    def filled(self, values: FilledNumbers) -> FilledNumbers:
-        """Values (N, ...) at their places, (K', G, ...); zero where there is none."""
-        count, each = self.shape
-        out = np.zeros((count * each, *values.shape[1:]), dtype=values.dtype)
-        out[self.row * each + self.place] = values
-        return cast(FilledNumbers, out.reshape(*self.shape, *values.shape[1:]))
-
-    def taken(self, values: Array) -> Array:
-        """Of values (K', G, ...) those at the measurements' places, (N, ...)."""
-        return values[self.row, self.place]
-
-    @property
-    def present(self) -> Booleans:
-        """(K', G) where there is one."""
-        return self.filled(np.ones(len(self.row), dtype=int)).astype(bool)
-
 
 @dataclass(frozen=True)
 class Assembled:
     """A problem and where its rows come from.
 
-    seen : (K,) configurations with at least one edge, or pose of a board on the platform, or all
-    without a station; only they are in the problem. places : where each kind's measurements stand
-    among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
+    seen : (K,) configurations with at least one edge, link, or pose of a board on the platform, or
+    all without a station; only they are in the problem. places : where each kind's measurements
+    stand among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
     shading, breathing, size, mount, level or gauge.
     """
 
@@ -96,6 +72,7 @@ def assemble(
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
     poses = _places(measurements.poses.configuration, seen, one)
+    link_blocks, link_data = _links(measurements, seen)
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
@@ -105,6 +82,7 @@ def assemble(
         n_mounts=len(measurements.mounts),
         n_breathing=len(measurements.breathing_at),
         n_sizes=sum(mount.tolerance > 0 for mount in measurements.mounts),
+        n_linked=len(link_blocks.linked) * machine.layout.own_motion.shape[1],
     )
     prior, target, kinds = prior_rows(
         machine,
@@ -135,8 +113,10 @@ def assemble(
         frames=exact_moves(machine),
         pose_blocks=pose_blocks,
         pose_data=pose_data,
+        link_blocks=link_blocks,
+        link_data=link_data,
     )
-    return Assembled(problem, seen, Kinds(edges, poses), kinds)
+    return Assembled(problem, seen, Kinds(edges, poses, link_blocks.at), kinds)
 
 
 def seen_configurations(measurements: Measurements) -> Booleans:
@@ -147,13 +127,16 @@ def seen_configurations(measurements: Measurements) -> Booleans:
     if not measurements.n_stations:
         return np.ones(n, dtype=bool)
     on_platform = measurements.on_platform[poses.mount]
-    rows = np.concatenate([measurements.edges.configuration, poses.configuration[on_platform]])
+    linked = [links.configuration.ravel() for links in measurements.links]
+    rows = [measurements.edges.configuration, poses.configuration[on_platform], *linked]
+    rows = np.concatenate(rows)
     return np.bincount(rows, minlength=n) > 0
 
 
 def _check(machine: Machine, measurements: Measurements) -> None:
     edges, joints = measurements.edges, measurements.joints
-    if measurements.n_stations and len(edges) == 0 and len(measurements.poses) == 0:
+    seen = len(edges) + len(measurements.poses) + measurements.n_links
+    if measurements.n_stations and not seen:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
             next_step="check the photographs, the stations' poses and the tubes of the drawing",
@@ -164,6 +147,13 @@ def _check(machine: Machine, measurements: Measurements) -> None:
             found=f"{joints.shape[-1]} columns",
             expected=f"{machine.n_joints}, one an actuated leg",
         )
+    for links in measurements.links:
+        if int(links.configuration.max(initial=-1)) >= len(joints):
+            raise InputError(
+                what="a link names a configuration that does not exist",
+                found=str(int(links.configuration.max())),
+                expected=f"below {len(joints)}",
+            )
     for items in (edges, measurements.poses):
         configuration = int(items.configuration.max(initial=-1))
         station = int(items.station.max(initial=-1))
@@ -293,6 +283,24 @@ def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData
     return blocks, PoseData(
         target[None], whiten[None], weight[None], at.filled(optics)[None], breathing
     )
+
+
+def _links(measurements: Measurements, seen: Booleans) -> tuple[LinkBlocks, LinkData]:
+    """The links, each among the rows of its second configuration."""
+    rows = np.cumsum(seen) - 1  # of each configuration among the seen ones
+    ends = [np.zeros((0, 2), dtype=int), *(one.configuration for one in measurements.links)]
+    ends = np.concatenate(ends)
+    linked = np.unique(ends)
+    number = np.full(len(seen), -1)
+    number[linked] = np.arange(len(linked))
+    sets = tuple(
+        replace(one, configuration=number[one.configuration]) for one in measurements.links
+    )
+    at = _places(ends[:, 1], seen, np.zeros(len(ends), dtype=int))
+    sigma = np.concatenate([np.zeros(0), *(one.sigma for one in measurements.links)])
+    blocks = LinkBlocks(sets, rows[linked], number[seen], at)
+    whiten = at.filled(1 / sigma)[None, ..., None, None]
+    return blocks, LinkData(at.present[None].astype(float), whiten)
 
 
 def prior_rows(

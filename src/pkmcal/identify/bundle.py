@@ -25,7 +25,12 @@ from pkmcal.identify.covariance import (
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
-from pkmcal.identify.kinds import EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.kinds import (
+    EDGE_ROWS_KIND,
+    LINK_ROWS_KIND,
+    POSE_ROWS_KIND,
+    READING_ROWS_KIND,
+)
 from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.noise import (
     LARGEST_NOISE_STEP,
@@ -39,11 +44,11 @@ from pkmcal.identify.noise import (
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.reinstated import innovations
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
@@ -139,7 +144,7 @@ def solve_batch(
     larger than stated by more than this factor.
     """
     n_runs = start.z.shape[0]
-    ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs))
+    ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
     present = (kind.present.astype(float) for kind in problem.kinds)
     every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
     # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
@@ -188,7 +193,11 @@ def _settle(
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, trust = fit.scale, fit.edges, fit.trust
         if scale_noise:
-            scale = Kinds(np.ones_like(scale.edges), _pose_scale(fit))
+            scale = Kinds(
+                np.ones_like(scale.edges),
+                _scale_of(fit, fit.scale.poses, POSE_ROWS_KIND),
+                _scale_of(fit, fit.scale.links, LINK_ROWS_KIND),
+            )
             if scale.poses.min() > hopeless:
                 return replace(fit, scale=scale)
             edges = _edges(fit, by_tube, number)
@@ -324,15 +333,15 @@ def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
     return replace(fit.edges, scale=scale)
 
 
-def _pose_scale(fit: BatchResult) -> Array:
-    """The factor on the poses' stated noise that makes their chi2 equal its degrees of freedom,
-    (B,), from the one in use; kept as it is where too few remain to judge it.
+def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
+    """The factor on the stated noise of poses, or of links, that makes their chi2 equal its degrees
+    of freedom, (B,), from the one in use; kept as it is where too few remain to judge it.
     """
-    scale = fit.scale.poses
-    if not fit.info.problem.kinds.poses.present.any():
+    kinds = fit.info.problem.kinds
+    if not (kinds.poses if kind == POSE_ROWS_KIND else kinds.links).present.any():
         return scale
     found = fit.components
-    chi2, freedom = found.chi2[:, POSE_ROWS_KIND], found.freedom[:, POSE_ROWS_KIND]
+    chi2, freedom = found.chi2[:, kind], found.freedom[:, kind]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
@@ -436,6 +445,7 @@ def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled,
     weights = Kinds(
         estimate.edge_weights * estimate.edge_trust,
         estimate.pose_weights / statistics.pose_scale**2,
+        estimate.link_weights / statistics.link_scale**2,
     )
     assembled = replace(assembled, problem=assembled.trusting(weights))
     return assembled, Information(assembled.problem, batch_of(machine, assembled, estimate.state))
@@ -472,10 +482,11 @@ def _estimate(
     identified = machine.with_values(state.theta)
     optics, variance = own_blocks(shared, u.optics, u.n_optics), np.diagonal(shared)
     factor = measurements.intrinsics_factor
-    edges, poses = problem.unweighted(found)
+    edges, poses, links = problem.unweighted(found)
     residuals = Kinds(
         assembled.places.edges.taken(edges[0]),
         assembled.places.poses.taken(poses[0] / result.scale.poses[0]),
+        assembled.places.links.taken(links[0] / result.scale.links[0]),
     )
     weighted = zip(assembled.places, result.weight, strict=True)
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
@@ -500,6 +511,8 @@ def _estimate(
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
+        link_residuals=residuals.links[:, 0],
+        link_weights=weights.links,
         line_shading=problem.data.shading[0],
         line_shift=(problem.data.shading * found.shading)[0],
         line_shift_sigma=problem.data.shading[0] * np.sqrt(variance[u.shading]),
@@ -527,25 +540,27 @@ def _statistics(
     """What the residuals (1, K, r) and their number say of the fit."""
     problem, state = result.info.problem, result.info.state
     kinds = np.array(assembled.priors)
-    rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
+    rows = [kind.rows for kind in problem.kinds]
+    rows.insert(1, problem.closure_rows)
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
     chi2[0] = float(np.sum(result.edges.squares(problem.blocks, value[..., rows[0]])))
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     prior = problem.prior_values(state)[0] - problem.prior_target
     chi2_drawing = float(np.sum(prior[drawn] ** 2))
-    n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
+    n_edges, n_poses, n_links = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
     # what is known beforehand of mounts is no measurement: unknowns that nothing else tells count
     # as little as it does
     prior_rows = problem.prior[~np.isin(kinds, ("gauge", "mount"))]
     normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
-    unknowns = rank_of_normal(normal) + value.shape[1] * problem.layout.own_motion.shape[1]
+    own = value.shape[1] * problem.layout.own_motion.shape[1] - problem.unknowns.n_linked
+    unknowns = rank_of_normal(normal) + own
     found = result.components
     freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
-        dof=n_edges + n_joints + n_poses + n_drawing - unknowns,
+        dof=n_edges + n_joints + n_poses + n_links + n_drawing - unknowns,
         chi2_edges=chi2[0],
         n_edges=n_edges,
         chi2_joints=chi2[1],
@@ -564,6 +579,11 @@ def _statistics(
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(result.reading_noise, result.reading_scale),
         pose_range=_range(noise_shares(result.info, POSE_ROWS_KIND), result.scale.poses),
+        chi2_links=chi2[3],
+        n_links=n_links,
+        link_scale=float(result.scale.links[0]),
+        dof_links=freedom[LINK_ROWS_KIND],
+        link_range=_range(noise_shares(result.info, LINK_ROWS_KIND), result.scale.links),
         shading=float(np.median(problem.data.shading[0])),
         look_scatter=float(np.sqrt(look_variance)),
     )

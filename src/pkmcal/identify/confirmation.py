@@ -34,9 +34,9 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import as_pairs
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.search import NO_WEIGHT_DISTANCE, final_loss
 
@@ -48,14 +48,19 @@ MOST_REJECTED_UNITS = 50
 """Units, from the first on, that are looked at: where more are rejected, the share is the reason
 not to use the result."""
 
+IMAGE_ROW, LINK_ROW, DROPPED_LINK_ROW = -1, -2, -3
+"""In the place of a configuration, of units that are no poses."""
+
 
 @dataclass(frozen=True)
 class RejectedUnit:
-    """What a user measured at once, and the estimate rejected: a height, a board, an image.
+    """What a user measured at once, and the estimate rejected: a height, a board, an image, a
+    distance.
 
-    pose : its number among the measured poses, -1 for the edges of an image. station, configuration
-    : where. right : probability that it is right after all. shift : m, root mean square, by which
-    the hypotheses in which it is let the tool be elsewhere.
+    pose : its number among the measured poses, -1 for all else. link : its number among the links,
+    -1 for all else. station, configuration : where; of a link -1 and its second one. right :
+    probability that it is right after all. shift : m, root mean square, by which the hypotheses in
+    which it is let the tool be elsewhere.
     """
 
     pose: int
@@ -63,6 +68,12 @@ class RejectedUnit:
     configuration: int
     right: float = 0.0
     shift: float = 0.0
+    link: int = -1
+
+    @property
+    def is_image(self) -> bool:
+        """Whether it is the edges of an image."""
+        return self.pose < 0 and self.link < 0
 
 
 @dataclass(frozen=True)
@@ -103,7 +114,7 @@ class _Normal(NamedTuple):
 
 
 def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[RejectedUnit, ...]:
-    """Measured poses without half of their weight, and images of which most edges are."""
+    """Measured poses and links without half of their weight, and images of which most edges are."""
     poses, edges = measurements.poses, measurements.edges
     lost = np.flatnonzero(estimate.pose_weights < 0.5).tolist()
     out = [RejectedUnit(k, int(poses.station[k]), int(poses.configuration[k])) for k in lost]
@@ -112,6 +123,9 @@ def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[Reje
     rejected = np.bincount(own.ravel(), estimate.edge_weights < 0.5, len(image))
     every = np.bincount(own.ravel(), minlength=len(image))
     out += [RejectedUnit(-1, int(s), int(c)) for s, c in image[2 * rejected > every]]
+    lost = np.flatnonzero(estimate.link_weights < 0.5).tolist()
+    ends = measurements.link_ends
+    out += [RejectedUnit(-1, -1, int(ends[k, 1]), link=k) for k in lost]
     return tuple(out)
 
 
@@ -174,7 +188,10 @@ class _Cases(NamedTuple):
 
     base : of the estimate (1). readmission : by how much each rejected unit changes it (n); loss :
     (n,) what these cost as they are. row : (n,) the configuration of each in the problem, for
-    poses; -1 for images.
+    poses; -1 for images, LINK_ROW for links.
+
+    in_use, losses : (K, G) each of poses and of links: whether it is in use, and what it costs
+    rejected.
     """
 
     problem: Problem
@@ -182,8 +199,8 @@ class _Cases(NamedTuple):
     readmission: _Normal
     loss: Array
     row: Integers
-    in_use: Booleans
-    pose_loss: Array
+    in_use: Kinds[Booleans]
+    losses: Kinds[Array]
 
     @classmethod
     def of(
@@ -201,18 +218,24 @@ class _Cases(NamedTuple):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
+        links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
-        pose_loss = full / np.maximum(as_pairs(problem.kinds.poses), 1e-9) ** 2
+        losses = Kinds(*(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.kinds))
         edges = measurements.edges
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
-            weight = Kinds(edge_weight.copy(), pose_weight.copy())
-            if unit.pose >= 0:
-                places = assembled.places.poses
-                row, place = int(places.row[unit.pose]), int(places.place[unit.pose])
-                weight.poses[row, place] = 1 / estimate.statistics.pose_scale**2
-                loss.append(float(pose_loss[row, place]))
-                rows.append(row)
+            weight = Kinds(edge_weight.copy(), pose_weight.copy(), links.copy())
+            if not unit.is_image:
+                of_links = unit.link >= 0
+                places = assembled.places.links if of_links else assembled.places.poses
+                number = unit.link if of_links else unit.pose
+                row, place = int(places.row[number]), int(places.place[number])
+                if of_links:
+                    weight.links[0, row, place] = 1 / estimate.statistics.link_scale**2
+                else:
+                    weight.poses[row, place] = 1 / estimate.statistics.pose_scale**2
+                loss.append(float((losses.links if of_links else losses.poses)[row, place]))
+                rows.append(LINK_ROW if of_links else row)
             else:
                 own = (edges.station == unit.station) & (edges.configuration == unit.configuration)
                 own = np.flatnonzero(own & (estimate.edge_weights < 0.5))
@@ -220,38 +243,44 @@ class _Cases(NamedTuple):
                 row = int(places.row[own[0]])
                 weight.edges[places.row[own], places.place[own]] = 1.0
                 loss.append(full * len(own))
-                rows.append(-1)
+                rows.append(IMAGE_ROW)
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
-            new = problem.weighted(Kinds(weight.edges[None], weight.poses[None])).among(cut)
+            new = Kinds(weight.edges[None], weight.poses[None], weight.links)
+            new = problem.weighted(new).among(cut)
             changes.append(
                 _normal_equations(new, there).plus(
                     _normal_equations(problem.among(cut), there), -1.0
                 )
             )
         readmission = _Normal(*(np.concatenate(x) for x in zip(*changes, strict=True)))
-        in_use = problem.kinds.poses.present & (pose_weight > 0)
-        return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, pose_loss)
+        in_use = Kinds(*(kind.present & (kind.weight[0] > 0) for kind in problem.kinds))
+        return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, losses)
 
     def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
-        """Without one more pose each: the change of the normal equations, what it then costs, and
-        its configuration in the problem, some at a time.
+        """Without one more pose, or link, each: the change of the normal equations, what it then
+        costs, and its configuration in the problem, some at a time.
         """
-        if not (self.row >= 0).any():
+        if not (self.row != IMAGE_ROW).any():
             return
         for cut in divisions(*self.problem.extent):
             part, there = self.problem.among(cut), self.problem.state_among(state, cut)
             before = _normal_equations(part, there)
-            for place in range(self.in_use.shape[1]):
-                in_use = np.flatnonzero(self.in_use[cut, place])
-                if not in_use.size:
-                    continue
-                weight = part.pose_data.weight.copy()
-                weight[:, :, place] = 0.0
-                without = part.weighted(Kinds(part.data.weight, weight))
-                change = _normal_equations(without, there).plus(before, -1.0)
-                row = np.arange(len(self.in_use))[cut][in_use]
-                yield change.at(in_use), self.pose_loss[row, place], row
+            weights = Kinds(*(kind.weight for kind in part.kinds))
+            for name in ("poses", "links"):
+                used, losses = getattr(self.in_use, name), getattr(self.losses, name)
+                for place in range(used.shape[1]):
+                    in_use = np.flatnonzero(used[cut, place])
+                    if not in_use.size:
+                        continue
+                    weight = getattr(weights, name).copy()
+                    weight[:, :, place] = 0.0
+                    without = part.weighted(weights._replace(**{name: weight}))
+                    change = _normal_equations(without, there).plus(before, -1.0)
+                    row = np.arange(len(used))[cut][in_use]
+                    # no own unknowns stand between a link and others of its configuration
+                    of = row if name == "poses" else np.full(len(row), DROPPED_LINK_ROW)
+                    yield change.at(in_use), losses[row, place], of
 
 
 def _normal_equations(problem: Problem, state: BatchState) -> _Normal:

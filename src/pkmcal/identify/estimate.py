@@ -64,6 +64,8 @@ class Statistics:
     reading_range, pose_range : factors on the stated noise that the data allow, smallest and
     largest, None for no end (:mod:`pkmcal.identify.noise`). look_scatter : what the result scatters
     by with where edges were looked for, in the deviations that noise gives it; they contain it.
+    chi2_links, n_links, dof_links, link_scale, link_range : of measurements that link two
+    configurations, as those of poses.
     """
 
     chi2: float
@@ -88,6 +90,11 @@ class Statistics:
     reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     look_scatter: float = 0.0
+    chi2_links: float = field(default=0.0, repr=False)
+    n_links: float = field(default=0.0, repr=False)
+    dof_links: float = field(default=0.0, repr=False)
+    link_scale: float = field(default=1.0, repr=False)
+    link_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
 
     @property
     def chi2_as_stated(self) -> float:
@@ -98,6 +105,7 @@ class Statistics:
         """
         chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
         chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
+        chi2 += self.chi2_links * self.link_scale**2
         return chi2 / self.dof if self.dof > 0 else float("nan")
 
 
@@ -118,6 +126,8 @@ class Estimate:
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
+    link_residuals, link_weights : (N,) of measurements that link two configurations, those of one
+    kind after the other.
     line_shading : (n,) px, standard deviation of each tube's side's shading at each station;
         line_shift : (n,) px outward, what it came to, and line_shift_sigma : (n,) how well that is
         known. Lines are numbered by :func:`~pkmcal.identify.assembly.lines`.
@@ -143,6 +153,8 @@ class Estimate:
     intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
+    link_residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    link_weights: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     line_shift: Array = field(default_factory=lambda: np.zeros(0))
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))

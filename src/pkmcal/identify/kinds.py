@@ -12,12 +12,13 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import joint_rows
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements.readings import joint_rows
 from pkmcal.solver.elimination import divisions, flat
 from pkmcal.solver.strips import Compact, Eliminated, eliminated
 
-EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND = range(3)
+EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND = range(4)
+ROWS_KINDS = 4
 """Kinds of rows in the axes of :class:`KindSums`."""
 
 
@@ -25,9 +26,9 @@ class KindSums(NamedTuple):
     """Sums over the configurations c of B runs; kinds k of rows as :data:`EDGE_ROWS_KIND`.
 
     With Q of the own Jacobian in a configuration and its reduced rows A, Q_k and A_k those of a
-    kind: trace sum_c tr Q_k^T Q_k (B, 3), normal sum_c A_k^T A_k (B, 3, na, na). every : sum_c A^T
+    kind: trace sum_c tr Q_k^T Q_k (B, 4), normal sum_c A_k^T A_k (B, 4, na, na). every : sum_c A^T
     A (B, na, na) of all rows, those that are of no kind, as of rods of constant length, among them.
-    chi2 : (B, 3). value : (B, K, r) residuals, zero where nothing can be predicted or is there.
+    chi2 : (B, 4). value : (B, K, r) residuals, zero where nothing can be predicted or is there.
     """
 
     trace: Array
@@ -51,8 +52,8 @@ class KindRows(NamedTuple):
 def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     """Those of a problem's rows at a state."""
     n_runs, na = len(state.z), problem.unknowns.count
-    trace, normal = np.zeros((n_runs, 3)), np.zeros((n_runs, 3, na, na))
-    every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3))
+    trace, normal = np.zeros((n_runs, ROWS_KINDS)), np.zeros((n_runs, ROWS_KINDS, na, na))
+    every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROWS_KINDS))
     values: list[Array] = []
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
@@ -63,7 +64,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
         if part.kinds.edges.present.any():
             trace[:, EDGE_ROWS_KIND] += np.einsum("bcii->b", found.own)
             normal[:, EDGE_ROWS_KIND] += found.strips_normal
-        for kind in (POSE_ROWS_KIND, READING_ROWS_KIND):
+        for kind in (POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND):
             own, shared, _ = _rows_of_kind(part, rows, found, by_reading, kind)
             if shared.size:
                 trace[:, kind] += np.sum(own**2, axis=(1, 2, 3))
@@ -73,7 +74,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
 
 
 def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
-    """The rows of poses or of readings at a state."""
+    """The rows of poses, readings or links at a state."""
     parts: list[KindRows] = []
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
@@ -86,11 +87,13 @@ def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
 def _rows_of_kind(
     problem: Problem, rows: Compact, found: Eliminated, by_reading: Array, kind: int
 ) -> KindRows:
-    """The rows of poses or of readings in some configurations; by_reading (B, K, E)."""
+    """The rows of poses, readings or links in some configurations; by_reading (B, K, E)."""
     equations, start = problem.layout.n_equations, problem.closure_rows.start
     parts = found.q, found.rows, rows.value[:, :, start:, None]
-    if kind == POSE_ROWS_KIND:
-        own, shared, value = (part[:, :, equations:] for part in parts)
+    if kind in (POSE_ROWS_KIND, LINK_ROWS_KIND):
+        last = problem.kinds.links.rows.start - start
+        cut = slice(equations, last) if kind == POSE_ROWS_KIND else slice(last, None)
+        own, shared, value = (part[:, :, cut] for part in parts)
     else:
         own, shared, value = (
             _readings(problem, part[:, :, :equations], by_reading) for part in parts
@@ -104,8 +107,9 @@ def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
 
 
 def _chi2(problem: Problem, value: Array, by_reading: Array) -> Array:
-    """Sums of squares of each kind, (B, 3), of residuals (B, K, r)."""
+    """Sums of squares of each kind, (B, 4), of residuals (B, K, r)."""
     closures = problem.closure_rows
     readings = _readings(problem, value[..., closures, None], by_reading)[..., 0]
-    parts = value[..., : closures.start], value[..., closures.stop :], readings
+    poses, links = (value[..., kind.rows] for kind in problem.kinds[1:])
+    parts = value[..., : closures.start], poses, readings, links
     return np.stack([np.sum(part**2, axis=(1, 2)) for part in parts], axis=-1)

@@ -32,7 +32,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.kinds import KindRows, kind_rows
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 
 NOISE_CONTRADICTION_CHANCE = 0.01 / 3
 """Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
@@ -64,7 +64,7 @@ takes hardly longer than that of one."""
 class Components:
     """What B solutions leave of each kind of rows, see the module.
 
-    chi2 : (B, 3) sums of squares of the residuals. freedom : (B, 3) tr R_kk, what they are expected
+    chi2 : (B, 4) sums of squares of the residuals. freedom : (B, 4) tr R_kk, what they are expected
     to be.
     """
 
@@ -80,9 +80,10 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     """
     problem, sums, half = info.problem, info.by_kind, info.root
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
-    count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
+    edges, poses, links = counts(problem, weight)
+    count = np.stack([edges, poses, np.full(len(half), n_readings), links], axis=-1)
     kinds = np.flatnonzero(count.any(axis=0))
-    shared = np.zeros((len(half), 3))
+    shared = np.zeros(count.shape)
     covariance = half @ half.mT
     shared[:, kinds] = np.einsum("bkij,bij->bk", sums.normal[:, kinds], covariance)
     return Components(chi2=sums.chi2, freedom=count - sums.trace - shared)

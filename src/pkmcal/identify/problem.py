@@ -1,7 +1,19 @@
 """The joint estimation as one least-squares problem: all unknowns, all rows, and a step.
 
 Rows of a configuration are its edges, then its limbs' closures, then its boards' poses
-(:mod:`pkmcal.identify.rows`). Rows on shared unknowns: ``(theta - drawing) / tolerance``, what is
+(:mod:`pkmcal.measurements`), then what links it to another configuration, if its name stands
+second there (:mod:`pkmcal.identify.link_rows`). Of J the Jacobian, in blocks::
+
+                            machine, stations,          own unknowns of
+                            cameras, boards    linked   configurations 1  2  3
+    configuration 1              x                                     x
+    configuration 2              x                                        x
+    3, linked to 4               x               x
+    4, linked to 3               x               x
+    known beforehand             x
+
+The own unknowns of linked configurations are shared, so that all others can be eliminated one
+configuration after the other. Rows on shared unknowns: ``(theta - drawing) / tolerance``, what is
 known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identify.assembly`).
 """
 
@@ -26,25 +38,21 @@ from pkmcal.identify.gauge import (
     station_generators,
     turned_back,
 )
-from pkmcal.identify.rows import (
+from pkmcal.identify.link_rows import LinkBlocks, LinkData, link_rows
+from pkmcal.identify.structure import Structure, numbered_columns
+from pkmcal.identify.unknowns import BatchState, Unknowns
+from pkmcal.measurements import LinkRows
+from pkmcal.measurements.edges import (
     EdgeBlocks,
     EdgeData,
     EdgeRows,
-    Kinds,
-    MeasurementKind,
-    PoseBlocks,
-    PoseData,
-    PoseRows,
     ViewData,
-    by_noise,
     edge_rows,
-    joint_rows,
-    least_joint_noise,
-    pose_rows,
     rows_at_blocks,
 )
-from pkmcal.identify.structure import Structure, numbered_columns
-from pkmcal.identify.unknowns import BatchState, Unknowns
+from pkmcal.measurements.poses import PoseBlocks, PoseData, PoseRows, pose_rows
+from pkmcal.measurements.readings import by_noise, joint_rows, least_joint_noise
+from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.mechanisms.closure import (
     Closure,
     by_own,
@@ -72,6 +80,7 @@ class _Evaluated(NamedTuple):
     closure: Closure
     edges: EdgeRows
     poses: PoseRows
+    links: LinkRows
 
 
 @dataclass(frozen=True)
@@ -82,9 +91,9 @@ class Problem:
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,).
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
-    pose_blocks, pose_data : of boards. slopes : (B, K, E) closures by their readings, which tell
-    their noise, where they are held; None where they are the state's own. kept : the
-    :attr:`structure`, which problems of the same measurements share.
+    pose_blocks, pose_data : of boards. link_blocks, link_data : of links. slopes : (B, K, E)
+    closures by their readings, which tell their noise, where they are held; None where they are the
+    state's own. kept : the :attr:`structure`, which problems of the same measurements share.
     """
 
     layout: LimbLayout
@@ -99,12 +108,17 @@ class Problem:
     frames: Array
     pose_blocks: PoseBlocks
     pose_data: PoseData
+    link_blocks: LinkBlocks
+    link_data: LinkData
     slopes: Array | None = None
     kept: Structure | None = None
 
     def __post_init__(self) -> None:
         """The structure of a problem of the same measurements stays."""
-        parts = self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames
+        parts = (
+            self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
+            self.link_blocks,
+        )  # fmt: skip
         if self.kept is None or not self.kept.made_of(*parts):
             object.__setattr__(self, "kept", Structure(*parts))
 
@@ -114,17 +128,17 @@ class Problem:
         return cast(Structure, self.kept)
 
     @cached_property
-    def kinds(self) -> Kinds[MeasurementKind]:
-        """The kinds of measurement: edges' rows come first in a configuration, poses' last."""
-        edges, poses = self.data, self.pose_data
+    def kinds(self) -> Kinds[RowsOfKind]:
+        """The kinds of measurement: edges' rows come first in a configuration, links' last."""
+        edges, poses, links = self.data, self.pose_data, self.link_data
         closures = self.closure_rows
+        last = closures.stop + 6 * self.pose_blocks.present.shape[1]
         return Kinds(
-            MeasurementKind(
-                slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten
+            RowsOfKind(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
+            RowsOfKind(
+                slice(closures.stop, last), self.pose_blocks.present, poses.weight, poses.whiten
             ),
-            MeasurementKind(
-                slice(closures.stop, None), self.pose_blocks.present, poses.weight, poses.whiten
-            ),
+            RowsOfKind(slice(last, None), self.link_blocks.present, links.weight, links.whiten),
         )
 
     @property
@@ -139,6 +153,7 @@ class Problem:
             self,
             data=of_runs(self.data, runs),
             pose_data=of_runs(self.pose_data, runs),
+            link_data=of_runs(self.link_data, runs),
             joint_noise=of_runs(self.joint_noise, runs),
             slopes=None if self.slopes is None else of_runs(self.slopes, runs),
         )
@@ -155,6 +170,8 @@ class Problem:
             data=self.data.among(configurations),
             pose_blocks=self.pose_blocks.among(configurations),
             pose_data=self.pose_data.among(configurations),
+            link_blocks=structure.link_blocks,
+            link_data=self.link_data.among(configurations),
             slopes=None if self.slopes is None else self.slopes[:, configurations],
         )
 
@@ -164,7 +181,14 @@ class Problem:
             state,
             T_base_platform=state.T_base_platform[:, configurations],
             internal=state.internal[:, configurations],
+            linked=self._linked_poses(state),
         )
+
+    def _linked_poses(self, state: BatchState) -> Array:
+        """T_base_platform (B, J, 4, 4) of the linked configurations."""
+        if state.linked.shape[1]:
+            return state.linked
+        return state.T_base_platform[:, self.link_blocks.linked]
 
     def weighted(self, weight: Kinds[Array]) -> Problem:
         """The same problem with other weights (B, K, G) of each kind's measurements."""
@@ -172,6 +196,7 @@ class Problem:
             self,
             data=replace(self.data, weight=weight.edges),
             pose_data=replace(self.pose_data, weight=weight.poses),
+            link_data=replace(self.link_data, weight=weight.links),
         )
 
     def as_noisy_as_at(self, state: BatchState) -> Problem:
@@ -229,31 +254,38 @@ class Problem:
 
     def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
-        edges, poses = self._edges(state, c), self._poses(state)
-        of_edges = edges.value(state)
+        edges, poses, links = self._edges(state, c), self._poses(state), self._links(state)
+        of_edges = edges.value(state.optics, state.shading, state.breathing)
         parts = (
             _in_rows(rows_at_blocks(self.blocks, of_edges)[..., None]),
             self._by_noise(c, c.rows.value[..., None]),
             _in_rows(poses.value[..., None]),
+            links.value[..., None],
         )
         value = np.concatenate(parts, axis=2)[..., 0]
         shared_value = self.prior_values(state) - self.prior_target
-        return _Evaluated(value, of_edges, shared_value, c, edges, poses)
+        return _Evaluated(value, of_edges, shared_value, c, edges, poses, links)
 
     def _rows(self, found: _Evaluated) -> Compact:
         """The rows at a point, from what was needed of it for its residuals."""
         usable = np.isfinite(found.value) & self._in_use
         by_closures, by_pose = self._of_closures(found.closure)
         by_boards, by_board = self._of_boards(found.poses)
-        by_own = np.concatenate([by_pose, by_board], axis=2)
+        by_links = self._of_links(found.links)
+        no_own = np.zeros((*by_links.shape[:3], by_pose.shape[-1]))
+        by_own = np.concatenate([by_pose, by_board, no_own], axis=2)
         by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
+        rest = self._of_rest(by_closures, np.concatenate([by_boards, by_links], axis=2))
+        for k, columns in zip(*self.structure.strips.linked_places, strict=True):
+            rest[:, k, :, columns] += np.moveaxis(by_own[:, k], -1, 0)
+            by_own[:, k] = 0.0
         return Compact(
             np.where(usable, found.value, 0.0),
             usable,
             found.shared_value,
             self.prior,
             Strips(self.structure.strips, self._of_edges(found.edges, found.of_edges)),
-            self._of_rest(by_closures, by_boards),
+            rest,
             by_own,
         )
 
@@ -311,7 +343,8 @@ class Problem:
     @cached_property
     def n_rows(self) -> int:
         """Rows of a configuration, r."""
-        return self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
+        links = self.link_blocks.present.shape[1]
+        return self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6 + links
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -354,6 +387,25 @@ class Problem:
         out[~np.isfinite(poses.value + out.sum(axis=-1))] = 0.0
         return _in_rows(out), _in_rows(own)
 
+    def _of_links(self, links: LinkRows) -> Array:
+        """Derivatives (B, K, G, na) of the links by all shared unknowns: the own unknowns of both
+        configurations, which are shared, and the mount.
+        """
+        u, blocks, freedoms = self.unknowns, self.link_blocks, self.layout.freedoms
+        out = np.zeros((*links.value.shape, u.count))
+        d, at = self.layout.own_motion.shape[1], (blocks.at.row, blocks.at.place)
+        each = (links.by_first[..., freedoms], links.by_second[..., freedoms])
+        n = each[0].shape[-1]
+        for number, by in zip(blocks.ends.T, each, strict=True):
+            columns = u.linked.start + d * number[:, None] + np.arange(n)
+            out[:, at[0][:, None], at[1][:, None], columns] += by
+        columns = numbered_columns(u.mounts, blocks.mount, 6)
+        out[:, at[0][:, None], at[1][:, None], columns] += links.by_mount
+        return out
+
+    def _links(self, state: BatchState) -> LinkRows:
+        return link_rows(self.link_blocks, self.link_data, self._linked_poses(state), state.T_mount)
+
     def unweighted(self, state: BatchState) -> Kinds[Array]:
         """Residuals of each kind, (B, K, G, n), in the deviations that each measurement has by
         itself: without weights, and without what edges that are shaded alike count for together.
@@ -367,8 +419,10 @@ class Problem:
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        rows = rows_at_blocks(self.blocks, edges.value(state))
-        return Kinds(rows, plain._poses(state).value)  # noqa: SLF001
+        rows = edges.value(state.optics, state.shading, state.breathing)
+        rows = rows_at_blocks(self.blocks, rows)
+        links = plain._links(state).value[..., None]  # noqa: SLF001
+        return Kinds(rows, plain._poses(state).value, links)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
@@ -422,11 +476,11 @@ class Problem:
     @cached_property
     def _in_use(self) -> Booleans:
         """Rows that are not padding and not weighted away, (B or 1, K, r)."""
-        edges, poses = (
+        edges, poses, links = (
             np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.kinds
         )
-        runs, n = max(len(edges), len(poses)), edges.shape[1]
-        parts = (edges, np.ones((1, n, self.layout.n_equations), dtype=bool), poses)
+        runs, n = max(len(edges), len(poses), len(links)), edges.shape[1]
+        parts = (edges, np.ones((1, n, self.layout.n_equations), dtype=bool), poses, links)
         parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)
 
@@ -438,6 +492,10 @@ class Problem:
         drawing's soft hold on the frames would be found along a curved valley.
         """
         u, layout = self.unknowns, self.layout
+        if len(self.link_blocks.linked):
+            own = own.copy()
+            each = (len(own), len(self.link_blocks.linked), own.shape[-1])
+            own[:, self.link_blocks.linked] = shared[:, u.linked].reshape(each)
         z = shared[:, u.machine]
         moves = z @ self.structure.moves_of.T
         y, slides = moves[:, :12], moves[:, 12:]

@@ -28,6 +28,7 @@ class ReducedEdges:
 
     problem : of these configurations, from ``first`` on. value : (B, N, r) residuals. own : (B, N,
     d, r) what the own unknowns take up, q. numbers : (B, w, N, r) rows by the strips' unknowns.
+    by_linked : (B, N, d, r) rows by the own unknowns of linked configurations, which are shared.
     """
 
     problem: Problem
@@ -36,6 +37,7 @@ class ReducedEdges:
     value: Array
     own: Array
     numbers: Array
+    by_linked: Array
     found: Eliminated
 
     @property
@@ -59,8 +61,11 @@ class ReducedEdges:
         at = self.layout.configuration
         of_own = (self.found.along @ half[:, None]).mT
         by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
+        linked = self.layout.linked
         for cut, columns in zip(self.layout.groups, self.layout.columns, strict=True):
             taken = by_shared[:, None, columns].mT @ self.numbers[:, :, cut].swapaxes(1, 2)
+            if linked is not None:
+                taken = taken + by_shared[:, linked[at[cut]]].mT @ self.by_linked[:, cut]
             yield cut, taken - of_own[:, at[cut]] @ self.own[:, cut]
 
 
@@ -76,8 +81,15 @@ def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
         numbers = _turned(rows.strips.numbers, unit[:, *_edges_at(layout)])
         d = layout.n_own
-        own = found.inverse.mT[:, layout.configuration] @ numbers[:, :d].swapaxes(1, 2)
-        yield ReducedEdges(part, cut.start, layout, numbers[:, -1], own, numbers[:, d:-1], found)
+        by_own = numbers[:, :d].swapaxes(1, 2)
+        own = found.inverse.mT[:, layout.configuration] @ by_own
+        by_linked = by_own[:, :, :0]
+        if layout.linked is not None:
+            shares = (layout.linked[:, 0] >= 0)[layout.configuration, None, None]
+            own, by_linked = np.where(shares, 0.0, own), np.where(shares, by_own, 0.0)
+        yield ReducedEdges(
+            part, cut.start, layout, numbers[:, -1], own, numbers[:, d:-1], by_linked, found
+        )
 
 
 def _edges_at(layout: StripLayout) -> tuple[Integers, Integers]:

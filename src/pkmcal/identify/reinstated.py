@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.robust import as_pairs
-from pkmcal.identify.rows import Kinds
+from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.strips import eliminated
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds, MeasurementKind
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.solver.search import (
     FULL_WEIGHT_DISTANCE,
     final_loss,
@@ -78,7 +78,7 @@ def clean_norm(share: float, count: Integers) -> Array:
     return out
 
 
-def as_pairs(kind: MeasurementKind) -> Array:
+def as_pairs(kind: RowsOfKind) -> Array:
     """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE
     as of pairs.
     """
@@ -197,7 +197,8 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
     usual, _, _ = robust_cost(part, state, scaled=scaled)
     every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.kinds)
     one = np.ones(len(runs))
-    other = RobustStart(state, Kinds(*(p.astype(float) for p in every)), Kinds(one, one), 0)
+    every = Kinds(*(p.astype(float) for p in every))
+    other = RobustStart(state, every, Kinds(one, one, one), 0)
     poses, before = bool(problem.kinds.poses.present.any()), np.full(len(runs), np.inf)
     for _ in range(MOST_REWEIGHTINGS):
         parts = zip(other.weight, other.scale, strict=True)

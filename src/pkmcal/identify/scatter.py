@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
-from pkmcal.identify.rows import EdgeBlocks, EdgeData
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+from pkmcal.measurements.edges import EdgeBlocks, EdgeData
 
 NUMBERS_AN_EDGE = 2
 """Numbers that an edge measures."""

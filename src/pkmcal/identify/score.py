@@ -39,9 +39,9 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
-from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
+from pkmcal.measurements.readings import by_noise
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 
@@ -502,7 +502,7 @@ def columns_of(
         out[:, part.closure_rows] = by_noise(layout, noise, c.by_reading, by[None])[0]
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
-        before, after = out[:, : part.closure_rows.start], out[:, part.closure_rows.stop :]
+        before, after = (out[:, kind.rows] for kind in part.kinds[:2])
         for where, edges, poses in placed:
             shape = (len(out), -1, where.stop - where.start)
             if edges is not None:

@@ -10,8 +10,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.gauge import move_generators
-from pkmcal.identify.rows import EdgeBlocks
+from pkmcal.identify.link_rows import LinkBlocks
 from pkmcal.identify.unknowns import Unknowns
+from pkmcal.measurements.edges import EdgeBlocks
 from pkmcal.mechanisms.closure import platform_ends
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.solver.strips import StripLayout
@@ -52,10 +53,14 @@ class Structure:
     unknowns: Unknowns
     blocks: EdgeBlocks
     frames: Array
+    link_blocks: LinkBlocks
 
     def made_of(self, *parts: object) -> bool:
         """Whether it is made of these, in their order."""
-        own = self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames
+        own = (
+            self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
+            self.link_blocks,
+        )  # fmt: skip
         return all(mine is other for mine, other in zip(own, parts, strict=True))
 
     @cached_property
@@ -67,7 +72,11 @@ class Structure:
         """That of some configurations only."""
         key = configurations.start, configurations.stop
         if key not in self._parts:
-            self._parts[key] = replace(self, blocks=self.blocks.among(configurations))
+            self._parts[key] = replace(
+                self,
+                blocks=self.blocks.among(configurations),
+                link_blocks=self.link_blocks.among(configurations),
+            )
         return self._parts[key]
 
     @cached_property
@@ -126,7 +135,17 @@ class Structure:
             rows=rows.reshape(len(rows), rows.shape[1] * n_rows),
             groups=views.groups,
             columns=columns if self.turn is None else self.turn.columns,
+            linked=self.linked_columns if len(self.link_blocks.linked) else None,
         )
+
+    @cached_property
+    def linked_columns(self) -> Integers:
+        """(K, d) the shared columns of each configuration's own unknowns; -1 where it is not
+        linked.
+        """
+        d, number = self.layout.own_motion.shape[1], self.link_blocks.number
+        columns = self.unknowns.linked.start + d * number[:, None] + np.arange(d)
+        return np.where(number[:, None] < 0, -1, columns)
 
     @cached_property
     def strip_parameters(self) -> Integers:

@@ -131,7 +131,8 @@ def explain(
 def only_heights(estimate: Estimate) -> bool:
     """Whether nothing but heights was measured: what is not measured leaves no residual."""
     poses = estimate.pose_residuals
-    return not estimate.edge_weights.size and len(poses) > 0 and not poses[:, :5].any()
+    others = estimate.edge_weights.size + estimate.link_weights.size
+    return not others and len(poses) > 0 and not poses[:, :5].any()
 
 
 def identified(machine: Machine, covariance: Array) -> Booleans:

@@ -13,9 +13,11 @@ Shared by all configurations, in this order of columns:
 - **sizes** : of each board whose size is not known exactly, the excess of its size over what its
   file says (in units of its tolerance).
 - **mounts** : left perturbation of each T_mount, of boards and targets.
+- **linked** : the own unknowns, see below, of each configuration that a measurement links to
+  another: the rows of both depend on them, so they are shared.
 
-Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
-T_base_platform, along the directions that the machine has) and, on an articulated platform, its
+Each other configuration has unknowns of its own besides: the platform's motion (left perturbation
+of T_base_platform, along the directions that the machine has) and, on an articulated platform, its
 hinges; :attr:`~pkmcal.mechanisms.layout.LimbLayout.own_motion` says how.
 """
 
@@ -39,6 +41,7 @@ Name = Literal[
     "breathing",
     "sizes",
     "mounts",
+    "linked",
 ]
 
 
@@ -48,7 +51,8 @@ class Unknowns:
 
     n_free : of the machine. n_optics : of each camera, one and the refined intrinsics. n_lines :
     tubes' sides at stations with a shading of their own. n_breathing : stations where focal lengths
-    breathe, all or none. n_sizes : boards of unsure size.
+    breathe, all or none. n_sizes : boards of unsure size. n_linked : own unknowns, all together, of
+    the configurations that are linked.
     """
 
     n_free: int
@@ -59,6 +63,7 @@ class Unknowns:
     n_mounts: int = 0
     n_breathing: int = 0
     n_sizes: int = 0
+    n_linked: int = 0
 
     @cached_property
     def machine(self) -> slice:
@@ -97,9 +102,14 @@ class Unknowns:
         return slice(self.sizes.stop, self.sizes.stop + 6 * self.n_mounts)
 
     @cached_property
+    def linked(self) -> slice:
+        """The columns of linked configurations' own unknowns."""
+        return slice(self.mounts.stop, self.mounts.stop + self.n_linked)
+
+    @cached_property
     def count(self) -> int:
         """Number of shared unknowns, na."""
-        return self.mounts.stop
+        return self.linked.stop
 
     def columns(self, *names: Name) -> Integers:
         """Where the named unknowns stand, in increasing order."""
@@ -108,7 +118,16 @@ class Unknowns:
             "edge shifts": optics[:, 0],
             "intrinsics": optics[:, 1:].ravel(),
         }
-        for name in ("machine", "stations", "optics", "shading", "breathing", "sizes", "mounts"):
+        for name in (
+            "machine",
+            "stations",
+            "optics",
+            "shading",
+            "breathing",
+            "sizes",
+            "mounts",
+            "linked",
+        ):
             part: slice = getattr(self, name)
             where[name] = np.arange(part.start, part.stop)
         none = np.zeros(0, dtype=int)
@@ -128,7 +147,9 @@ class BatchState:
     T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
     internal (B, K, n) of articulated platforms, shading (B, n) of the lines, outward, in units of
     its standard deviation, breathing (B, n) of the stations' focal lengths, sizes (B, n) of the
-    boards of unsure size, in units of their own.
+    boards of unsure size, in units of their own. linked : (B, J, 4, 4) T_base_platform of the
+    linked configurations, in the state of some configurations only; else none, for
+    T_base_platform has them.
     """
 
     z: Array
@@ -140,11 +161,16 @@ class BatchState:
     shading: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros((0, 0)))
     sizes: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    linked: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
 
     def __post_init__(self) -> None:
         """Runs without boards or hinges get none each, so that all fields select alike."""
-        none = {"internal": (self.T_base_platform.shape[1], 0), "T_mount": (0, 4, 4)}
-        for name in ("T_mount", "internal", "shading", "breathing", "sizes"):
+        none = {
+            "internal": (self.T_base_platform.shape[1], 0),
+            "T_mount": (0, 4, 4),
+            "linked": (0, 4, 4),
+        }
+        for name in ("T_mount", "internal", "shading", "breathing", "sizes", "linked"):
             if len(getattr(self, name)) != len(self.z):
                 empty = np.zeros((len(self.z), *none.get(name, (0,))))
                 object.__setattr__(self, name, empty)

@@ -201,8 +201,9 @@ def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
     """What heights leave to the drawing, in figures, and the largest cause in words."""
     told = [
         f"Heights do not tell x and y: these are known to {bed.sideways * 1e3:.2g} mm, and sizes to"
-        f" {bed.size:.2%}, by the drawing's tolerances. Measure a printed part, or"
-        " a board on the tool (observe: board), where dimensions matter."
+        f" {bed.size:.2%}, by the drawing's tolerances. Measure distances on a printed part"
+        " (distances in session.yaml), or a board on the tool (observe: board), where dimensions"
+        " matter."
     ]
     matter = [s for s in (*findings.unidentified, *findings.weak) if s.matters]
     if matter:

@@ -28,9 +28,9 @@ from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
 from pkmcal.solver.search import Stop, minimise
@@ -40,7 +40,7 @@ USUAL_RATIO_CHANGE = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
 USUAL_STATION_MOVE = 1e-2
 """m and rad: the same of a camera's place, what a tripod makes that somebody ran into."""
-UNSCALED_NOISE = Kinds(1.0, 1.0)
+UNSCALED_NOISE = Kinds(1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class Trust:
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
         """All data as they are stated."""
-        return cls(Kinds(np.ones(len(measurements.edges)), np.ones(len(measurements.poses))))
+        counts = len(measurements.edges), len(measurements.poses), measurements.n_links
+        return cls(Kinds(*map(np.ones, counts)))
 
     @classmethod
     def of(
@@ -78,8 +79,16 @@ class Trust:
         """
         own = estimate.statistics
         return cls(
-            Kinds(estimate.edge_weights * estimate.edge_trust, estimate.pose_weights),
-            Kinds(max(scale.edges / own.noise_scale, 1.0), max(own.pose_scale, scale.poses)),
+            Kinds(
+                estimate.edge_weights * estimate.edge_trust,
+                estimate.pose_weights,
+                estimate.link_weights,
+            ),
+            Kinds(
+                max(scale.edges / own.noise_scale, 1.0),
+                max(own.pose_scale, scale.poses),
+                max(own.link_scale, scale.links),
+            ),
             readings if own.reading_scale == 1 else 1.0,
             own.shading,
         )

@@ -25,10 +25,10 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
-from pkmcal.identify.rows import PERFECT_CLOSURE_SIGMA
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.held import Held, hold, too_little
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
@@ -96,7 +96,9 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             expected="a session with photographs, or with a table of poses",
             next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
         )
-    held = hold(machine, replace(measurements, joint_noise=SOFT_READING_NOISE), start)
+    # links tell the difference of two poses, not the pose at either's readings
+    soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
+    held = hold(machine, soft, start)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])

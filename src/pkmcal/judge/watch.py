@@ -24,12 +24,12 @@ from pkmcal.calibration.saved import Known, SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.identify.assembly import seen_configurations
-from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
 from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import check_new, known_rows, measured_new_data
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
+from pkmcal.measurements.rows import Kinds
 from pkmcal.outcome import Verdict
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
@@ -135,7 +135,8 @@ def watch_machine(
 
         told("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
-        before = Kinds(float(old.get("noise_scale", 1.0)), float(old.get("pose_scale", 1.0)))
+        factors = ("noise_scale", "pose_scale", "link_scale")
+        before = Kinds(*(float(old.get(name, 1.0)) for name in factors))
         trust = Trust.of(looked.estimate, before, _readings(saved, session))
         noise = looked.estimate.statistics.noise_scale * trust.scale.edges
         held = _hold_new(saved, session, looked, trust, ~known)
@@ -231,6 +232,7 @@ def _hold_new(
     kept = Kinds(
         trust.robust.edges[keep[data.edges.configuration]],
         trust.robust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
+        trust.robust.links[data.links_among(keep)],
     )
     return hold(
         saved.machine,

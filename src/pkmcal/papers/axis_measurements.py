@@ -69,7 +69,7 @@ def as_edges(axis: Array, sigma: Array, radius: Array) -> tuple[Array, Array]:
     """The pair of edges of measured axes (..., 4) with standard deviations sigma (4,).
 
     Returns bases (..., 2, 3, 2) at the measured normals of sides 0 and 1, and the pair's
-    whitening matrices (..., 4, 4), as identify.rows.EdgeData wants them.
+    whitening matrices (..., 4, 4), as measurements.edges.EdgeData wants them.
     """
     u, point, du, dpoint = from_coordinates(axis)
     side = np.broadcast_to([0, 1], (*u.shape[:-1], 2))

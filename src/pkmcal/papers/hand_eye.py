@@ -31,9 +31,9 @@ from pkmcal.geometry.rigid import (
     skew,
 )
 from pkmcal.identify.estimate import State
-from pkmcal.identify.rows import PoseBlocks, PoseData, pose_rows
 from pkmcal.identify.start import middle_pose
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.poses import PoseBlocks, PoseData, pose_rows
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Values, minimise, take

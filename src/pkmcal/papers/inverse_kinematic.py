@@ -26,9 +26,9 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
-from pkmcal.identify.rows import PERFECT_CLOSURE_SIGMA
 from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import pose, rotation, rotation_vector, skew
-from pkmcal.identify.rows import turn_jacobian
+from pkmcal.measurements.poses import turn_jacobian
 
 
 class SeenPlatform(NamedTuple):

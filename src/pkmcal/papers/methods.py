@@ -159,6 +159,7 @@ def _estimate(
     if trust is not None:
         weight, scale = trust
     poses = assembled.places.poses.taken(unweighted.poses[0])
+    links = assembled.places.links.taken(unweighted.links[0])[:, 0]
     n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
     pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)
     chi2 = float(np.sum(weight[:, None] * (edges / scale) ** 2))
@@ -173,6 +174,8 @@ def _estimate(
         edge_residuals=edges / scale,
         pose_residuals=poses / pose_scale,
         pose_weights=np.ones(len(poses)),
+        link_residuals=links,
+        link_weights=np.ones(len(links)),
         edge_weights=weight,
         edge_noise=EdgeScatter(
             np.full(n_tubes, scale), np.full(n_tubes, scale * OWN_SHADING), np.full(n_tubes, np.inf)

@@ -22,8 +22,8 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
-from pkmcal.identify.rows import turn_jacobian
 from pkmcal.measurements import PoseSet
+from pkmcal.measurements.poses import turn_jacobian
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 from pkmcal.papers.measured_platform import taken
 

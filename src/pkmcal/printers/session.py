@@ -105,6 +105,12 @@ stations:
       # to that counts as well: what is found is told.
       noise: {{position: 0.02 mm}}
       level: true             # the firmware's Z is counted from the bed
+
+# Heights do not tell how large a part comes out. Distances between marks that the tool made do: the
+# carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
+# distances:
+#   file: distances.csv
+#   noise: 0.03 mm            # how well they repeat
 """
 
 

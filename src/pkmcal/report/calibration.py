@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -25,7 +26,8 @@ from pkmcal.files import output_lock, write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
-from pkmcal.measurements import Observation
+from pkmcal.measurements import LinkSet, Observation
+from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome, doubtful
 from pkmcal.pages import page
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
@@ -33,6 +35,7 @@ from pkmcal.report import (
     bed,
     field,
     identifiability,
+    linked,
     parameters,
     photographed,
     pictures,
@@ -140,6 +143,7 @@ def report_of(
         parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
+        *linked.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
         residuals.section(
@@ -195,8 +199,8 @@ def calibration_cards(
         _tool_sigma(session, estimate, tool),
         moved,
         _tool_change(session, estimate, tool),
-        _data(session, observation, estimate),
-        _fit(estimate),
+        _data(session, observation, estimate, _links(calibration)),
+        _fit(session, estimate),
     )
     return tuple(card for card in found if card)
 
@@ -279,12 +283,19 @@ def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figur
     )
 
 
-def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
+def _links(calibration: Calibration) -> tuple[LinkSet, ...]:
+    """What links configurations in the estimate, by kind."""
+    return calibration.measurements.links if calibration.session.links else ()
+
+
+def _data(
+    session: Session, observation: Observation, estimate: Estimate, links: Sequence[LinkSet]
+) -> Figure:
     """Photographs and edges, used and not; of a session without any, the trackers' poses, or the
     readings alone.
     """
     taken = session.images_taken
-    if not session.station_names:
+    if not session.station_names and not session.links:
         return Figure(
             "What is it based on?",
             ((str(len(session.configurations)), "poses"),),
@@ -293,8 +304,10 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             " measured",
         )
     if not taken:
-        quiet, n = int(np.sum(estimate.pose_weights < KEPT_EDGE_WEIGHT)), len(observation.poses)
-        kinds = sorted({table.kind for table in session.trackers})
+        weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
+        quiet, n = int(np.sum(weights < KEPT_EDGE_WEIGHT)), len(weights)
+        kinds = sorted({table.target.label for table in session.trackers})
+        kinds += [measurement_kinds()[links.kind].label for links in session.links]
         return Figure(
             "What is it based on?",
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
@@ -309,6 +322,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
         for thing, weights, n, more in (
             ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
             ("pose", estimate.pose_weights, len(estimate.pose_weights), ""),
+            *((one, part, len(part), "") for one, part in linked.weights(links, estimate)),
         )
         if len(weights)
     ]
@@ -321,7 +335,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     )
 
 
-def _fit(estimate: Estimate) -> Figure:
+def _fit(session: Session, estimate: Estimate) -> Figure:
     """Chi-square per degree of freedom, of the noise as stated."""
     s = estimate.statistics
     scaled = [
@@ -330,6 +344,7 @@ def _fit(estimate: Estimate) -> Figure:
             ("edges", s.noise_scale),
             ("poses", s.pose_scale),
             ("readings", s.reading_scale),
+            (provenance.link_labels(session), s.link_scale),
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]

@@ -103,9 +103,9 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
 
 
 def mount_names(session: Session, n: int) -> list[str]:
-    """Names of the mounts: the board, where there is one, then the trackers."""
-    trackers = [table.name for table in session.trackers]
-    return ["board"] * (n - len(trackers)) + trackers
+    """Names of the mounts: the board, where there is one, the trackers, then the links' points."""
+    others = [table.name for table in session.trackers] + [one.kind for one in session.links]
+    return ["board"] * (n - len(others)) + others
 
 
 def _texts(values: Array, sigma: Array, known: Booleans, factor: float) -> list[str]:

@@ -15,6 +15,7 @@ from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
+from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
 from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
@@ -145,6 +146,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     noise = estimate.edge_noise
     tubes = zip(noise.scale, noise.shading, noise.tails, strict=True)
     units = dict.fromkeys(session.machine.joint_units)
+    linked = link_labels(session)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
@@ -167,6 +169,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 ("edges", s.chi2_edges, s.n_edges, s.dof_edges),
                 ("poses", s.chi2_poses, s.n_poses, s.dof_poses),
                 ("readings", s.chi2_joints, s.n_joints, s.dof_joints),
+                (linked, s.chi2_links, s.n_links, s.dof_links),
                 ("drawing", s.chi2_drawing, s.n_drawing, 0.0),
             )
             if n
@@ -177,6 +180,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 ("edges", s.noise_scale, s.n_edges),
                 ("poses", s.pose_scale, s.n_poses),
                 ("readings", s.reading_scale, s.n_joints),
+                (linked, s.link_scale, s.n_links),
             )
             if n
         ),
@@ -198,10 +202,16 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             for name, limits, n in (
                 ("poses", s.pose_range, s.n_poses),
                 ("readings", s.reading_range, s.n_joints),
+                (linked, s.link_range, s.n_links),
             )
             if n
         ),
     )
+
+
+def link_labels(session: Session) -> str:
+    """What links the session's configurations, in the plural."""
+    return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
 
 
 def _between(limits: tuple[float, float | None]) -> str:

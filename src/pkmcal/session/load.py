@@ -42,13 +42,22 @@ from pkmcal.files import (
     written_unit,
 )
 from pkmcal.geometry.rigid import pose
+from pkmcal.measurements import LinkSet
+from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
-from pkmcal.session.schema import BoardBody, SessionDocument, StationDocument, Vector
+from pkmcal.session.schema import (
+    BoardBody,
+    SessionDocument,
+    StationDocument,
+    Vector,
+    session_schema,
+)
 from pkmcal.wording import count, listed
 
 SESSION_FILE_NAME = "session.yaml"
@@ -122,6 +131,7 @@ class Session:
     mechanism : where the machine came from, for other models of it.
     workspace : where the tool is to be right, None where the file does not say.
     rejected : stations that were taken out because their images do not show where they stand.
+    links : measurements that link two configurations, by kind.
     """
 
     folder: Path
@@ -139,6 +149,7 @@ class Session:
     mechanism: Path | str = ""
     workspace: Region | None = None
     rejected: tuple[RejectedStation, ...] = ()
+    links: tuple[LinkSet, ...] = ()
 
     def __repr__(self) -> str:
         parts = (
@@ -157,8 +168,8 @@ class Session:
     @property
     def heights_alone(self) -> bool:
         """Whether nothing but heights of a bed was measured."""
-        felt = bool(self.trackers) and all(table.kind == "heights" for table in self.trackers)
-        return felt and not self.stations
+        felt = bool(self.trackers) and all(table.kind == Heights.code for table in self.trackers)
+        return felt and not self.stations and not self.links
 
     @property
     def station_names(self) -> tuple[str, ...]:
@@ -237,7 +248,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
 
     """
     folder, document = _read(Path(folder))
-    schema = validated_document(document, SessionDocument)
+    schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
     if not measured and not schema.stations:
         raise InputError(
@@ -257,7 +268,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
                 where=document.where("joints", "noise"),
             )
         warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
-        if measured and not schema.stations:
+        if measured and not schema.stations and not schema.links():
             _check_redundant(document, machine)
             table, repeated = without_repeats(table, noise)
             warnings += repeated
@@ -282,14 +293,15 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             trackers.append(read)
         else:
             trackers.append(PoseTable.to_come(name, given.poses, *noise))
+    links = _links(folder, document, schema, table.names, machine) if measured else ()
     if measured:
         _check_paths(document, schema, table)
     _check_distinct(document, stations)
     _check_tables_distinct(folder, document, schema)
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
-    if measured and schema.stations:
-        warnings += _unphotographed(table, stations, tuple(trackers))
+    if measured and (schema.stations or links):
+        warnings += _unphotographed(table, stations, tuple(trackers), links)
     return Session(
         folder=folder,
         machine=machine,
@@ -305,6 +317,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         model=model,
         mechanism=source,
         workspace=_workspace(document, schema),
+        links=links,
     )
 
 
@@ -417,6 +430,22 @@ def _check_redundant(document: Document, machine: Machine) -> None:
         expected="stations: a camera or a tracker, or a machine with more readings than freedoms",
         next_step="Photograph the machine, or measure its platform, and name that under stations",
     )
+
+
+def _links(
+    folder: Path,
+    document: Document,
+    schema: SessionDocument,
+    names: tuple[str, ...],
+    machine: Machine,
+) -> tuple[LinkSet, ...]:
+    """Tables of what links two configurations, by kind."""
+    out: list[LinkSet] = []
+    for code, node in schema.links().items():
+        kind = kinds_of(LinkKind)[code]
+        path = _existing(folder, document, kind.table(node), (kind.key, "file"))
+        out.append(kind.read(node, path, names, machine))
+    return tuple(out)
 
 
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:
@@ -619,6 +648,11 @@ def _check_noise(document: Document, schema: SessionDocument, machine: Machine) 
         (("stations", name, "tracker", "noise", "position"), station.tracker.noise.position)
         for name, station in schema.trackers.items()
     ]
+    for code, node in schema.links().items():
+        kind = kinds_of(LinkKind)[code]
+        noise = kind.noise(node)
+        if noise is not None and kind.unit == "m":
+            places.append(((kind.key, "noise"), noise))
     if "m" in machine.joint_units:
         places.append((("joints", "noise"), schema.joints.noise))
     for keys, value in places:
@@ -662,14 +696,18 @@ def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) 
 
 
 def _unphotographed(
-    table: CsvTable, stations: tuple[Station, ...], trackers: tuple[PoseTable, ...]
+    table: CsvTable,
+    stations: tuple[Station, ...],
+    trackers: tuple[PoseTable, ...],
+    links: tuple[LinkSet, ...],
 ) -> list[str]:
     taken = {photo.configuration for station in stations for photo in station.photographs}
     taken |= {int(k) for tracker in trackers for k in tracker.configuration}
+    taken |= {int(k) for one in links for k in one.configuration.ravel()}
     if len(taken) < 2:
         raise InputError(
             "only one configuration was measured"
-            if trackers
+            if trackers or links
             else "only one configuration has photographs",
             where=table.label,
             found=table.names[min(taken)],
@@ -679,7 +717,7 @@ def _unphotographed(
     if not missing:
         return []
     return [
-        f"{table.label}: no station has {'measured' if trackers else 'a photograph of'}"
+        f"{table.label}: no station has {'measured' if trackers or links else 'a photograph of'}"
         f" configuration {listed(missing)}"
         f" ({len(missing)} of {len(table.names)}); their readings are not used."
     ]
@@ -690,6 +728,9 @@ def _resolved(
 ) -> dict[str, Any]:
     """session.yaml with everything that was found for it, in plain data."""
     document = schema.model_dump(mode="json")
+    for kind in kinds_of(LinkKind).values():  # a digest does not depend on which kinds there are
+        if document[kind.key] is None:
+            del document[kind.key]
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
     for station in stations:
@@ -723,6 +764,7 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
         for s in session.stations
     }
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
+    tables += [[one.configuration, one.value, one.sigma] for one in session.links]
     board = session.board.read_bytes() if session.board else b""
     all_of_it = [said, session.machine.to_document(), session.model, cameras, tables, photographs]
     text = json_text(all_of_it) + blake2b(board).hexdigest()

@@ -10,32 +10,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, closest, read_csv
-from pkmcal.geometry.rigid import from_quaternion, pose, register, rotation
+from pkmcal.geometry.rigid import from_quaternion, pose, rotation
 from pkmcal.measurements import PoseSet
+from pkmcal.measurements.contract import (
+    POINT_COLUMNS,
+    QUATERNION_COLUMNS,
+    TURN_VECTOR_COLUMNS,
+    TargetKind,
+    configuration_rows,
+    kinds_of,
+)
+from pkmcal.measurements.tracker_points import TrackerPoints
+from pkmcal.measurements.tracker_poses import TrackerPoses
 from pkmcal.wording import listed
 
-PoseTableKind = Literal["poses", "points", "heights"]
-POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
-    ("x", "y", "z"),
-    ("qw", "qx", "qy", "qz"),
-    ("rx", "ry", "rz"),
-)
-POSE_TABLE_KINDS: dict[tuple[str, ...], PoseTableKind] = {
-    (*POINT_COLUMNS, *QUATERNION_COLUMNS): "poses",
-    (*POINT_COLUMNS, *TURN_VECTOR_COLUMNS): "poses",
-    POINT_COLUMNS: "points",
-    ("z",): "heights",
-}
-"""Columns of each kind of table, in any order."""
-FEWEST_POSE_TABLE_ROWS = {"poses": 3, "points": 4, "heights": 7}
-"""Rows that fix the tracker's place, and leave something that is known."""
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """By which a quaternion may be longer or shorter than one: three written digits leave as much."""
 OTHER_UNIT_SPREAD_FACTOR = 30.0
@@ -46,14 +40,15 @@ OTHER_UNIT_SPREAD_FACTOR = 30.0
 class PoseTable:
     """A tracker's measurements.
 
-    name : of the station. kind : of the table. configuration : (N,) rows of the session's readings.
-    T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z, mean nothing.
-    position, rotation : standard deviations, m and rad. level : its z axis is the base's, exactly.
+    name : of the station. kind : code of what was measured. configuration : (N,) rows of the
+    session's readings. T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z,
+    mean nothing. position, rotation : standard deviations, m and rad. level : its z axis is the
+    base's, exactly.
     """
 
     name: str
     label: str
-    kind: PoseTableKind
+    kind: str
     configuration: Integers
     T: Array
     position: float
@@ -65,20 +60,19 @@ class PoseTable:
     @classmethod
     def to_come(cls, name: str, label: str, position: float, rotation: float | None) -> PoseTable:
         """Of a tracker that has not measured yet: poses, or points where it tells no turn."""
-        kind: PoseTableKind = "points" if rotation is None else "poses"
+        kind = TrackerPoints.code if rotation is None else TrackerPoses.code
         none = np.zeros(0, dtype=int)
         return cls(name, label, kind, none, np.zeros((0, 4, 4)), position, rotation)
 
     @property
-    def known(self) -> tuple[int, ...]:
-        """Which of (omega, tau) it measures."""
-        return {"poses": (0, 1, 2, 3, 4, 5), "points": (3, 4, 5), "heights": (5,)}[self.kind]
+    def target(self) -> type[TargetKind]:
+        """Its kind of measurement."""
+        return kinds_of(TargetKind)[self.kind]
 
     @property
     def whiten(self) -> Array:
         """(6, 6) of one measurement, as of :class:`~pkmcal.measurements.PoseSet`."""
-        sigma = np.repeat([self.rotation or 1.0, self.position], 3)
-        return np.diag(np.where(np.isin(np.arange(6), self.known), 1 / sigma, 0.0))
+        return self.target.whiten(self.position, self.rotation)
 
     def poses(self, station: int, mount: int) -> PoseSet:
         """The measurements; what is not measured has rows of zeros."""
@@ -95,14 +89,7 @@ class PoseTable:
         """A first T_tracker_base (4, 4) from the platform's poses (K, 4, 4) by the drawing; None
         for whole poses, which tell it themselves.
         """
-        there = T_base_platform[self.configuration, :3, 3]
-        if self.kind == "poses":
-            return None
-        if self.kind == "points":
-            good = np.isfinite(there).all(axis=1)
-            return register(there[good], self.T[good, :3, 3])
-        shift = np.nanmean(self.T[:, 2, 3] - there[:, 2])
-        return pose(np.eye(3), np.array([0.0, 0.0, shift]))
+        return self.target.start(self.T, T_base_platform[self.configuration, :3, 3])
 
 
 def read_poses(
@@ -124,7 +111,7 @@ def read_poses(
     kind = _kind(table)
     lengths, turns = dict.fromkeys(POINT_COLUMNS, "m"), dict.fromkeys(TURN_VECTOR_COLUMNS, "rad")
     table.check_kinds([(lengths | turns).get(name, "") for name in table.columns])
-    if kind == "poses" and rotation_noise is None:
+    if kind.turns() and rotation_noise is None:
         raise InputError(
             "the poses' orientations have no stated noise",
             where=label,
@@ -132,19 +119,19 @@ def read_poses(
             expected="noise: {position: ..., rotation: ...} of the tracker, in radians",
             next_step="Leave the columns of the turn out, if only points were measured",
         )
-    rows = _rows(table, names)
-    if len(rows) < FEWEST_POSE_TABLE_ROWS[kind]:
+    rows = configuration_rows(table, names)
+    if len(rows) < kind.fewest_rows:
         raise InputError(
-            f"too few {kind} to say where the tracker stands",
+            f"too few {kind.label} to say where the tracker stands",
             where=label,
             found=f"{len(rows)} rows",
-            expected=f"{FEWEST_POSE_TABLE_ROWS[kind]} at least",
+            expected=f"{kind.fewest_rows} at least",
         )
     column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
     nothing = np.zeros(len(rows))
     t = np.stack([column.get(axis, nothing) for axis in POINT_COLUMNS], axis=-1)
     T = pose(_turn(table, column), t)
-    if level and kind != "heights":
+    if level and not kind.levels:
         raise InputError(
             "only of heights can be said that the bed is level",
             where=label,
@@ -152,43 +139,25 @@ def read_poses(
             expected="configuration and z",
             next_step="Leave level out: how such a tracker stands is found out",
         )
-    return PoseTable(name, label, kind, rows, T, position, rotation_noise, level)
+    return PoseTable(name, label, kind.code, rows, T, position, rotation_noise, level)
 
 
-def _kind(table: CsvTable) -> PoseTableKind:
-    """Which table it is, by its header."""
-    found = set(table.columns)
-    for columns, kind in POSE_TABLE_KINDS.items():
-        if found == set(columns):
+def _kind(table: CsvTable) -> type[TargetKind]:
+    """Which kind of measurement it is, by its header."""
+    found, kinds = set(table.columns), kinds_of(TargetKind)
+    for kind in kinds.values():
+        if any(found == set(columns) for columns in kind.headers):
             return kind
-    known = sorted({name for columns in POSE_TABLE_KINDS for name in columns})
+    headers = sorted((h for kind in kinds.values() for h in kind.headers), key=len, reverse=True)
+    known = sorted({name for columns in headers for name in columns})
     strange = [name for name in table.columns if name not in known]
     guess = closest(strange[0], known) if strange else None
     raise InputError(
         "this column is not known" if strange else "these columns together mean nothing",
         where=f"{table.label}, line 1",
         found=strange[0] if strange else listed(table.columns, 12),
-        expected=guess
-        or "configuration and " + "; or ".join(", ".join(c) for c in POSE_TABLE_KINDS),
+        expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in headers),
     )
-
-
-def _rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
-    """The readings' row of each of the table's."""
-    number = {name: k for k, name in enumerate(names)}
-    for row, name in enumerate(table.names):
-        if name not in number:
-            short = {known.lstrip("0"): known for known in names}.get(name.lstrip("0"))
-            raise InputError(
-                "this configuration has no joint readings",
-                where=table.where(row),
-                found=name,
-                expected=short or f"one of the readings' {len(names)}: {listed(names)}",
-                next_step="Write the names alike; spreadsheets drop leading zeros"
-                if short
-                else None,
-            )
-    return np.array([number[name] for name in table.names], dtype=int)
 
 
 def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
@@ -228,7 +197,7 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
     """
     there = T_base_platform[table.configuration, :3, 3]
     moved = float(np.nanmax(np.nanstd(there, axis=0)))
-    measured = table.T[:, :3, 3] if table.kind != "heights" else table.T[:, 2:3, 3]
+    measured = table.target.lengths(table.T)
     spread = float(np.max(np.std(measured, axis=0)))
     if spread <= OTHER_UNIT_SPREAD_FACTOR * max(moved, 1e-6):
         return

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, Discriminator, Field, Tag, create_model
 
 from pkmcal.cameras.response import Response
 from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema, closest, shown
+from pkmcal.measurements.contract import NOISE_FIELD_RANGE, LinkKind, kinds_of
 
 BoardBody = Literal["base", "platform"]
 """What a board may be fixed to."""
 Vector = tuple[float, float, float]
-NOISE_FIELD_RANGE = Field(ge=1e-12, lt=10)
-"""m or rad; nothing measures better, nor is of any use that measures worse."""
 OBSERVE_WORDS = ("legs", "board")
 """What a station can observe, in the order in which it is written back."""
 
@@ -129,7 +129,9 @@ class WorkspaceDocument(Schema):
 
 
 class SessionDocument(Schema):
-    """The whole of session.yaml."""
+    """session.yaml but for the keys of kinds of measurement that have their own; see
+    :func:`session_schema`.
+    """
 
     pkmcal: Literal[1] = Field(description="the line pkmcal: 1, the format's version")
     mechanism: str = Field(description="a mechanism's file, or a built-in's name")
@@ -159,3 +161,17 @@ class SessionDocument(Schema):
     def trackers(self) -> dict[str, TrackerStationDocument]:
         """The stations without one."""
         return {k: s for k, s in self.stations.items() if isinstance(s, TrackerStationDocument)}
+
+    def links(self) -> dict[str, Schema]:
+        """What stands under the keys of measurements that link configurations, by their kinds."""
+        found = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
+        return {code: node for code, node in found.items() if node is not None}
+
+
+@cache
+def session_schema() -> type[SessionDocument]:
+    """The whole of session.yaml, with the keys of all kinds of measurement."""
+    fields: dict[str, Any] = {
+        kind.key: (kind.schema | None, None) for kind in kinds_of(LinkKind).values()
+    }
+    return create_model("SessionDocument", __base__=SessionDocument, **fields)

@@ -54,6 +54,9 @@ class Reduced(NamedTuple):
 def eliminate(linear: Linear) -> Reduced:
     """Own unknowns eliminated."""
     q, r = np.linalg.qr(linear.by_own)
+    none = ~linear.by_own.any(axis=(-2, -1), keepdims=True)
+    if none.any():  # nothing to eliminate; the factors of zeros are any orthonormal columns
+        q, r = np.where(none, 0.0, q), np.where(none, np.eye(r.shape[-1]), r)
     value = linear.value[..., None]
     rows = linear.by_shared - q @ (q.mT @ linear.by_shared)
     return Reduced(rows, (value - q @ (q.mT @ value))[..., 0], q, r)

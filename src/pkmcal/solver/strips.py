@@ -29,7 +29,8 @@ class StripLayout:
 
     n_shared, n_own : na, d. configuration : (N,), of ``count``. rows : (N, n) which of the
     configuration's each is, -1 for padding. groups : strips with the same columns. columns :
-    (groups, w), na where there are fewer.
+    (groups, w), na where there are fewer. linked : (count, d) shared columns of each configuration
+    whose own unknowns are shared, -1 for all others; None where there is none.
     """
 
     n_shared: int
@@ -39,6 +40,7 @@ class StripLayout:
     rows: Integers
     groups: list[slice]
     columns: Integers
+    linked: Integers | None = None
 
     @classmethod
     def none(cls, n_shared: int, n_own: int, count: int) -> StripLayout:
@@ -66,6 +68,14 @@ class StripLayout:
         residual = np.full((len(self.columns), 1), self.n_shared + 1)
         column = np.concatenate([self.columns, residual], axis=1)
         return (column[:, :, None] * (self.n_shared + 2) + column[:, None]).ravel()
+
+    @cached_property
+    def linked_places(self) -> tuple[Integers, Integers]:
+        """Configurations (n,) whose own unknowns are shared, and their columns (n, d)."""
+        if self.linked is None:
+            return np.zeros(0, dtype=int), np.zeros((0, self.n_own), dtype=int)
+        which = np.flatnonzero(self.linked[:, 0] >= 0) if self.n_own else np.zeros(0, dtype=int)
+        return which, self.linked[which]
 
 
 class Strips(NamedTuple):
@@ -107,6 +117,9 @@ class Compact(NamedTuple):
             place = at[cut, ..., None], layout.rows[cut, :, None], columns
             by_shared[:, *place] = by_row[:, cut, :, d:-1]
         by_own, by_shared = by_own[:, :, :-1], by_shared[:, :, :-1, :-1]
+        for k, columns in zip(*layout.linked_places, strict=True):
+            by_shared[:, k, :, columns] = np.moveaxis(by_own[:, k], -1, 0)
+            by_own[:, k] = 0.0
         rest = slice(n_rows - self.by_own.shape[2], None)
         by_own[:, :, rest], by_shared[:, :, rest] = self.by_own, self.by_shared
         return Linear(self.value, by_shared, by_own, self.usable, self.shared_value, self.shared_by)
@@ -179,10 +192,20 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     products = strips @ np.ascontiguousarray(strips[:, :, :d].mT)
     sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
     square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
+    normal, slope = _group_sums(layout, numbers[:, d:])
+    for k, columns in zip(*layout.linked_places, strict=True):
+        normal[:, columns] += with_shared[:, k]
+        normal[:, :, columns] += with_shared[:, k].mT
+        normal[:, columns[:, None], columns] += square[:, k]
+        slope[:, columns] += with_value[:, k, :, 0]
+        square[:, k], with_shared[:, k], with_value[:, k] = 0.0, 0.0, 0.0
     norms = np.einsum("...ii->...i", square) + np.einsum("...nm,...nm->...m", by_own, by_own)
     damped = damping[:, None, None] * np.where(norms > 0, norms, 1.0)
     extra = np.sqrt(damped)[..., None] * np.eye(d)
-    r = np.linalg.qr(np.concatenate([_root(square), by_own, extra], axis=-2), mode="r")
+    beside = extra
+    if (none := ~norms.any(axis=-1)).any():  # nothing to eliminate: R = 1, for it to be invertible
+        beside = np.where(none[..., None, None], np.eye(d), extra)
+    r = np.linalg.qr(np.concatenate([_root(square), by_own, beside], axis=-2), mode="r")
     inverse = np.linalg.inv(r)
 
     q = by_own @ inverse
@@ -190,7 +213,6 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     along_strips = inverse.mT @ with_shared
     along = along_strips + q.mT @ rows.by_shared
     fitted = inverse.mT @ with_value + q.mT @ value
-    normal, slope = _group_sums(layout, numbers[:, d:])
     return Eliminated(
         inverse,
         along,

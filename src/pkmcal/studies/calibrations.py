@@ -41,12 +41,13 @@ from pkmcal.identify.gauge import (
     in_gauge,
     transformation,
 )
-from pkmcal.identify.rows import EdgeData, PoseData
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
 from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, SHADING_SIGMA
+from pkmcal.measurements.edges import EdgeData
+from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward

@@ -1,20 +1,8 @@
-"""Residuals of all that is measured and their exact Jacobians, in standard deviations.
+"""Silhouette edges of legs in images: the kind, its measurements and their rows.
 
-Three kinds of rows, each in one place here:
-
-- **edges** (:class:`EdgeRows`), two each: ``L^-1 (basis^T n_predicted + shift * s)`` with L the
-  Cholesky factor of the edge's covariance. The measured normal is the true one moved by
-  ``basis @ (shift * s)`` when all edge points lie s px outward, and ``basis^T n_measured = 0``;
-  hence the plus sign.
-- **closures** (:func:`by_noise`), one a limb: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5
-  whitened; what no reading enters (rods of constant length, joints' axes) is taken as perfect and
-  held to :data:`PERFECT_CLOSURE_SIGMA`.
-- **poses** of boards (:func:`pose_rows`), six each: predicted as
-  ``T_camera_base T_base_platform T_platform_board``, or ``T_camera_base T_base_board`` for a board
-  fixed to the base ([A] 3.3). The error is the left perturbation (omega, tau) that leads from the
-  measured pose to the predicted one, whitened by the measurement's own noise.
-
-Measurements stand in K configurations of G places each, padded to a common count.
+Two rows an edge, ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the
+edge's covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
+edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
 """
 
 from __future__ import annotations
@@ -22,69 +10,151 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Generic, NamedTuple, TypeVar
+from typing import ClassVar, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
-from pkmcal.geometry.rigid import dot, pose_difference, skew
-from pkmcal.identify.line_cells import LineCells
-from pkmcal.identify.unknowns import BatchState
-from pkmcal.measurements import SHADING_SIGMA
+from pkmcal.geometry.rigid import skew
+from pkmcal.measurements.contract import ImageKind
+from pkmcal.measurements.line_cells import LineCells
+from pkmcal.measurements.rows import among
 from pkmcal.mechanisms.closure import Closure
-from pkmcal.mechanisms.layout import LimbLayout
 
-PERFECT_CLOSURE_SIGMA = 1e-6
-"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
-a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+SHADING_SIGMA = 0.03
+"""Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
+where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
+Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
 
-Item = TypeVar("Item", covariant=True)
+OWN_SHADING = 0.015
+"""Standard deviation (px) of what shading adds to one edge beside what all of its line have in
+common, where light is even; highlights and what metal mirrors add ten times as much."""
+
 Scalar = TypeVar("Scalar", bound=np.generic)
-BlockNumbers = TypeVar("BlockNumbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
-class Kinds(NamedTuple, Generic[Item]):
-    """Something of each kind of measurement: of the edges, and of the boards' poses.
+@final
+class Edges(ImageKind):
+    """Edges of legs."""
 
-    An estimate weighs, counts and scales all kinds alike. Readings are none: no robust weight lets
-    them go.
-    """
-
-    edges: Item
-    poses: Item
+    code: ClassVar = "edges"
+    one: ClassVar = "edge"
+    label: ClassVar = "edges"
+    unit: ClassVar = "px"
+    numbers: ClassVar = 2
+    observe: ClassVar = "legs"
 
 
 @dataclass(frozen=True)
-class MeasurementKind:
-    """One kind of measurement in a problem.
+class EdgeSet:
+    """Silhouette edges of legs in photographs; N edges, flat arrays, all indices from 0.
 
-    rows : those of a configuration that are its. present : (K, G) False for padding. weight :
-    (B or 1, K, G). whiten : (B or 1, K, G, n, n).
+    station, configuration, leg, tube, side : (N,) where the edge was seen; side as in
+        :mod:`pkmcal.geometry.cylinders` (0 or 1).
+    normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame,
+        pointing away from the leg's axis.
+    basis : (N, 3, 2) orthonormal tangent basis at the normal: shift first, tilt second.
+    covariance : (N, 2, 2) of the normal in that basis, rad^2.
+    shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
+        outward by one pixel (rad/px).
+    span : (N, 2) first and last seen place along the leg, m from A.
+    by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
+        the edge's pixels held; n = 0 where nobody asked.
+    by_focal : (N, 2) the same by the relative excess of the focal lengths, where these breathe from
+        photograph to photograph; else zero.
+    shading : (N,) px, standard deviation of what shading adds to each edge beside what it adds to
+        all of its line; edges of a line share it as far as their normals agree, see
+        :mod:`~pkmcal.measurements.line_cells`. It counts where measurements are ``shaded``.
+    coarse : (N,) whether it is where a whole machine's silhouettes lie on picture edges
+        (:mod:`pkmcal.observe.silhouettes`), and not measured by itself.
     """
 
-    rows: slice
-    present: Booleans
-    weight: Array
-    whiten: Array
+    station: Integers
+    configuration: Integers
+    leg: Integers
+    tube: Integers
+    side: Integers
+    normal: Array
+    basis: Array
+    covariance: Array
+    shift: Array
+    span: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    by_focal: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    shading: Array = field(default_factory=lambda: np.zeros(0))
+    coarse: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
-    @property
-    def count(self) -> Integers:
-        """Residuals of each measurement, (K, G): a board's pose has six, a point's three of them,
-        padding none.
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """What is not given is empty, zero or the usual, so that all edges select alike."""
+        if len(self.coarse) != len(self.station):
+            object.__setattr__(self, "coarse", np.zeros(len(self.station), dtype=bool))
+        if len(self.by_intrinsics) != len(self.station):
+            object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
+        if len(self.by_focal) != len(self.station):
+            object.__setattr__(self, "by_focal", np.zeros((len(self.station), 2)))
+        if len(self.shading) != len(self.station):
+            object.__setattr__(self, "shading", np.full(len(self.station), OWN_SHADING))
+
+    @classmethod
+    def empty(cls) -> EdgeSet:
+        """No edge, for sessions of boards alone."""
+        none = np.zeros(0, dtype=int)
+        each = [np.zeros((0, *shape)) for shape in ((3,), (3, 2), (2, 2), (2,), (2,))]
+        normal, basis, covariance, shift, span = each
+        return cls(none, none, none, none, none, normal, basis, covariance, shift, span)
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    def select(self, keep: Booleans | Integers) -> EdgeSet:
+        """The edges at a mask or at positions."""
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def same_as(self, other: EdgeSet) -> tuple[Integers, Integers]:
+        """Positions in this set and in another of the edges that are in both: of one station's
+        photograph of a configuration, and one side of a leg's tube. Each is in a set once.
         """
-        return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
+        each = [
+            np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
+            for of in (self, other)
+        ]
+        number = np.unique(np.concatenate(each), axis=0, return_inverse=True)[1].ravel()
+        own, others = number[: len(self)], number[len(self) :]
+        return np.intersect1d(own, others, return_indices=True)[1:]
+
+    def scaled(self, factor: float) -> EdgeSet:
+        """The same, that scatter by a factor more."""
+        return replace(self, covariance=self.covariance * factor**2)
+
+    def rejection(self, k: int, reason: str) -> Rejection:
+        """The edge at k, left out for a reason."""
+        return Rejection(
+            station=int(self.station[k]),
+            configuration=int(self.configuration[k]),
+            leg=int(self.leg[k]),
+            tube=int(self.tube[k]),
+            side=int(self.side[k]),
+            reason=reason,
+        )
 
 
-def _among(numbers: BlockNumbers, configurations: slice, axis: int) -> BlockNumbers:
-    """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
-    them, a single one or none, stays.
+@dataclass(frozen=True)
+class Rejection:
+    """Something that was seen but left out, or looked for and not found, and why.
+
+    tube and side are -1 where the whole leg, leg -1 where the whole photograph is meant.
     """
-    cut = (slice(None),) * axis + (configurations,)
-    found = ((f.name, getattr(numbers, f.name)) for f in fields(numbers))
-    arrays = ((name, x) for name, x in found if isinstance(x, np.ndarray))
-    return replace(numbers, **{name: x[cut] for name, x in arrays if x.shape[axis] > 1})
+
+    station: int
+    configuration: int
+    leg: int
+    tube: int
+    side: int
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -100,8 +170,8 @@ class EdgeBlocks:
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
     empty where nothing is shaded. tube : (K, G) number of the tube on its leg. crowd : (K, G) how
-    many of its line share an edge's own shading, see :mod:`~pkmcal.identify.line_cells`, zero where
-    nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
+    many of its line share an edge's own shading, see :mod:`~pkmcal.measurements.line_cells`, zero
+    where nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
     """
 
     leg: Integers
@@ -118,7 +188,7 @@ class EdgeBlocks:
 
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
-        return _among(self, configurations, 0)
+        return among(self, configurations, 0)
 
     @cached_property
     def views(self) -> EdgeViews:
@@ -210,7 +280,7 @@ class EdgeData:
 
     def among(self, configurations: slice) -> EdgeData:
         """Those of some configurations."""
-        return replace(_among(self, configurations, 1), shading=self.shading)
+        return replace(among(self, configurations, 1), shading=self.shading)
 
     @cached_property
     def by_shift(self) -> Array:
@@ -315,24 +385,22 @@ class EdgeRows:
     cosine: Array
     by_frame: Array
 
-    def value(self, state: BatchState) -> Array:
-        """Rows (B, N, n), zero where they do not count, with the state's cameras, lines and focal
-        lengths.
+    def value(self, optics: Array, shading: Array, breathing: Array) -> Array:
+        """Rows (B, N, n), zero where they do not count, with the cameras' unknowns (B, C, w), the
+        lines' shading (B, n) and the stations' focal breathing (B, S), none where there is none.
         """
         data, views = self.data, self.blocks.views
         (_, along_m, along_w), *others = self.by_frame
         rows = self.cosine[0] * along_m - self.sine * along_w
         for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
             rows += cosine * along_m - self.sine * along_w
-        for by_unknown, unknown in zip(
-            data.by_optics, state.optics.transpose(2, 0, 1), strict=True
-        ):
+        for by_unknown, unknown in zip(data.by_optics, optics.transpose(2, 0, 1), strict=True):
             rows += by_unknown * unknown[:, views.camera, None]
-        if state.shading.shape[-1]:
-            shift = state.shading[:, views.taken(self.blocks.line)]
+        if shading.shape[-1]:
+            shift = shading[:, views.taken(self.blocks.line)]
             rows += data.by_line * self._of_blocks(shift)
-        if state.breathing.shape[-1]:
-            rows += data.by_breathing[0] * state.breathing[:, views.station, None]
+        if breathing.shape[-1]:
+            rows += data.by_breathing[0] * breathing[:, views.station, None]
         return np.where(data.counts, rows, 0.0)
 
     def _of_blocks(self, numbers: Array) -> Array:
@@ -447,192 +515,3 @@ def edge_rows(
     distance = np.repeat(lines.distance, n_rows, axis=-1).reshape(radius.shape)
     planes = edge_planes(distance, radius, data.sign[:, None])
     return EdgeRows(blocks, data, c, T_camera_base, lines, frame, *planes, by_frame)
-
-
-def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
-    """Rows (..., E, n) of the closure in standard deviations; the noise's own derivative is
-    multiplied by c = 0.
-
-    joint_noise : what by_reading (..., E) broadcasts with. Rods on one motor share its reading's
-    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T +
-    PERFECT_CLOSURE_SIGMA^2``, whitened in closed form.
-    """
-    if not layout.shares_motors:
-        return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
-    for motor in range(layout.n_readings):
-        slope = np.where(layout.row_motor == motor, by_reading, 0.0)
-        size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
-        unit = slope / np.where(size > 0, size, 1.0)
-        less = 1 - PERFECT_CLOSURE_SIGMA / np.hypot(PERFECT_CLOSURE_SIGMA, joint_noise * size)
-        rows = rows - (less * unit)[..., None] * (unit[..., None, :] @ rows)
-    return rows / PERFECT_CLOSURE_SIGMA
-
-
-def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> Array:
-    """Standard deviation (..., E) of each closure where every motor moves one rod.
-
-    A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a
-    rod that is read always moves with its reading, whose noise is one of lengths: told by its
-    scale, it would be the same but for a thousandth, and change with an unknown.
-    """
-    if layout.reads_lengths:
-        return np.where(layout.row_motor >= 0, joint_noise, PERFECT_CLOSURE_SIGMA)
-    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT_CLOSURE_SIGMA)
-    sigma = np.where(layout.row_is_rod, joint_noise, sigma)
-    return np.where(layout.row_motor >= 0, sigma, PERFECT_CLOSURE_SIGMA)
-
-
-def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
-    """Noise of the readings (B,) below which no closure counts more, for slopes (B, K, E); 0 where
-    a rod is read, whose closure is as sharp as its reading.
-    """
-    if layout.rod_reads[layout.closing].any() and not layout.shares_motors:
-        return np.zeros(len(by_reading))
-    steepest = np.abs(by_reading * (layout.row_motor >= 0)).max(axis=(1, 2))
-    return PERFECT_CLOSURE_SIGMA / np.maximum(steepest, PERFECT_CLOSURE_SIGMA)
-
-
-def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
-    """Whitened closure rows (..., E) as one a reading, (..., m)."""
-    if not layout.shares_motors:
-        driven = layout.driven_rows
-        order = np.argsort(layout.row_motor[driven], kind="stable")
-        return rows[..., driven[order]]
-    slope = by_reading[..., None] * layout.of_motor
-    size = np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
-    unit = slope / np.where(size > 0, size, 1.0)
-    return (unit.mT @ rows[..., None])[..., 0]
-
-
-@dataclass(frozen=True)
-class PoseBlocks:
-    """Where the poses are: K configurations of G poses, padded; the same for all runs.
-
-    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
-    mounts. tolerance : (M,) of the sizes of boards, relative; those that have one are unknowns, in
-    their order.
-    """
-
-    station: Integers
-    mount: Integers
-    present: Booleans
-    on_platform: Booleans
-    camera: Integers
-    tolerance: Array
-
-    @property
-    def size(self) -> Integers:
-        """(M,) number of each mount's size among those that are unknown; -1 for an exact one."""
-        unsure = self.tolerance > 0
-        return np.where(unsure, np.cumsum(unsure) - 1, -1)
-
-    def among(self, configurations: slice) -> PoseBlocks:
-        """Those of some configurations."""
-        whole = _among(self, configurations, 0)
-        return replace(whole, on_platform=self.on_platform, tolerance=self.tolerance)
-
-
-@dataclass(frozen=True)
-class PoseData:
-    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
-
-    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
-    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
-    breathing : (B, K, G, 6, 1) by their station's focal breathing.
-    """
-
-    T_station_target: Array
-    whiten: Array
-    weight: Array
-    optics: Array
-    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
-
-    def among(self, configurations: slice) -> PoseData:
-        """Those of some configurations."""
-        return _among(self, configurations, 1)
-
-
-class PoseRows(NamedTuple):
-    """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
-    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), by their
-    station's focal breathing and by their board's size (B, K, G, 6, 1).
-    """
-
-    value: Array
-    by_station: Array
-    by_platform: Array
-    by_mount: Array
-    by_optics: Array
-    by_breathing: Array
-    by_size: Array
-
-
-def pose_rows(
-    blocks: PoseBlocks,
-    data: PoseData,
-    T_camera_base: Array,
-    poses: Array,
-    T_mount: Array,
-    optics: Array,
-    breathing: Array,
-    sizes: Array,
-) -> PoseRows:
-    """Whitened errors of the predicted poses.
-
-    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
-    (B, C, w), breathing (B, S) or (B, 0), sizes (B, n). A board that is larger by a share s stands
-    farther from the camera by the same share.
-    """
-    if not blocks.present.size:
-        none = np.zeros((*poses.shape[:2], 0, 6, 6))
-        optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
-        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1], none[..., :1])
-    moving = blocks.on_platform[blocks.mount][..., None, None]
-    camera = T_camera_base[:, blocks.station]
-    body = np.where(moving, poses[:, :, None], np.eye(4))
-    mount = T_mount[:, blocks.mount]
-    rot_c, rot_b = camera[..., :3, :3], body[..., :3, :3]
-    arm = rot_b @ mount[..., :3, 3:]
-    place = rot_c @ (arm + body[..., :3, 3:])
-    predicted = camera @ body @ mount
-    error = pose_difference(predicted, data.T_station_target)
-    weigh = np.sqrt(data.weight)[..., None, None] * data.whiten
-    turn = turn_jacobian(error[..., :3])
-
-    def rows(by_turn: Array, by_shift_turn: Array, by_shift: Array) -> Array:
-        """Derivative by (omega, tau) from those of the pose's turn and place."""
-        out = np.zeros((*np.broadcast_shapes(by_turn.shape, place.shape)[:-2], 6, 6))
-        out[..., :3, :3], out[..., 3:, :3] = turn @ by_turn, by_shift_turn
-        out[..., 3:, 3:] = by_shift
-        return weigh @ out
-
-    eye, by_optics, by_breathing = np.eye(3), weigh @ data.optics, weigh @ data.breathing
-    value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
-    if breathing.shape[-1]:
-        value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
-    away = -blocks.tolerance[blocks.mount][..., None] * data.T_station_target[..., :3, 3]
-    by_size = weigh @ np.concatenate([np.zeros_like(away), away], axis=-1)[..., None]
-    if sizes.shape[-1]:
-        value = value + by_size[..., 0] * sizes[:, blocks.size[blocks.mount], None]
-    return PoseRows(
-        value,
-        rows(eye, -skew(place[..., 0]), eye),
-        np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
-        rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
-        by_optics,
-        by_breathing,
-        by_size,
-    )
-
-
-def turn_jacobian(phi: Array) -> Array:
-    """Change of a rotation vector (..., 3) by a further turn from the left, (..., 3, 3).
-
-    The inverse left Jacobian of SO(3), with its series near zero.
-    """
-    angle2 = dot(phi, phi)[..., None, None]
-    small = angle2 < 1e-6
-    angle = np.sqrt(np.where(small, 1.0, angle2))
-    exact = (1 - 0.5 * angle * np.cos(angle / 2) / np.sin(angle / 2)) / np.where(small, 1, angle2)
-    k = skew(phi)
-    return np.eye(3) - 0.5 * k + np.where(small, 1 / 12 + angle2 / 720, exact) * (k @ k)

@@ -1,0 +1,186 @@
+"""Distances between two positions of the tool, as calipers measure them on a printed part.
+
+The tool leaves a mark at two configurations, and the distance d of the marks is measured. With the
+tool's point m, fixed to the platform, the marks are ``p_k = R_k m + t_k`` and the residual is
+
+    (|p_2 - p_1| - d) / sigma.
+
+With the unit vector e from the first mark to the second, a perturbation (omega, tau) of the pose of
+the second configuration changes the distance by ``e . (omega x R_2 m + tau)``, the first by as much
+the other way, and a shift tau of the tool's point by ``e . (R_2 - R_1) tau``.
+
+Distances tell the size of a machine, which heights of a bed leave to the nominal model. Klipper's
+``DELTA_ANALYZE`` uses them in the same way, from a part of a fixed shape
+(https://www.klipper3d.org/Delta_Calibrate.html).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, final
+
+import numpy as np
+from pydantic import Field
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import Metres, PairTable, Schema, read_pairs
+from pkmcal.measurements.contract import (
+    LEAST_NOISE,
+    NOISE_FIELD_RANGE,
+    LinkKind,
+    configuration_rows,
+)
+from pkmcal.measurements.links import LinkRows, LinkSet
+from pkmcal.mechanisms import Machine, check_plausible
+
+END_COLUMNS, VALUE_COLUMN, SIGMA_COLUMN = ("from", "to"), "distance", "sigma"
+LONGEST_IN_SIZES = 4.0
+"""Longest distance in times of the machine's size: a tool reaches no further than the machine is
+large to either side, and a nominal model may be wrong by a factor of two."""
+OTHER_UNIT_RATIO = 10.0
+"""Ratio of measured to nominal distances, all of them, from which they are in another unit: inches
+for millimetres make 25.4, and no nominal model is wrong by ten."""
+
+
+class DistancesDocument(Schema):
+    """``distances``: where the table is, and how good its distances are."""
+
+    file: str = Field(description="the table of distances, for example distances.csv")
+    noise: Annotated[Metres, NOISE_FIELD_RANGE] | None = Field(
+        default=None,
+        description="the standard deviation of a distance in metres, such as 3.0e-5",
+    )
+
+
+@dataclass(frozen=True)
+class DistanceSet(LinkSet):
+    """N distances in m; the mount's place is the tool's point."""
+
+    @property
+    def kind(self) -> str:
+        """Code of the kind."""
+        return Distances.code
+
+    def rows(self, first: Array, second: Array, mount: Array) -> LinkRows:
+        """Residuals and derivatives; see the module."""
+        point = mount[..., :3, 3:]
+        arms = [(T[..., :3, :3] @ point)[..., 0] for T in (first, second)]
+        apart = arms[1] + second[..., :3, 3] - arms[0] - first[..., :3, 3]
+        distance = np.linalg.norm(apart, axis=-1)
+        # where both marks coincide the distance has no derivative
+        e = apart / np.where(distance > 0, distance, 1.0)[..., None] / self.sigma[:, None]
+        by_poses = [np.concatenate([np.cross(arm, e), e], axis=-1) for arm in arms]
+        turned = (second[..., :3, :3] - first[..., :3, :3]).mT @ e[..., None]
+        by_mount = np.concatenate([np.zeros_like(e), turned[..., 0]], axis=-1)
+        return LinkRows((distance - self.value) / self.sigma, -by_poses[0], by_poses[1], by_mount)
+
+
+@final
+class Distances(LinkKind):
+    """Distances between two positions of the tool."""
+
+    code: ClassVar = "distances"
+    one: ClassVar = "distance"
+    label: ClassVar = "distances"
+    unit: ClassVar = "m"
+    key: ClassVar = "distances"
+    schema: ClassVar = DistancesDocument
+
+    @classmethod
+    def table(cls, node: DistancesDocument) -> str:
+        """The table's file."""
+        return node.file
+
+    @classmethod
+    def noise(cls, node: DistancesDocument) -> float | None:
+        """Standard deviation of a distance, m."""
+        return node.noise
+
+    @classmethod
+    def read(
+        cls, node: DistancesDocument, path: Path, names: tuple[str, ...], machine: Machine
+    ) -> DistanceSet:
+        """Read the table; every fault is an InputError with line and column."""
+        table = read_pairs(path, END_COLUMNS, (VALUE_COLUMN,), (SIGMA_COLUMN,), label=node.file)
+        table.check_kinds(["m"] * len(table.columns))
+        rows = configuration_rows(table, names)
+        column = dict(zip(table.columns, table.values.T, strict=True))
+        if SIGMA_COLUMN in column:
+            sigma = column[SIGMA_COLUMN]
+        elif node.noise is not None:
+            sigma = np.full(len(rows), node.noise)
+        else:
+            raise InputError(
+                "the distances have no stated noise",
+                where=table.label,
+                found=f"columns {', '.join((*END_COLUMNS, *table.columns))}",
+                expected=f"{cls.key}.noise in session.yaml, or a column {SIGMA_COLUMN}",
+                next_step="Calipers repeat to some 0.03 mm on printed parts: noise: 0.03 mm",
+            )
+        for k, value in enumerate(column[VALUE_COLUMN].tolist()):
+            _check_row(table, k, value, float(sigma[k]), machine)
+        none = np.zeros(len(rows), dtype=int)
+        value, lines = column[VALUE_COLUMN], np.array(table.lines)
+        return DistanceSet(table.label, rows, none, value, sigma, lines)
+
+    @classmethod
+    def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:
+        """Raise `InputError` where all distances are in another unit than the machine.
+
+        T_base_platform : (K, 4, 4) by the nominal model, NaN where it has none.
+        """
+        place = T_base_platform[:, :3, 3]
+        apart = place[links.configuration[:, 1]] - place[links.configuration[:, 0]]
+        ratio = links.value / np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
+        ratio = ratio[np.isfinite(ratio)]
+        large, small = ratio > OTHER_UNIT_RATIO, ratio < 1 / OTHER_UNIT_RATIO
+        if not ratio.size or not (large.all() or small.all()):
+            return
+        raise InputError(
+            "the distances are in another unit than the machine",
+            where=links.label,
+            found=f"distances of {float(np.median(ratio)):.3g} times those by the readings",
+            expected="metres, or a unit in the header",
+            next_step=f"Head the column {VALUE_COLUMN} [mm], if these are millimetres",
+        )
+
+
+def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Machine) -> None:
+    """Raise `InputError` for a distance that cannot be."""
+    first, second = table.pairs[k]
+    where = table.where(k, table.columns.index(VALUE_COLUMN))
+    if first == second:
+        raise InputError(
+            "a distance leads from one configuration to another",
+            where=table.where(k),
+            found=f"{first} twice",
+            expected="two different configurations",
+        )
+    if value <= 0:
+        raise InputError(
+            "a distance is a positive number", where=where, found=f"{value:g} m", expected="above 0"
+        )
+    most = LONGEST_IN_SIZES * machine.size
+    if value > most:
+        raise InputError(
+            "this distance is longer than the machine reaches",
+            where=where,
+            found=f"{value:g} m",
+            expected=f"at most {most:.3g} m, four times the machine's largest length",
+            next_step=f"Head the column {VALUE_COLUMN} [mm], if this is in millimetres"
+            if value <= 1e3 * most
+            else None,
+        )
+    if SIGMA_COLUMN not in table.columns:
+        return
+    where = table.where(k, table.columns.index(SIGMA_COLUMN))
+    if not sigma >= LEAST_NOISE:
+        raise InputError(
+            "a standard deviation is a positive number",
+            where=where,
+            found=f"{sigma:g} m",
+            expected=f"{LEAST_NOISE:g} m or more",
+        )
+    check_plausible(sigma, machine, where, "a standard deviation")

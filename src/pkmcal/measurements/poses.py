@@ -1,0 +1,213 @@
+"""Poses of boards and targets: measurements of all kinds that have them, and their rows.
+
+Six rows each, of which a kind may measure a part: predicted as ``T_camera_base T_base_platform
+T_platform_board``, or ``T_camera_base T_base_board`` for a board fixed to the base ([A] 3.3). The
+error is the left perturbation (omega, tau) that leads from the measured pose to the predicted one,
+whitened by the measurement's own noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.geometry.rigid import dot, perturb, pose_difference, skew
+from pkmcal.measurements.rows import among
+
+
+@dataclass(frozen=True)
+class PoseSet:
+    """N measured poses.
+
+    station : (N,) index into the session's stations. configuration : (N,) row of the readings.
+    mount : (N,) what the target is fixed to.
+    T_station_target : (N, 4, 4) target to station (camera or tracker) coordinates, m.
+    whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m:
+        whiten @ error has unit covariance. Rows of what is not measured (a point's turn) are zero.
+    by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
+        pixels held; n = 0 where nobody asked.
+    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these breathe from
+        photograph to photograph; else zero.
+    """
+
+    station: Integers
+    configuration: Integers
+    mount: Integers
+    T_station_target: Array
+    whiten: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 6, 0)))
+    by_focal: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
+        if len(self.by_intrinsics) != len(self.station):
+            object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 6, 0)))
+        if len(self.by_focal) != len(self.station):
+            object.__setattr__(self, "by_focal", np.zeros((len(self.station), 6)))
+
+    @classmethod
+    def empty(cls) -> PoseSet:
+        """No pose."""
+        none = np.zeros(0, dtype=int)
+        return cls(none, none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    @property
+    def rows(self) -> Integers:
+        """(N,) how many of its six numbers each measurement has."""
+        return np.any(self.whiten != 0, axis=-1).sum(axis=-1)
+
+    def select(self, mask: Booleans | Integers) -> PoseSet:
+        """The poses that a mask or an index picks."""
+        return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
+
+    def moved(self, change: Array) -> PoseSet:
+        """The poses as cameras with other parameters see them; change : (S, n), by station.
+
+        To first order: a camera's calibration is good to a thousandth, so what is left out is a
+        millionth.
+        """
+        n = self.by_intrinsics.shape[-1]
+        delta = (self.by_intrinsics @ change[self.station, :n, None])[..., 0]
+        return replace(self, T_station_target=perturb(self.T_station_target, delta))
+
+
+@dataclass(frozen=True)
+class PoseBlocks:
+    """Where the poses are: K configurations of G poses, padded; the same for all runs.
+
+    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
+    mounts. tolerance : (M,) of the sizes of boards, relative; those that have one are unknowns, in
+    their order.
+    """
+
+    station: Integers
+    mount: Integers
+    present: Booleans
+    on_platform: Booleans
+    camera: Integers
+    tolerance: Array
+
+    @property
+    def size(self) -> Integers:
+        """(M,) number of each mount's size among those that are unknown; -1 for an exact one."""
+        unsure = self.tolerance > 0
+        return np.where(unsure, np.cumsum(unsure) - 1, -1)
+
+    def among(self, configurations: slice) -> PoseBlocks:
+        """Those of some configurations."""
+        whole = among(self, configurations, 0)
+        return replace(whole, on_platform=self.on_platform, tolerance=self.tolerance)
+
+
+@dataclass(frozen=True)
+class PoseData:
+    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+
+    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
+    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
+    breathing : (B, K, G, 6, 1) by their station's focal breathing.
+    """
+
+    T_station_target: Array
+    whiten: Array
+    weight: Array
+    optics: Array
+    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
+
+    def among(self, configurations: slice) -> PoseData:
+        """Those of some configurations."""
+        return among(self, configurations, 1)
+
+
+class PoseRows(NamedTuple):
+    """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
+    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), by their
+    station's focal breathing and by their board's size (B, K, G, 6, 1).
+    """
+
+    value: Array
+    by_station: Array
+    by_platform: Array
+    by_mount: Array
+    by_optics: Array
+    by_breathing: Array
+    by_size: Array
+
+
+def pose_rows(
+    blocks: PoseBlocks,
+    data: PoseData,
+    T_camera_base: Array,
+    poses: Array,
+    T_mount: Array,
+    optics: Array,
+    breathing: Array,
+    sizes: Array,
+) -> PoseRows:
+    """Whitened errors of the predicted poses.
+
+    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
+    (B, C, w), breathing (B, S) or (B, 0), sizes (B, n). A board that is larger by a share s stands
+    farther from the camera by the same share.
+    """
+    if not blocks.present.size:
+        none = np.zeros((*poses.shape[:2], 0, 6, 6))
+        optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
+        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1], none[..., :1])
+    moving = blocks.on_platform[blocks.mount][..., None, None]
+    camera = T_camera_base[:, blocks.station]
+    body = np.where(moving, poses[:, :, None], np.eye(4))
+    mount = T_mount[:, blocks.mount]
+    rot_c, rot_b = camera[..., :3, :3], body[..., :3, :3]
+    arm = rot_b @ mount[..., :3, 3:]
+    place = rot_c @ (arm + body[..., :3, 3:])
+    predicted = camera @ body @ mount
+    error = pose_difference(predicted, data.T_station_target)
+    weigh = np.sqrt(data.weight)[..., None, None] * data.whiten
+    turn = turn_jacobian(error[..., :3])
+
+    def rows(by_turn: Array, by_shift_turn: Array, by_shift: Array) -> Array:
+        """Derivative by (omega, tau) from those of the pose's turn and place."""
+        out = np.zeros((*np.broadcast_shapes(by_turn.shape, place.shape)[:-2], 6, 6))
+        out[..., :3, :3], out[..., 3:, :3] = turn @ by_turn, by_shift_turn
+        out[..., 3:, 3:] = by_shift
+        return weigh @ out
+
+    eye, by_optics, by_breathing = np.eye(3), weigh @ data.optics, weigh @ data.breathing
+    value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
+    if breathing.shape[-1]:
+        value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
+    away = -blocks.tolerance[blocks.mount][..., None] * data.T_station_target[..., :3, 3]
+    by_size = weigh @ np.concatenate([np.zeros_like(away), away], axis=-1)[..., None]
+    if sizes.shape[-1]:
+        value = value + by_size[..., 0] * sizes[:, blocks.size[blocks.mount], None]
+    return PoseRows(
+        value,
+        rows(eye, -skew(place[..., 0]), eye),
+        np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
+        rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
+        by_optics,
+        by_breathing,
+        by_size,
+    )
+
+
+def turn_jacobian(phi: Array) -> Array:
+    """Change of a rotation vector (..., 3) by a further turn from the left, (..., 3, 3).
+
+    The inverse left Jacobian of SO(3), with its series near zero.
+    """
+    angle2 = dot(phi, phi)[..., None, None]
+    small = angle2 < 1e-6
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    exact = (1 - 0.5 * angle * np.cos(angle / 2) / np.sin(angle / 2)) / np.where(small, 1, angle2)
+    k = skew(phi)
+    return np.eye(3) - 0.5 * k + np.where(small, 1 / 12 + angle2 / 720, exact) * (k @ k)

@@ -1,0 +1,86 @@
+"""Readings of the motors: the kind, and the rows of the closures with their noise.
+
+One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters
+(rods of constant length, joints' axes) is taken as perfect and held to PERFECT_CLOSURE_SIGMA.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.measurements.contract import MotorKind
+from pkmcal.mechanisms.layout import LimbLayout
+
+PERFECT_CLOSURE_SIGMA = 1e-6
+"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
+a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+
+
+@final
+class Readings(MotorKind):
+    """Lengths, places of sliders and angles of cranks, as the motors read them."""
+
+    code: ClassVar = "readings"
+    one: ClassVar = "reading"
+    label: ClassVar = "readings"
+    unit: ClassVar = "m or rad"
+    numbers: ClassVar = 1
+    key: ClassVar = "joints"
+
+
+def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
+    """Rows (..., E, n) of the closure in standard deviations; the noise's own derivative is
+    multiplied by c = 0.
+
+    joint_noise : what by_reading (..., E) broadcasts with. Rods on one motor share its reading's
+    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T +
+    PERFECT_CLOSURE_SIGMA^2``, whitened in closed form.
+    """
+    if not layout.shares_motors:
+        return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
+    for motor in range(layout.n_readings):
+        slope = np.where(layout.row_motor == motor, by_reading, 0.0)
+        size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
+        unit = slope / np.where(size > 0, size, 1.0)
+        less = 1 - PERFECT_CLOSURE_SIGMA / np.hypot(PERFECT_CLOSURE_SIGMA, joint_noise * size)
+        rows = rows - (less * unit)[..., None] * (unit[..., None, :] @ rows)
+    return rows / PERFECT_CLOSURE_SIGMA
+
+
+def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> Array:
+    """Standard deviation (..., E) of each closure where every motor moves one rod.
+
+    A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a
+    rod that is read always moves with its reading, whose noise is one of lengths: told by its
+    scale, it would be the same but for a thousandth, and change with an unknown.
+    """
+    if layout.reads_lengths:
+        return np.where(layout.row_motor >= 0, joint_noise, PERFECT_CLOSURE_SIGMA)
+    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT_CLOSURE_SIGMA)
+    sigma = np.where(layout.row_is_rod, joint_noise, sigma)
+    return np.where(layout.row_motor >= 0, sigma, PERFECT_CLOSURE_SIGMA)
+
+
+def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
+    """Noise of the readings (B,) below which no closure counts more, for slopes (B, K, E); 0 where
+    a rod is read, whose closure is as sharp as its reading.
+    """
+    if layout.rod_reads[layout.closing].any() and not layout.shares_motors:
+        return np.zeros(len(by_reading))
+    steepest = np.abs(by_reading * (layout.row_motor >= 0)).max(axis=(1, 2))
+    return PERFECT_CLOSURE_SIGMA / np.maximum(steepest, PERFECT_CLOSURE_SIGMA)
+
+
+def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
+    """Whitened closure rows (..., E) as one a reading, (..., m)."""
+    if not layout.shares_motors:
+        driven = layout.driven_rows
+        order = np.argsort(layout.row_motor[driven], kind="stable")
+        return rows[..., driven[order]]
+    slope = by_reading[..., None] * layout.of_motor
+    size = np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
+    unit = slope / np.where(size > 0, size, 1.0)
+    return (unit.mT @ rows[..., None])[..., 0]

@@ -1,0 +1,207 @@
+"""What was measured, of all kinds together: plain and frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.measurements.edges import EdgeSet, Rejection
+from pkmcal.measurements.links import LinkSet
+from pkmcal.measurements.poses import PoseSet
+
+BREATHING_SIGMA = 1.5e-3
+"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
+focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
+mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the photographs of a session gave.
+
+    edges : the measurements.
+    rejected : what was left out, with its reason.
+    points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
+        for pictures and residuals.
+    T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    poses : of boards, and of trackers' targets.
+    binning : (S,) pixels of each station's photographs across, and down, that were one where edges
+        were looked for: what of an edge is in pixels, is in these.
+    """
+
+    edges: EdgeSet
+    rejected: tuple[Rejection, ...]
+    points: Array
+    point_edge: Integers
+    T_camera_base: Array
+    poses: PoseSet = field(default_factory=PoseSet.empty)
+    binning: Integers = field(default_factory=lambda: np.ones(0, dtype=int))
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Where nothing is said of binning, there is none."""
+        if not len(self.binning):
+            object.__setattr__(self, "binning", np.ones(len(self.T_camera_base), dtype=int))
+
+
+Set = TypeVar("Set", PoseSet, EdgeSet)
+
+
+def concatenate(sets: Sequence[Set]) -> Set:
+    """One set or more as one; cameras with fewer parameters get zeros for the rest."""
+    widest = max(s.by_intrinsics.shape[-1] for s in sets)
+    padded = [
+        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
+        for s in sets
+    ]
+    joined = {
+        f.name: np.concatenate(
+            padded if f.name == "by_intrinsics" else [getattr(s, f.name) for s in sets]
+        )
+        for f in fields(sets[0])
+    }
+    return replace(sets[0], **joined)
+
+
+def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
+    """Edges by the number of their station, whatever number it had, as one set."""
+    return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
+
+
+@dataclass(frozen=True)
+class Mount:
+    """What a board or a tracker's target is fixed to; its place there is estimated.
+
+    tolerance : standard deviation of a board's size, relative: its squares are all larger or
+    smaller by one factor, which is estimated where the data tell it.
+    """
+
+    name: str
+    body: Literal["base", "platform"]
+    tolerance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Everything that was measured, nothing that was assumed.
+
+    edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
+    standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
+    that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
+    (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
+    refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
+    those units from the calibration's values. poses : of boards or targets, each on one of the
+    ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
+    gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
+    they were measured, in BREATHING_SIGMA; empty where none breathes. links : measurements that
+    link two configurations, one set for each kind. level : (S,) stations whose z
+    axis is the base's, exactly; empty where there is none. look_variance : by what part of its
+    variance by noise a result varies besides, with where its edges were looked for.
+    """
+
+    edges: EdgeSet
+    joints: Array
+    joint_noise: float
+    n_stations: int
+    camera_of_station: Integers
+    intrinsics_factor: Array = field(default_factory=lambda: np.zeros((1, 0, 0)))
+    intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
+    poses: PoseSet = field(default_factory=PoseSet.empty)
+    mounts: tuple[Mount, ...] = ()
+    shaded: bool = False
+    breathing_at: Array = field(default_factory=lambda: np.zeros(0))
+    level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    look_variance: float = 0.0
+    links: tuple[LinkSet, ...] = ()
+
+    __repr__ = short_repr
+
+    @property
+    def n_links(self) -> int:
+        """Number of measurements that link two configurations."""
+        return sum(len(links) for links in self.links)
+
+    @property
+    def link_ends(self) -> Integers:
+        """(n, 2) configurations of all links."""
+        none = np.zeros((0, 2), dtype=int)
+        return np.concatenate([none, *(links.configuration for links in self.links)])
+
+    def link_at(self, number: int) -> tuple[LinkSet, int]:
+        """The set of a link, by its number among all, and its number there."""
+        for links in self.links:
+            if number < len(links):
+                return links, number
+            number -= len(links)
+        raise IndexError(number)
+
+    def links_among(self, keep: Booleans) -> Booleans:
+        """(n,) links of which both configurations are among those to keep, (K,)."""
+        first, second = self.link_ends.T
+        return keep[first] & keep[second]
+
+    def with_links(self, keep: Booleans) -> Measurements:
+        """The same with some of the links, (n,)."""
+        ends = np.cumsum([len(links) for links in self.links]).tolist()
+        parts = [
+            links.select(keep[end - len(links) : end])
+            for links, end in zip(self.links, ends, strict=True)
+        ]
+        return replace(self, links=tuple(parts))
+
+    @property
+    def n_cameras(self) -> int:
+        """Number of cameras, C."""
+        return int(self.camera_of_station.max(initial=-1)) + 1
+
+    @property
+    def on_platform(self) -> Booleans:
+        """(M,) which of the mounts move with the platform."""
+        return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What k numbers do to what was measured, to first order: from what was measured to what should
+    have been.
+
+    edges : (N, 2, k) turn of the normals, in their bases. readings : (K, m, k). poses : (N', 6, k)
+    left perturbation of T_station_target. motion : (S, K, 6, k) left perturbation (omega, tau) of
+    the stations' poses, by configuration. Absent: none. Or, where ``station`` is given, the camera
+    or tracker of that number stands elsewhere from configuration ``since`` on, by (omega, tau).
+    """
+
+    edges: Array | None = None
+    readings: Array | None = None
+    poses: Array | None = None
+    motion: Array | None = None
+    station: int | None = None
+    since: int = 0
+
+    @property
+    def count(self) -> int:
+        """How many numbers, k."""
+        if self.station is not None:
+            return 6
+        parts = (self.edges, self.readings, self.poses, self.motion)
+        return max((part.shape[-1] for part in parts if part is not None), default=0)
+
+
+@dataclass(frozen=True)
+class Departure:
+    """Something that a session takes for granted and that may be otherwise.
+
+    kind : for programs. of : what departs, by name. says : what the data show and what to do next,
+    from the numbers that fit and their standard deviations (k,). effect : what it does to what was
+    measured; empty for a single reading, see :class:`pkmcal.identify.score.Departures`.
+    """
+
+    kind: str
+    of: str
+    says: Callable[[Array, Array], tuple[str, str]]
+    effect: Effect = field(default_factory=Effect)

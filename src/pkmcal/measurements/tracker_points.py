@@ -1,0 +1,34 @@
+"""Points of a reflector or a ball on the platform, as a tracker or a measuring machine sees them.
+
+Rows: :func:`pkmcal.measurements.poses.pose_rows`, the last three numbers.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import register
+from pkmcal.measurements.contract import POINT_COLUMNS, TargetKind
+
+
+@final
+class TrackerPoints(TargetKind):
+    """Place of a target."""
+
+    code: ClassVar = "points"
+    one: ClassVar = "point"
+    label: ClassVar = "points"
+    unit: ClassVar = "m"
+    numbers: ClassVar = 3
+    headers: ClassVar = (POINT_COLUMNS,)
+    known: ClassVar = (3, 4, 5)
+    fewest_rows: ClassVar = 4
+
+    @classmethod
+    def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
+        """The points laid over the platform's places."""
+        good = np.isfinite(platform).all(axis=1)
+        return register(platform[good], T_tracker_target[good, :3, 3])

@@ -1,0 +1,94 @@
+"""What links two configurations in the report: a section for each kind, a row for each link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import LinkSet
+from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
+from pkmcal.outcome import Part, Row, Table
+from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
+from pkmcal.session.load import Session
+from pkmcal.wording import brief, capital, count, decimals, number
+
+
+def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> tuple[Part, ...]:
+    """A section for each kind. every : the links of the estimate."""
+    out: list[Part] = []
+    first = 0
+    for links in every:
+        mine = slice(first, first + len(links))
+        first += len(links)
+        if not len(links):
+            continue
+        kind = measurement_kinds()[links.kind]
+        unit, factor = DISPLAY_UNITS[kind.unit]
+        white, weight = estimate.link_residuals[mine], estimate.link_weights[mine]
+        off = white * estimate.statistics.link_scale * links.sigma
+        kept = weight >= KEPT_EDGE_WEIGHT
+        aside = "" if kept.all() else f", {int(np.sum(~kept))} rejected"
+        joined = count(len(np.unique(links.configuration)), "configuration")
+        times = number(_rms(off[kept] / links.sigma[kept]), 2)
+        text = (
+            f"{count(len(links), kind.one)} between {joined}{aside}. They are"
+            f" {brief(_rms(off[kept]) * factor)} {unit} off the calibrated machine (root mean"
+            f" square), which is {times} times their stated noise."
+        )
+        out.append(
+            Part(
+                kind.code,
+                capital(kind.label),
+                (text,),
+                tables=(_table(session, links, off, white, kept, unit, factor),),
+            )
+        )
+    return tuple(out)
+
+
+def weights(every: Sequence[LinkSet], estimate: Estimate) -> list[tuple[str, Array]]:
+    """Of each kind what one of them is called, and the weights."""
+    out: list[tuple[str, Array]] = []
+    first = 0
+    for links in every:
+        one = measurement_kinds()[links.kind].one
+        out.append((one, estimate.link_weights[first : first + len(links)]))
+        first += len(links)
+    return out
+
+
+def _rms(values: Array) -> float:
+    """Root mean square, NaN of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def _table(
+    session: Session,
+    links: LinkSet,
+    off: Array,
+    white: Array,
+    kept: Booleans,
+    unit: str,
+    factor: float,
+) -> Table:
+    """One row a link, those that are farthest off first."""
+    rows: list[Row] = []
+    for k in np.argsort(-np.abs(white), kind="stable").tolist():
+        first, second = (session.configurations[c] for c in links.configuration[k])
+        digits = decimals(float(links.sigma[k]) * factor)
+        cells = (
+            second,
+            number(float(links.value[k]) * factor, digits),
+            number(float(links.value[k] + off[k]) * factor, digits),
+            number(float(off[k]) * factor, digits),
+            number(float(white[k]), 1),
+            "used" if kept[k] else "rejected",
+        )
+        rows.append(Row(first, cells))
+    values = (f"Measured, {unit}", f"Calibrated, {unit}", f"Off, {unit}")
+    columns = ("From", "To", *values, "In σ", "Use")
+    title = "By the calibrated machine"
+    return Table(title, columns, tuple(rows), brief=False, words=(1, 6))

@@ -1,0 +1,66 @@
+"""Sessions of delta printers with heights of the bed and distances on a printed part."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import printers
+from pkmcal.printers.session import write_printer_session
+
+CALIPER = 0.02
+"""mm."""
+
+
+def marks():
+    """Places (13, 2) mm of a printed part's marks: a star of two rings and its middle."""
+    a = np.deg2rad(np.arange(0, 360, 60))
+    ring = np.column_stack([np.cos(a), np.sin(a)])
+    return np.concatenate([np.zeros((1, 2)), 40 * ring, 75 * ring])
+
+
+PAIRS = [(0, k) for k in range(1, 13)] + [(k, k + 3) for k in (1, 2, 3, 7, 8, 9)]
+"""The middle to all others, and across."""
+
+
+def write(folder, true, rng, *, says=None, noise=0.015, places=13, caliper=CALIPER, pairs=None):
+    """A session of heights and of distances of a true machine, mm; the marks' names.
+
+    The part is printed at places by the firmware's own account, so the true marks are elsewhere.
+    """
+    says = says or printers.Settings()
+    readings = printers.felt(true, printers.bed(places), noise, rng)
+    (folder / "printer.cfg").write_text(printers.printer_cfg(says, readings))
+    write_printer_session(folder / "kit", folder / "printer.cfg")
+    add_distances(folder / "kit", true, rng, says, caliper, pairs)
+    return folder / "kit"
+
+
+def add_distances(kit, true, rng, says, caliper=CALIPER, pairs=None):
+    """Adds marks to joints.csv, distances.csv, and its key to session.yaml."""
+    pairs = PAIRS if pairs is None else pairs
+    at = marks()
+    carriages = says.carriages(np.column_stack([at, np.full(len(at), 0.2)]))
+    there = 1e3 * true.forward(1e-3 * carriages)[:, :3, 3]
+    text = (kit / "joints.csv").read_text()
+    rows = [f"m{k:02d}," + ",".join(repr(float(x)) for x in c) for k, c in enumerate(carriages)]
+    (kit / "joints.csv").write_text(text + "\n".join(rows) + "\n")
+    lines = ["from,to,distance [mm]"]
+    for a, b in pairs:
+        apart = np.linalg.norm(there[b] - there[a]) + caliper * rng.normal()
+        lines.append(f"m{a:02d},m{b:02d},{float(apart)!r}")
+    (kit / "distances.csv").write_text("\n".join(lines) + "\n")
+    session = (kit / "session.yaml").read_text()
+    (kit / "session.yaml").write_text(
+        session + f"\ndistances:\n  file: distances.csv\n  noise: {caliper} mm\n"
+    )
+
+
+def stretch(true, found):
+    """By how much larger than commanded a calibrated machine makes the bed, a share."""
+    xy = printers.bed(30)
+    T = np.broadcast_to(np.eye(4), (30, 4, 4)).copy()
+    T[:, :2, 3] = 1e-3 * xy
+    there = true.forward(found.inverse(T))[:, :2, 3]
+    plane = np.column_stack([1e-3 * xy, np.ones(30)])
+    slope = np.linalg.lstsq(plane, there, rcond=None)[0]
+    return np.trace(slope[:2]) / 2 - 1
