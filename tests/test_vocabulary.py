@@ -1,0 +1,120 @@
+"""The tree's words are the field's: identifiers and files are nouns, by the glossary in
+docs/conventions.md, and no participles or verbs of speech.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "pkmcal"
+
+NO_WORDS = frozenset(
+    {
+        "told",
+        "said",
+        "seen",
+        "found",
+        "known",
+        "asked",
+        "shown",
+        "looked",
+        "kept",
+        "alike",
+        "aside",
+        "crowd",
+        "doubt",
+        "doubts",
+        "doubted",
+        "departure",
+        "departures",
+        "departed",
+        "byhand",
+        "closely",
+    }
+)
+"""No part of an identifier: what was told, to whom, and when, the word does not say."""
+NO_NAMES = NO_WORDS | {"left", "way", "looks", "says", "tells", "ask", "tell"}
+"""No identifier by itself; as a part they have a meaning (``left_margin``, ``half_way``)."""
+ALLOWED = {
+    "found": "what an error found (`pkmcal.errors`, and its JSON), and keys of other documents",
+    "seen": "keys of the documents of `check` and `validate`",
+    "tells": "a key of the document of `check`",
+    "known": "an argument of `pkmcal.compare`",
+    "asked": "an argument of `pkmcal.simulate`",
+    "shown": "a key of the requests of the page of `view`",
+    "left": "the opposite of right",
+}
+"""Names that are part of a file, of the command line or of Python's public interface."""
+
+
+def words(name: str) -> set[str]:
+    return set(re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower().split("_"))
+
+
+def definitions(path: Path) -> Iterator[tuple[str, int]]:
+    """Identifiers that a file binds, with their lines."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                yield name, node.lineno
+            case ast.arg(arg=name):
+                yield name, node.lineno
+            case ast.Name(id=name, ctx=ast.Store()):
+                yield name, node.lineno
+            case ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name, node.lineno
+            case ast.ExceptHandler(name=str(name)) | ast.alias(asname=str(name)):
+                yield name, node.lineno
+            case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+                yield name, node.lineno
+            case _:
+                pass
+
+
+def is_banned(name: str) -> bool:
+    return name.strip("_") in NO_NAMES or bool(words(name) & NO_WORDS)
+
+
+def sources() -> list[Path]:
+    return sorted(SOURCE.rglob("*.py"))
+
+
+def test_the_words_of_a_name_are_read():
+    assert words("_ToldBy_x2Y") == {"", "told", "by", "x2", "y"}
+    assert is_banned("_told")
+    assert is_banned("MachineTold")
+    assert is_banned("left")
+    assert not is_banned("left_margin")
+    assert not is_banned("T_camera_base")
+
+
+def test_identifiers_are_nouns_of_the_field():
+    wrong = [
+        f"{path.relative_to(SOURCE)}:{line} {name}"
+        for path in sources()
+        for name, line in definitions(path)
+        if is_banned(name) and name not in ALLOWED
+    ]
+    assert wrong == []
+
+
+def test_files_are_named_by_what_they_hold():
+    assert [str(path.relative_to(SOURCE)) for path in sources() if is_banned(path.stem)] == []
+
+
+def test_every_exception_is_still_needed():
+    bound = {name for path in sources() for name, _ in definitions(path)}
+    assert sorted(ALLOWED.keys() - bound) == []
+    assert [name for name in ALLOWED if not is_banned(name)] == []
+
+
+def test_the_glossary_names_files_that_there_are():
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    table = text.split("## Glossary", 1)[1]
+    named = re.findall(r"`([\w/]+\.py)`", table.split("| --- |", 1)[1])
+    assert named
+    assert [name for name in named if not (SOURCE / name).is_file()] == []
