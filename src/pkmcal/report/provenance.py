@@ -25,10 +25,10 @@ from pkmcal.wording import amount, brief, count, decimals, number
 
 SIGMA_MEANING_TEXT = Markup(
     "<strong>What σ means here.</strong> The standard deviations say how much the result would"
-    " scatter if the same photographs and readings were taken again. They know the noise of the"
-    " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
-    " lens that its file does not describe. Photographs that the calibration has not seen are the"
-    " test for those."
+    " scatter if the same measurements were taken again. They contain the noise of the measurement,"
+    " and of what the model leaves out (legs that bend, joints with play, a lens that its file does"
+    " not describe, an uneven bed) what these data show. Measurements that the calibration has not"
+    " used are the test for the rest."
 )
 NORMAL_FROM_FREEDOMS = 50
 """Degrees of freedom from which on a Student distribution is told as the normal one."""
