@@ -29,6 +29,7 @@ from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 from test_report_page import Found
@@ -456,8 +457,8 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
     found = calibrated
-    doubts = ("Somebody ran into the machine.",)
-    verdict = judge(found.observation, found.estimate, found.findings, doubts=doubts)
+    others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
+    verdict = judge(found.observation, found.estimate, found.findings, others=others)
     found = replace(found, verdict=verdict)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: found)
     done = run("calibrate", session)

@@ -149,7 +149,8 @@ def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
     checks = found.parts[-1].checks
     bad = replace(checks[1], passed=False)
     part = replace(found.parts[-1], checks=(checks[0], bad))
-    verdict = replace(found.verdict, usable=False, reasons=(bad.sentence,))
+    missed = found.verdict.of("study.missed")
+    verdict = replace(found.verdict, usable=False, findings=missed)
     failed = replace(found, verdict=verdict, stamp="Not reproduced", parts=(part,))
     failed.document["passed"] = False
     monkeypatch.setattr(

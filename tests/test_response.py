@@ -269,15 +269,16 @@ def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
     assert told.sure == sure
     assert told.response == ("srgb" if sure else "linear")
     if sure:
-        assert "at odds of more than 1000 to 1. They are measured so" in told.sentence
-        assert "write response: srgb in session.yaml, under the stations front" in told.sentence
+        assert "at odds of more than 1000 to 1. They are measured so" in told.finding.text
+        assert "write response: srgb in session.yaml, under the stations front" in told.finding.text
     else:
         assert (
             "do not tell whether the levels of the photographs of front and left are linear"
-            in told.sentence
+            in told.finding.text
         )
         assert (
-            "Write response: linear or response: srgb in session.yaml, under the" in told.sentence
+            "Write response: linear or response: srgb in session.yaml, under the"
+            in told.finding.text
         )
 
 

@@ -458,7 +458,7 @@ def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
         raise InputError(
             "the photographs that are recognised show one configuration only",
             where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
-            found=f"{listed(names)}; {left.rejected[0].sentence}"
+            found=f"{listed(names)}; {left.rejected[0].finding.text}"
             if left.rejected
             else listed(names),
             expected="two at least",

@@ -30,8 +30,9 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.session.load import Session
-from pkmcal.wording import listed, ratio_in_per_cent
+from pkmcal.wording import listed
 
 SUSPECT_POSE_SCALE = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
@@ -68,7 +69,6 @@ WRONG_MODEL_READING_SCALE = 100.0
 what a mounted encoder does lies a factor of ten or thirty."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
-BOARDS_TURN_WORDS = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 @dataclass(frozen=True)
@@ -382,29 +382,24 @@ def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
     return best < max(POOR_MODEL_POSE_SCALE, CURED_MISFIT_SHARE * estimate.statistics.pose_scale)
 
 
-def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """A reason where readings scatter by more than the drawing is off, and so tell nothing, or by
-    so much more than is stated that it is no noise.
+def noise_doubt(session: Session, estimate: Estimate) -> Iterator[Finding]:
+    """A reason where readings scatter by more than the nominal model is off, and so determine
+    nothing, or by so much more than is stated that it is no noise.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
     most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
     if s.reading_scale <= 1:
-        return ()
-    if noise <= most and s.reading_scale < WRONG_MODEL_READING_SCALE:
-        return ()
-    if noise <= most:
-        return (
-            f"The readings scatter by {_lengths(noise, units)},"
-            f" {s.reading_scale:.0f} times what joints.noise in session.yaml says: encoders are"
-            " not stated so wrong, something moves the machine beside its readings, or they are"
-            " not those of these configurations. If they really are no better, state their noise.",
+        return
+    if noise > most:
+        yield wrong("readings.noise_beyond_tolerance", noise=noise, limit=most, units=sorted(units))
+    elif s.reading_scale >= WRONG_MODEL_READING_SCALE:
+        yield wrong(
+            "readings.noise_beyond_encoders",
+            noise=noise,
+            scale=s.reading_scale,
+            units=sorted(units),
         )
-    return (
-        f"The readings scatter by {_lengths(noise, units)}, more than the drawing's tolerance of"
-        f" {_lengths(most, units)}: they may belong to other configurations, or to another"
-        " machine.",
-    )
 
 
 def richer_models(
@@ -434,151 +429,111 @@ def richer_models(
     return tuple(out)
 
 
-def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence where the whole machine came out larger or smaller than drawn."""
+def scale_doubt(session: Session, estimate: Estimate) -> Iterator[Finding]:
+    """A reason where the whole machine came out larger or smaller than drawn."""
     scale = wrong_scale(estimate)
-    if scale == 1.0 or not estimate.pose_weights.size:
-        return ()
-    more = "larger" if scale > 1 else "smaller"
-    cause = (
-        "the board's squares are not of the size that its file says. Measure them over as many as"
-        " there are"
-        if session.board
-        else "the table's lengths have another scale"
-    )
-    return (
-        f"All of the machine came out {abs(scale - 1):.2%} {more} than its drawing, as if {cause}:"
-        " every displacement of the platform is wrong by as much.",
-    )
+    if scale != 1.0 and estimate.pose_weights.size:
+        cause = "board" if session.board else "table"
+        yield wrong("machine.scale", value=scale - 1, cause=cause)
 
 
-def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> tuple[str, ...]:
-    """Sentences where the data do not allow a noise that session.yaml states.
+def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> Iterator[Finding]:
+    """Warnings where the data do not allow a noise that session.yaml states.
 
     departed : whether something was found that makes readings scatter.
     """
-    s, out = estimate.statistics, list[str]()
-    units, file = set(session.machine.joint_units), "session.yaml"
+    s, units = estimate.statistics, sorted(set(session.machine.joint_units))
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
         least, most = s.reading_range
-        used, stated, bound = (
-            _lengths(session.joint_noise * scale, units)
-            for scale in (s.reading_scale, 1.0, most or 0.0)
-        )
-        found, taken = used, "What they scatter by"
-        if most is not None and not least:
-            found, taken = f"no more than some {bound}", used
-        out.append(
-            f"The readings scatter by {found}; joints.noise in {file} says {stated}. {taken} was"
-            f" used (the data allow {_between(s.reading_range)} times the stated noise): "
-            + (
-                "what is named before may be all that they scatter by."
-                if departed
-                else "correct joints.noise, or look for what moves the machine beside its readings."
-            )
+        yield doubtful(
+            "readings.noise",
+            "session.yaml, joints.noise",
+            noise=session.joint_noise * s.reading_scale,
+            stated=session.joint_noise,
+            bound=session.joint_noise * most if most is not None and not least else None,
+            range=s.reading_range,
+            units=units,
+            explained="yes" if departed else "no",
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:
-        where = listed([f"stations.{table.name}.tracker.noise" for table in session.trackers])
-        out.append(
-            f"What was measured of the platform scatters by {_between(s.pose_range)} times what"
-            f" {where} in {file} says. The stated noise was used all the same, for errors that all"
-            " measurements share do not scatter; if there are none, state it smaller, and standard"
-            " deviations follow."
-        )
-    return tuple(out)
+        keys = [f"stations.{table.name}.tracker.noise" for table in session.trackers]
+        yield doubtful("poses.noise", f"session.yaml, {keys[0]}", range=s.pose_range, keys=keys)
 
 
-def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
-    """A sentence for each camera that was refined and whose file does not tell how well it is
-    known.
-    """
-    usual = ", ".join(
-        (
-            f"focal lengths to {USUAL_FOCAL:.1%}",
-            f"their ratio to {USUAL_ASPECT:.1%}",
-            f"the centre to {USUAL_CENTRE:.0%} of the width",
-            f"distortion to {USUAL_DISTORTION:g}",
-        )
-    )
-    return tuple(
-        f"{file} states no covariance, so its camera was taken to be known as cameras usually are:"
-        f" {usual}. One that `pkmcal camera` calibrates is better known."
-        for file, camera in zip(cameras.files, cameras.calibrated, strict=True)
-        if cameras.refined and camera.covariance is None
-    )
+def lens_told(cameras: CameraRefinement) -> Iterator[Finding]:
+    """A warning for each camera that was refined and whose file states no covariance."""
+    for file, camera in zip(cameras.files, cameras.calibrated, strict=True):
+        if cameras.refined and camera.covariance is None:
+            yield doubtful(
+                "camera.no_covariance",
+                file,
+                focal=USUAL_FOCAL,
+                aspect=USUAL_ASPECT,
+                centre=USUAL_CENTRE,
+                distortion=USUAL_DISTORTION,
+            )
 
 
-def sizes_told(session: Session, measurements: Measurements, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence on how large the board is, where that is not known exactly."""
+def sizes_told(
+    session: Session, measurements: Measurements, estimate: Estimate
+) -> Iterator[Finding]:
+    """A note on how large the board is, where that is not known exactly."""
     tolerances = [mount.tolerance for mount in measurements.mounts if mount.tolerance > 0]
-    told = zip(tolerances, estimate.state.sizes, estimate.size_sigma, strict=False)
-    out: list[str] = []
-    for tolerance, value, sigma in told:
+    for tolerance, value, sigma in zip(
+        tolerances, estimate.state.sizes, estimate.size_sigma, strict=False
+    ):
         file = session.document["board"]["file"]
+        if sigma <= UNTOLD_BOARD_SIZE_SIGMA:
+            yield note(
+                "board.size_estimate", file, value=tolerance * value, sigma=tolerance * sigma
+            )
+            continue
         # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
         other = max(1 - sigma**2, np.finfo(float).eps)
-        without, apart = value / other, abs(value) / np.sqrt(other)
-        if sigma > UNTOLD_BOARD_SIZE_SIGMA:
-            out.append(
-                f"Nothing but {file} tells how large the board is: to {100 * tolerance:.2g} %, its"
-                " tolerance, and standard deviations contain that. Measure its squares over as many"
-                " as there are, correct square and marker, and state how well you measured."
-                + (
-                    " All else, the drawing's lengths first, fits best as if the board were"
-                    f" {ratio_in_per_cent(tolerance * without, tolerance * sigma / np.sqrt(other))}"
-                    f" {'larger' if value > 0 else 'smaller'}."
-                    if apart > BOARD_SIZE_DISAGREEMENT
-                    else ""
-                )
-            )
-        else:
-            out.append(
-                f"The board came out {100 * tolerance * abs(value):.3f} ±"
-                f" {100 * tolerance * sigma:.3f} % {'larger' if value > 0 else 'smaller'} than"
-                f" {file} says; that is taken into account."
-            )
-    return tuple(out)
+        disagrees = abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT
+        yield note(
+            "board.size_by_file",
+            file,
+            tolerance=100 * tolerance,
+            value=tolerance * value / other if disagrees else None,
+            sigma=tolerance * sigma / np.sqrt(other) if disagrees else None,
+        )
 
 
-def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> tuple[str, ...]:
-    """A sentence on readings whose scale is surely not the drawing's, beside those that are named
+def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:
+    """A note on readings whose scale is surely not the nominal one, beside those that are named
     already.
     """
     layout, table = session.machine.layout, session.machine.parameters
-    unsure = np.flatnonzero(layout.unsure_scales)
-    out: dict[str, str] = {}
-    for leg in unsure:
+    found: dict[str, tuple[float, float]] = {}
+    for leg in np.flatnonzero(layout.unsure_scales):
         k, column = layout.scale[leg], int(layout.actuated[leg])
         name = session.document["joints"]["columns"][column]
-        share = estimate.machine.values[k] / table.drawing[k] - 1
+        share = float(estimate.machine.values[k] / table.drawing[k] - 1)
         sigma = float(np.sqrt(estimate.covariance[k, k]))
         if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
-            more = "larger" if share > 0 else "smaller"
-            out[name] = f"{100 * abs(share):.3f} ± {100 * sigma:.3f} % {more} ({name})"
-    if not out:
-        return ()
-    return (
-        "Readings have another scale than the drawing says: true ones are"
-        f" {listed([*out.values()])}. That is in the calibrated machine, under scale, and in what"
-        " is exported of it.",
-    )
+            found[name] = share, sigma
+    if found:
+        values, sigmas = zip(*found.values(), strict=True)
+        each = [
+            f"{100 * abs(share):.3f} ± {100 * sigma:.3f} %"
+            f" {'larger' if share > 0 else 'smaller'} ({name})"
+            for name, (share, sigma) in found.items()
+        ]
+        yield note(
+            "readings.scale_estimates",
+            listed([*found]),
+            columns=[*found],
+            values=values,
+            sigmas=sigmas,
+            each=each,
+        )
 
 
 def _within(value: float, limits: tuple[float, float | None]) -> bool:
     low, high = limits
     return low <= value and (high is None or value <= high)
-
-
-def _between(limits: tuple[float, float | None]) -> str:
-    low, high = limits
-    return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
-
-
-def _lengths(value: float, units: set[str]) -> str:
-    """A reading's noise where readings are lengths (m), turns (rad), or both."""
-    each = {"m": f"{value * 1e3:.2g} mm", "rad": f"{np.rad2deg(value):.2g}°"}
-    return " or ".join(each[unit] for unit in ("m", "rad") if unit in units)
 
 
 def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
@@ -593,6 +548,7 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
             found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
             expected=f"the readings with the other sign; {left}",
             next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            code="readings.sign",
         )
     if doubt.kind == "order":
         one, other = (joints["columns"][k] for k in (doubt.motor, doubt.other))
@@ -602,6 +558,7 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
             found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
             expected=f"the two columns in the other order; {left}",
             next_step="Exchange the two columns, or the motors in the mechanism file",
+            code="readings.exchanged",
         )
     if doubt.kind == "size":
         return InputError(
@@ -610,6 +567,7 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
             found=f"a board {doubt.size:.4f} times as large, by how far the platform moved",
             expected=f"the size as measured with a ruler over many squares; {left}",
             next_step=f"Multiply square and marker by {doubt.size:.4f}, if a ruler agrees",
+            code="board.size",
         )
     what = "the board was moved on the platform" if doubt.kind == "board moved" else \
         "the camera was moved"  # fmt: skip
@@ -622,12 +580,14 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
         found=f"{shift:.1f} mm and {turn:.2f} degrees; {left}",
         expected="a board screwed to the platform, and a camera that stands still",
         next_step=f"Calibrate with the configurations before {after}, or with those from it on",
+        code="board.moved" if doubt.kind == "board moved" else "station.moved",
     )
 
 
-def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tuple[bool, str]]:
-    """Whether the platform turns as the mechanism file says, by every station that saw it whole: in
-    doubt or not, and the words. on_platform : (M,) of the mounts.
+def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:
+    """Whether the platform turns as the mechanism file says, by every station that saw it whole.
+
+    on_platform : (M,) of the mounts.
     """
     motion = session.machine.document.motion
     if motion == "spatial" or not len(poses):
@@ -635,22 +595,30 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
     from pkmcal.papers.rotation_axis import rotation_axis
 
     whole = (poses.rows == 6) & on_platform[poses.mount]
-    out: list[tuple[bool, str]] = []
+    out: list[Finding] = []
     for s in np.unique(poses.station[whole]).tolist():
         part = poses.select(whole & (poses.station == s))
-        if len(part) >= FEWEST_POSES:
-            found = rotation_axis(part, motion)
-            # Noise that is stated a little too small is no reason to doubt a mechanism.
-            doubt = not found.tenable and found.chi2 > POOR_MODEL_POSE_SCALE**2 * found.dof
-            said = found.sentence
-            if not (doubt or found.tenable):
-                off, noise = (
-                    np.rad2deg(np.sqrt(np.mean(tilt**2)))
-                    for tilt in (found.tilt, found.expected_tilt)
-                )
-                said = (
-                    f"The boards {BOARDS_TURN_WORDS[found.hypothesis]} but for {off:.3f}°, where"
-                    f" their stated noise alone gives {noise:.3f}°."
-                )
-            out.append((doubt, f"{session.station_names[s]}: {said}"))
+        if len(part) < FEWEST_POSES:
+            continue
+        found = rotation_axis(part, motion)
+        name = session.station_names[s]
+        off, noise = (
+            float(np.rad2deg(np.sqrt(np.mean(tilt**2))))
+            for tilt in (found.tilt, found.expected_tilt)
+        )
+        facts = {
+            "station": name,
+            "motion": found.hypothesis,
+            "off": off,
+            "noise": noise,
+            "chi2": found.chi2,
+            "dof": found.dof,
+        }
+        # Noise that is stated a little too small is no reason to doubt a mechanism.
+        if found.tenable:
+            out.append(note("poses.turning", name, **facts))
+        elif found.chi2 > POOR_MODEL_POSE_SCALE**2 * found.dof:
+            out.append(doubtful("poses.not_turning", name, **facts))
+        else:
+            out.append(note("poses.turning_roughly", name, **facts))
     return out

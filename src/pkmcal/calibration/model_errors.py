@@ -27,7 +27,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Effect, Measurements
-from pkmcal.wording import amount, joined
+from pkmcal.outcome.finding import Finding, doubtful
 
 CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
 """Distances over which errors of neighbouring poses are alike, in the root mean square distance of
@@ -70,49 +70,16 @@ class ModelError:
         }
 
 
-SUBJECTS = {
-    "readings.workspace": (
-        "in the readings that vary smoothly over the workspace",
-        "Look for what gives way under load or droops, or measure the platform itself",
-    ),
-    "readings.step": (
-        "in the readings that follow the motors' last step, as backlash and lag do",
-        "Come to every configuration from the same side, and wait before reading",
-    ),
-    "readings.time": (
-        "in the readings that change with time",
-        "Let the machine warm up first, and measure in random order",
-    ),
-    "base.workspace": (
-        "in where the base stands, which moves with the platform",
-        "Clamp the base, or measure it too",
-    ),
-    "station.time": (
-        "in where stations stand, which changes with time",
-        "Fix camera and tracker better, or measure in less time",
-    ),
-    "legs.shape": (
-        "in the legs' shape, which are no straight cylinders",
-        "Measure the tubes' radii at both ends and how straight they are",
-    ),
-}
-"""By component: where the errors are, and what helps."""
-
-
-def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
-    """One for the verdict, of all components, the largest by evidence first; none without sure
-    ones.
-    """
+def discrepancy_findings(errors: tuple[ModelError, ...]) -> Iterator[Finding]:
+    """A warning for each component, the largest by evidence first; none without sure ones."""
     if not any(one.sure for one in errors):
-        return ()
-    first = errors[0]
-    parts = [f"{amount(one.scale, one.unit)} {SUBJECTS[one.code][0]}" for one in errors]
-    return (
-        f"The model leaves out errors of {joined(parts)} (standard deviations). Those of the"
-        " result contain what they may have done: the tool's is"
-        f" {amount(first.tool, 'm')} in place of {amount(first.tool_before, 'm')}."
-        f" {SUBJECTS[first.code][1]}.",
-    )
+        return
+    for k, one in enumerate(errors):
+        tool: dict[str, Any] = {}
+        if not k:
+            tool = {"tool_sigma": one.tool, "tool_sigma_before": one.tool_before}
+        yield doubtful(f"discrepancy.{one.code}", sigma=one.scale, unit=one.unit,
+                       log_odds=one.ratio / 2, **tool)  # fmt: skip
 
 
 def discrepancy_components(measurements: Measurements, estimate: Estimate) -> list[Component]:

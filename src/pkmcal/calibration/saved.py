@@ -33,6 +33,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Statistics
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.wording import listed
 
 SAVED_NUMBER_ROUNDING = 1e-9
@@ -307,9 +308,26 @@ class _Session(_Part):
     joints: _Readings | None = None
 
 
+class _Finding(_Part):
+    code: str
+    level: Level
+    text: str
+    subject: str = ""
+    facts: dict[str, Any] = Field(default_factory=dict)
+
+
+class _Verdict(_Part):
+    usable: bool
+    headline: str
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    findings: tuple[_Finding, ...] | None = None
+
+
 class _Saved(_Part):
     pkmcal_calibration: Literal[1] = Field(description="the file's version, 1")
-    verdict: Verdict
+    verdict: _Verdict
     method: str
     seed: int
     gauge: str
@@ -358,7 +376,7 @@ def load(source: Path | str) -> SavedCalibration:
         gauge=saved.gauge,
         method=saved.method,
         seed=saved.seed,
-        verdict=saved.verdict,
+        verdict=_verdict(saved.verdict),
         stations=tuple(
             SavedStation(
                 station.name,
@@ -375,6 +393,26 @@ def load(source: Path | str) -> SavedCalibration:
         T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
         document=document.data,
     )
+
+
+def _verdict(saved: _Verdict) -> Verdict:
+    """The verdict in its own words; of a file from before findings had codes, without codes."""
+    if saved.findings is not None:
+        findings = [
+            Finding(one.code, one.level, one.facts, one.subject, saved_text=one.text)
+            for one in saved.findings
+        ]
+    else:
+        findings = [
+            Finding("", level, saved_text=text)
+            for level, texts in (
+                (Level.WRONG, saved.reasons),
+                (Level.DOUBTFUL, saved.warnings),
+                (Level.NOTE, saved.advice),
+            )
+            for text in texts
+        ]
+    return Verdict(saved.usable, saved.headline, tuple(findings))
 
 
 def _mechanism(saved: _Saved) -> MechanismDocument:

@@ -50,6 +50,7 @@ from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
 from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
+from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
 from pkmcal.solver.ranks import RANK_TOLERANCE
 from pkmcal.wording import listed
@@ -120,15 +121,11 @@ class Turns(NamedTuple):
     change: float = 0.0
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """Why the result is not to be used, if it did not settle."""
+    def doubts(self) -> tuple[Finding, ...]:
+        """A reason where the machine did not settle."""
         if self.change < SETTLED_MACHINE_CHANGE:
             return ()
-        return (
-            f"The machine does not settle: the last of {MOST_LOOKS_ASTRAY} looks at its edges still"
-            f" moved it by {self.change:.1f} of its standard deviations. A station's pose by hand,"
-            " or a drawing that is nearer to the machine, gives it a better start.",
-        )
+        return (wrong("estimate.unsettled", passes=MOST_LOOKS_ASTRAY, change=self.change),)
 
 
 def take_turns(

@@ -67,7 +67,7 @@ class Validation:
         names = self.session.configurations
         found = {
             "pkmcal_validation": VALIDATION_FORMAT,
-            "verdict": asdict(self.verdict),
+            "verdict": self.verdict.document(),
             "new_data": self.judged.document(names) if self.judged else None,
             "known_configurations": [*compress(names, self.known)],
             "repeated_configurations": [*compress(names, self.repeated)],

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.measurements import Departure, Effect
-from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
 """Configurations on either side of a movement: fewer are outliers."""
@@ -30,13 +30,11 @@ def movement_departures(
     for k in np.unique(moments).tolist():
         before, after = (configurations[int(used[k + d])] for d in (-1, 0))
 
-        def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:
-            turn, shift = np.linalg.norm(value[:3]), np.linalg.norm(value[3:])
-            return (
-                f"The {what} of {name} stood elsewhere after configuration {b}, by some"
-                f" {amount(float(shift), 'm')} and {amount(float(turn), 'rad')}",
-                f"Make two stations of it, one up to {b} and one from {a} on",
-            )
+        def facts(value: Array, _s: Array, b: str = before, a: str = after) -> dict[str, Any]:
+            turn, shift = (float(np.linalg.norm(part)) for part in (value[:3], value[3:]))
+            return {
+                "what": what, "station": name, "before": b, "after": a, "shift": shift, "turn": turn
+            }  # fmt: skip
 
         effect = Effect(station=station, since=int(used[k]))
-        yield Departure("station moved", name, says, effect)
+        yield Departure("station.moved", name, facts, effect)
