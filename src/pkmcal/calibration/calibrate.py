@@ -258,7 +258,7 @@ def calibrate_measurements(
     turns = Turns(observation, measurements, estimate, refinement_of(session, False), start=start)
     known = KnownScene.as_drawn(session.machine, T_camera_base, session.joints)
     seen = SeenSession(session, [], Boards(), known)
-    return _judge(seen, _Identified(turns, estimate, (), None), (), "bundle", 0, clock)
+    return _judge(seen, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -279,13 +279,15 @@ class Settled(NamedTuple):
     """A session whose stations all stand where their photographs say, and the estimate of it that
     no known mistake explains better.
 
-    turned : cameras whose photographs are upside down, or may be.
+    turned : cameras whose photographs are upside down, or may be. findings : notes on hypotheses
+    that could not be tested.
     """
 
     seen: SeenSession
     turns: Turns
     richer: tuple[RicherModel, ...]
     turned: tuple[UpsideDown, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def settle(
@@ -312,16 +314,24 @@ def settle(
     machine = seen.session.machine
     stated = as_stated(machine, turns.measurements, turns.estimate)
     richer = richer_models(seen.session, turns.measurements, stated)
-    check_poses(seen.session, turns.measurements, stated, richer)
-    check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
-    return Settled(seen, turns, richer, turned)
+    untested = (
+        *seen.known.findings,
+        *(
+            note("poses.model_failed", model.name, why=model.failure.rstrip("."))
+            for model in richer
+            if model.failure
+        ),
+        *check_poses(seen.session, turns.measurements, stated, richer),
+        *check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed),
+    )
+    return Settled(seen, turns, richer, turned, untested)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
     """The calibration of a settled session."""
-    seen, turns, richer, turned = settled
+    seen, turns, richer, turned, untested = settled
     machine = seen.session.machine
     turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
     clock.lap("identify")
@@ -329,7 +339,7 @@ def _finished(
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
     found = _estimated(machine, turns, richer, method, seed, holdout, clock)
-    return _judge(seen, found, turned, method, seed, clock)
+    return _judge(seen, found, turned, untested, method, seed, clock)
 
 
 class _Identified(NamedTuple):
@@ -422,6 +432,7 @@ def _judge(
     seen: SeenSession,
     found: _Identified,
     turned: tuple[UpsideDown, ...],
+    untested: tuple[Finding, ...],
     method: CalibrationMethod,
     seed: int,
     clock: Clock,
@@ -477,6 +488,7 @@ def _judge(
         *scales_told(session, found.estimate, tuple(x.of for x in departed)),
         *numbering_told(session),
         *(one.finding for one in (*turned, *images)),
+        *untested,
     )
     verdict = judge(
         found.turns.observation,

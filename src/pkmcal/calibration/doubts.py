@@ -67,6 +67,8 @@ richer model no help: what is believed ends below MOST_CURED_MISFIT."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise from which it is no noise: between a data sheet's figure and
 what a mounted encoder does lies a factor of ten or thirty."""
+NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
+"""Errors by which an estimate under a hypothesis fails."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
 
@@ -78,7 +80,8 @@ class Doubt:
     motor : column of the readings with the wrong sign, or exchanged with the other. configuration :
     the first after a movement; before : the last before it. size : of the board, true over
     written. moved : T (4, 4) of the board, or the station, from before to after. misfit : what is
-    left, in standard deviations.
+    left, in standard deviations; infinite where there is no estimate with the mistake put right,
+    and failure says why.
     """
 
     kind: Literal["sign", "order", "board moved", "camera moved", "size"]
@@ -90,6 +93,7 @@ class Doubt:
     configuration: int = -1
     moved: Array = field(default_factory=lambda: np.eye(4))
     size: float = 1.0
+    failure: str = ""
 
 
 def pose_misfit(estimate: Estimate) -> float:
@@ -135,28 +139,32 @@ def wrong_scale(estimate: Estimate) -> float:
     return 1 / back if gain > COMMON_FACTOR_CHI2 and gain > left else 1.0
 
 
-def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:
-    """The mistake that explains the poses; None where none does.
+def find_doubt(
+    machine: Machine, measurements: Measurements, estimate: Estimate
+) -> tuple[Doubt | None, tuple[Doubt, ...]]:
+    """The mistake that explains the poses, None where none does; and those that could not be tried.
 
     machine : by the drawing. estimate : of these measurements.
     """
     before = pose_misfit(estimate)
     found: Doubt | None = None
+    failed: list[Doubt] = []
     for doubt in chain(
         _movements(machine, measurements, estimate),
         _other_readings(machine, measurements),
         _sizes(machine, measurements, estimate),
     ):
+        if doubt.failure:
+            failed.append(doubt)
+            continue
         if found is None or doubt.misfit < found.misfit:
             found = doubt
         # a board that moved and a camera that moved are alike, so both are always tried
         if found.misfit < SURELY_CURED_MISFIT and doubt.kind not in ("board moved", "camera moved"):
             break
-    return (
-        found
-        if found and found.misfit < min(CURED_MISFIT_SHARE * before, MOST_CURED_MISFIT)
-        else None
-    )
+    if found and found.misfit >= min(CURED_MISFIT_SHARE * before, MOST_CURED_MISFIT):
+        found = None
+    return found, tuple(failed)
 
 
 def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
@@ -181,46 +189,48 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Do
         doubt = Doubt("order", np.inf, motor=one, other=other)
         mistakes.append((doubt, measurements.joints[:, order]))
     limit = CURED_MISFIT_SHARE * _first_misfit(machine, measurements)
-    ranked = [
-        (_first_misfit(machine, replace(measurements, joints=joints)), k)
-        for k, (_, joints) in enumerate(mistakes)
-    ]
+    ranked: list[tuple[float, int]] = []
+    for k, (doubt, joints) in enumerate(mistakes):
+        try:
+            ranked.append((_first_misfit(machine, replace(measurements, joints=joints)), k))
+        except NO_ESTIMATE as error:
+            yield replace(doubt, failure=str(error))
     for first, k in sorted(ranked):
         doubt, joints = mistakes[k]
         if first > limit:
             break
-        estimate = _tried(machine, replace(measurements, joints=joints), None)
-        if estimate is not None:
-            yield replace(doubt, misfit=pose_misfit(estimate))
+        yield _tried(doubt, machine, replace(measurements, joints=joints))[0]
 
 
 def _first_misfit(machine: Machine, measurements: Measurements) -> float:
     """:func:`pose_misfit` where an estimate would start, platform poses by the drawing and the
-    readings; infinite where it cannot.
+    readings. Raises an error of NO_ESTIMATE where it cannot.
     """
     from pkmcal.papers.hand_eye import start_from_poses
 
-    try:
-        assembled = assemble(machine, measurements, default_gauge(machine))
-        start = batch_of(machine, assembled, start_from_poses(machine, measurements))
-    except (PkmcalError, np.linalg.LinAlgError):
-        return np.inf
+    assembled = assemble(machine, measurements, default_gauge(machine))
+    start = batch_of(machine, assembled, start_from_poses(machine, measurements))
     rows = assembled.places.poses.taken(assembled.problem.unweighted(start).poses[0])
     return _usual(np.nan_to_num(rows, nan=np.inf))
 
 
-def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
-    """The estimate from other measurements, from the drawing unless told; None where it fails."""
+def _tried(
+    doubt: Doubt, machine: Machine, measurements: Measurements, start: State | None = None
+) -> tuple[Doubt, Estimate | None]:
+    """A mistake with its misfit, and the estimate from measurements in which it is put right, from
+    the drawing unless a start is given; with its failure and None where there is no estimate.
+    """
     from pkmcal.papers.hand_eye import start_from_poses
 
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
-        return bundle(
+        estimate = bundle(
             machine, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
         )
-    except (PkmcalError, np.linalg.LinAlgError):
-        return None
+    except NO_ESTIMATE as error:
+        return replace(doubt, failure=str(error)), None
+    return replace(doubt, misfit=pose_misfit(estimate)), estimate
 
 
 def _movements(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
@@ -247,16 +257,16 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             start = replace(
                 state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
             )
-            tried = _tried(machine, board, start)
+            doubt = Doubt(
+                "board moved", np.inf, station=int(s), before=place[0], configuration=place[1]
+            )
+            doubt, tried = _tried(doubt, machine, board, start)
             pair = np.array([m, -1])
-            if tried is not None and _certain(
-                tried.state.T_mount[pair], tried.mount_covariance[pair]
-            ):
+            if tried is None:
+                yield doubt
+            elif _certain(tried.state.T_mount[pair], tried.mount_covariance[pair]):
                 change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
-                yield Doubt(
-                    "board moved", pose_misfit(tried), station=int(s), before=place[0],
-                    configuration=place[1], moved=change,
-                )  # fmt: skip
+                yield replace(doubt, moved=change)
             if len(measurements.edges):
                 continue  # its edges would have to move with the camera
             yield from _camera_moved(machine, measurements, state, int(s), later, place)
@@ -289,15 +299,13 @@ def _camera_moved(
         camera_of_station=np.append(number, number[s]),
     )
     start = replace(state, T_camera_base=np.concatenate([state.T_camera_base, station[None]]))
-    tried = _tried(machine, camera, start)
-    if tried is not None and _certain(
-        tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
-    ):
+    doubt = Doubt("camera moved", np.inf, station=s, before=place[0], configuration=place[1])
+    doubt, tried = _tried(doubt, machine, camera, start)
+    if tried is None:
+        yield doubt
+    elif _certain(tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]):
         change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
-        yield Doubt(
-            "camera moved", pose_misfit(tried), station=s, before=place[0], configuration=place[1],
-            moved=change,
-        )  # fmt: skip
+        yield replace(doubt, moved=change)
 
 
 def _changed(index: Integers, rows: Integers, value: int) -> Integers:
@@ -342,9 +350,7 @@ def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> 
         return
     T[rows] = pose(T[rows, :3, :3], spread * T[rows, :3, 3])
     other = replace(measurements, poses=replace(poses, T_station_target=T))
-    tried = _tried(machine, other, None)
-    if tried is not None:
-        yield Doubt("size", pose_misfit(tried), size=float(spread))
+    yield _tried(Doubt("size", np.inf, size=float(spread)), machine, other)[0]
 
 
 def check_poses(
@@ -352,19 +358,24 @@ def check_poses(
     measurements: Measurements,
     estimate: Estimate,
     richer: tuple[RicherModel, ...] = (),
-) -> None:
+) -> tuple[Finding, ...]:
     """Raise `InputError` where one of the usual mistakes explains why poses do not fit, or where a
-    reading never changes.
+    reading never changes; a note where mistakes could not be tried.
 
     richer : models that were tried; where one of them fits, it is the model that is at fault.
     """
     if not in_doubt(estimate) or any(model.scale < SUSPECT_POSE_SCALE for model in richer):
-        return
+        return ()
     if error := frozen_in(session):
         raise error
-    doubt = find_doubt(session.machine, measurements, estimate)
+    doubt, failed = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:
         raise _error(session, doubt, estimate.statistics.pose_scale)
+    if not failed:
+        return ()
+    kinds = [one.kind for one in failed]
+    why = failed[0].failure.rstrip(".")
+    return (note("poses.mistakes_untested", number=len(failed), mistakes=kinds, why=why),)
 
 
 def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
@@ -423,7 +434,8 @@ def richer_models(
             found = bundle(
                 other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
             )
-        except (PkmcalError, np.linalg.LinAlgError):
+        except NO_ESTIMATE as error:
+            out.append(RicherModel(name, np.inf, str(error)))
             continue
         out.append(RicherModel(name, found.statistics.pose_scale))
     return tuple(out)
@@ -491,14 +503,15 @@ def sizes_told(
             continue
         # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
         other = max(1 - sigma**2, np.finfo(float).eps)
-        disagrees = abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT
-        yield note(
-            "board.size_by_file",
-            file,
-            tolerance=100 * tolerance,
-            value=tolerance * value / other if disagrees else None,
-            sigma=tolerance * sigma / np.sqrt(other) if disagrees else None,
-        )
+        known = {"tolerance": 100 * tolerance}
+        if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT:
+            known |= {
+                "value": tolerance * value / other,
+                "sigma": tolerance * sigma / np.sqrt(other),
+            }
+            yield note("board.size_disagrees", file, **known)
+        else:
+            yield note("board.size_by_file", file, **known)
 
 
 def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:

@@ -49,12 +49,13 @@ class ResponseTold:
 
     entries : of session.yaml's stations, of one camera. usual : by which their photographs were
     measured at first. gain : of chi2 by the other response, less what there would be to gain by
-    going back.
+    going back; NaN where the test failed, and failure says why.
     """
 
     entries: tuple[str, ...]
     usual: Response
     gain: float
+    failure: str = ""
 
     @property
     def sure(self) -> bool:
@@ -76,6 +77,8 @@ class ResponseTold:
             "log_odds": self.gain / 2,
         }
         where = listed(self.entries)
+        if self.failure:
+            return note("image.response_untested", where, **facts, why=self.failure)
         if self.sure:
             return note("image.response", where, **facts, odds=ODDS_FOR_OTHER_RESPONSE)
         return doubtful("image.response_unknown", where, **facts)
@@ -125,17 +128,26 @@ def told_by_edges(
         ended = bundle(estimate.machine, otherwise, estimate.state)
         before = {camera: edges.select(own[camera]) for camera in every}
         back, _ = _scored(otherwise, ended, before)
-    except PkmcalError:  # nothing, or too little, is found by the other
-        return ()
+    except PkmcalError as error:  # such as too few edges by the other response
+        why = str(error).rstrip(".")
+        return tuple(
+            ResponseTold(_entries(session, usual[camera]), camera[1], np.nan, why)
+            for camera in usual
+        )
     told = [
         ResponseTold(
-            tuple(dict.fromkeys(session.stations[p.station].entry for p in usual[camera])),
+            _entries(session, usual[camera]),
             camera[1],
             there[camera] - back[camera],
         )
         for camera in every
     ]
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+
+
+def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:
+    """Their entries in session.yaml."""
+    return tuple(dict.fromkeys(session.stations[p.station].entry for p in photographs))
 
 
 def _doubted(

@@ -268,7 +268,7 @@ def _observed(
         *(one.finding for one in rejected),
     ]
     if isinstance(settled, Settled):
-        findings += [one.finding for one in settled.turned]
+        findings += [*(one.finding for one in settled.turned), *settled.findings]
         findings += _verdict_of_poses(settled)
     stations = [  # as it is known of one that observes no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
@@ -467,6 +467,7 @@ def _verdict_of_poses(settled: Settled) -> list[Finding]:
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []
-    better = min(richer, key=lambda model: model.scale, default=None)
+    fits = (model for model in richer if not model.failure)
+    better = min(fits, key=lambda model: model.scale, default=None)
     model = {"model": better and better.name, "model_scale": better and better.scale}
     return [doubtful("poses.explained", scale=scale, **model)]

@@ -62,10 +62,13 @@ POOR_MODEL_POSE_SCALE = 1.3
 
 @dataclass(frozen=True)
 class RicherModel:
-    """Another model of the mechanism file, and by how many times their noise poses fit it."""
+    """Another model of the mechanism file, and by how many times their noise poses fit it; infinite
+    where there is no estimate, and failure says why.
+    """
 
     name: str
     scale: float
+    failure: str = ""
 
 
 def judge(

@@ -81,6 +81,7 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
             found=" ".join(table.columns),
             expected=" ".join(f"leg{number}" for number in sorted(order)),
             next_step="Sort the columns, names and readings together",
+            code="readings.order",
         )
 
 
@@ -99,6 +100,7 @@ def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
                 found=f"{table.values[0, column]:g}",
                 expected=f"{expected}, between {low:g} and {high:g}",
                 next_step=next_step,
+                code="readings.units",
             )
 
 
@@ -118,6 +120,7 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
         found=f"{table.values[row, column]:g}",
         expected=f"{low:g} to {high:g}, where all of them lie with the other sign",
         next_step="Turn the sign of this column round, or the axis and range in the mechanism file",
+        code="readings.sign",
     )
 
 
@@ -161,6 +164,7 @@ def _shifted(
         f" {most} {name} added",
         next_step="Add the readings' constant to these columns, as far as you know it, or put it"
         " into the mechanism file's offsets: what is left of it is calibrated",
+        code="readings.zero",
     )
 
 
@@ -176,6 +180,7 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
             found=f"{table.values[row, column]:g}",
             expected=f"{low:g} to {high:g}, the range in the mechanism file",
             next_step=f"{more}Correct the reading, or the mechanism's range",
+            code="readings.outside_range",
         )
     near = np.argwhere(~_inside(table.values, ranges, margin=0.0))
     if not len(near):
@@ -213,6 +218,7 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
         expected="readings that follow the motor",
         next_step="Look at the encoder, its cable and the program that logs it. If this motor was"
         " really held, something else is wrong",
+        code="readings.frozen",
     )
 
 
@@ -271,6 +277,7 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
             found=f"differences of {np.ptp(table.values, axis=0).max():g} at most",
             expected=f"much more than joints.noise, {noise:g}",
             next_step="Check that the readings are the right ones and the noise is not too large",
+            code="readings.unmoved",
         )
     if not still.any():
         return []
