@@ -299,7 +299,7 @@ def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path
         session = load_session(folder, measured=False)
         assert (session.board is None) == (seen == "legs")
     assert session.machine.n_joints == drawn.n_joints
-    untouched = " ".join(untouched_files(folder))
+    untouched = " ".join(one.text for one in untouched_files(folder))
     assert all(f"{what}" in untouched for what in TO_FILL if (folder / what).exists())
 
 
@@ -311,7 +311,9 @@ def test_a_new_session_with_a_board_and_places(tmp_path):
     assert [s.name for s in session.stations] == ["front", "left", "right", "back", "place5"]
     assert {s.observe for s in session.stations} == {("legs", "board")}
     assert load_board(session.board).tolerance == 0.001
-    assert "board.yaml is still the example" in " ".join(untouched_files(folder))
+    assert "board.yaml is still the example" in " ".join(
+        one.text for one in untouched_files(folder)
+    )
     refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs")
     assert refused.code == 2
     assert "the drawing of delta has no cylinders that a camera could see" in refused.err

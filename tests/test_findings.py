@@ -106,6 +106,34 @@ def test_entries_hold_a_text_and_perhaps_a_next_step():
         assert entry["text"] == entry["text"].strip(), code
 
 
+FAILURES = {"PkmcalError", "ResultError", "GeometryError", "NO_ESTIMATE"}
+OTHER_START = "better_start"
+"""Chooses where to start; without the other start nothing is missing from the result."""
+
+
+def test_no_failure_is_dropped():
+    """What catches an error of ours raises again, or uses it: for a finding, a reason, a page."""
+    for folder in ("calibration", "check", "judge"):
+        for path in (SOURCE / folder).rglob("*.py"):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            exempt = {
+                handler
+                for node in ast.walk(tree)
+                if isinstance(node, ast.FunctionDef) and node.name == OTHER_START
+                for handler in ast.walk(node)
+            }
+            for node in ast.walk(tree):
+                if not isinstance(node, ast.ExceptHandler) or node.type is None or node in exempt:
+                    continue
+                kinds = {n.id for n in ast.walk(node.type) if isinstance(n, ast.Name)}
+                if kinds.isdisjoint(FAILURES):
+                    continue
+                inside = [n for part in node.body for n in ast.walk(part)]
+                used = any(isinstance(n, ast.Name) and n.id == node.name for n in inside)
+                raised = any(isinstance(n, ast.Raise) for n in inside)
+                assert used or raised, f"{path.relative_to(SOURCE)}:{node.lineno}"
+
+
 def test_departures_keep_their_kinds_in_files():
     assert {code for code in ENTRIES if "tool_shift_sigmas" in FIELDS[code]} == KINDS.keys()
 

@@ -313,6 +313,7 @@ class _Finding(_Part):
     level: Level
     text: str
     subject: str = ""
+    next_step: str = ""
     facts: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -399,7 +400,14 @@ def _verdict(saved: _Verdict) -> Verdict:
     """The verdict in its own words; of a file from before findings had codes, without codes."""
     if saved.findings is not None:
         findings = [
-            Finding(one.code, one.level, one.facts, one.subject, saved_text=one.text)
+            Finding(
+                one.code,
+                one.level,
+                one.facts,
+                one.subject,
+                saved_text=one.text,
+                saved_next_step=one.next_step,
+            )
             for one in saved.findings
         ]
     else:

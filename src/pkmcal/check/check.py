@@ -46,7 +46,7 @@ from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
 from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
-from pkmcal.outcome.finding import Finding, Level, doubtful, of_error
+from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
@@ -91,7 +91,12 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     findings += numbering_told(session)
     told("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
-    expected = forecast(seen.look) if seen.look and not by_hand else None
+    expected = None
+    if seen.look and not by_hand:
+        try:
+            expected = forecast(seen.look)
+        except (PkmcalError, np.linalg.LinAlgError) as error:
+            findings.append(note("images.no_forecast", why=str(error).rstrip(".")))
     for station in stations:
         findings += station_findings(station, session.machine.n_legs)
     return SessionCheck(

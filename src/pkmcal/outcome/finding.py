@@ -70,8 +70,8 @@ class Finding:
     code : ``area.what``, such as readings.scale. facts : numbers in SI units, texts, and lists of
     these by name; where they exist, value and sigma, log_odds, and tool_shift (m) with
     tool_shift_sigmas. subject : the file, leg, column, station or configuration that it is about.
-    error : of which it is made. saved_text : the sentence of a finding that was read back, as the
-    pkmcal that made it worded it.
+    error : of which it is made. saved_text, saved_next_step : of a finding that was read back, as
+    the pkmcal that made it worded them.
     """
 
     code: str
@@ -80,6 +80,7 @@ class Finding:
     subject: str = ""
     error: PkmcalError | None = None
     saved_text: str = ""
+    saved_next_step: str = ""
 
     @cached_property
     def text(self) -> str:
@@ -113,9 +114,9 @@ class Finding:
     def _parts(self) -> tuple[str, str]:
         if self.error is not None:
             return str(self.error), ""
-        template = templates(self.code.partition(".")[0]).get(self.code)
-        if template is None:
-            return self.saved_text, ""  # of a pkmcal with other codes
+        if self.saved_text:
+            return self.saved_text, self.saved_next_step
+        template = templates(self.code.partition(".")[0])[self.code]
         facts = {"subject": self.subject, **self.facts}
         return filled(template["text"], facts), filled(template.get("next_step", ""), facts)
 
