@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.outcome.finding import Finding, note, wrong
+from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.engine import StudyResult
@@ -84,7 +84,7 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
                 text=PAPER_STUDY_METHOD_TEXT if paper else STUDY_METHOD_TEXT,
             ),
         ),
-        findings=tuple(note("study.scope", text=text) for text in study.subject.warnings),
+        findings=study.subject.findings,
         closing=f"{count(study.runs * len(study.found), 'run')} in {seconds}.",
         document=study_document(study),
         texts={table: runs_bytes(study, table)},
@@ -370,7 +370,7 @@ def study_document(study: SweepResult) -> dict[str, Any]:
             }
             for g in study.gains
         ],
-        "warnings": list(study.subject.warnings),
+        "warnings": [one.text for one in study.subject.findings],
     }  # fmt: skip
 
 
