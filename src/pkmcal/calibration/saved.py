@@ -323,7 +323,7 @@ class _Verdict(_Part):
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
-    findings: tuple[_Finding, ...] | None = None
+    findings: tuple[_Finding, ...] = ()
 
 
 class _Saved(_Part):
@@ -397,29 +397,26 @@ def load(source: Path | str) -> SavedCalibration:
 
 
 def _verdict(saved: _Verdict) -> Verdict:
-    """The verdict in its own words; of a file from before findings had codes, without codes."""
-    if saved.findings is not None:
-        findings = [
-            Finding(
-                one.code,
-                one.level,
-                one.facts,
-                one.subject,
-                saved_text=one.text,
-                saved_next_step=one.next_step,
+    """The verdict in its own words; where a file is from before findings had codes, without."""
+    coded = {(one.level, one.text): one for one in saved.findings}
+    findings: list[Finding] = []
+    for level, texts in (
+        (Level.WRONG, saved.reasons),
+        (Level.DOUBTFUL, saved.warnings),
+        (Level.NOTE, saved.advice),
+    ):
+        for text in texts:
+            one = coded.get((level, text)) or _Finding(code="", level=level, text=text)
+            findings.append(
+                Finding(
+                    one.code,
+                    level,
+                    one.facts,
+                    one.subject,
+                    saved_text=text,
+                    saved_next_step=one.next_step,
+                )
             )
-            for one in saved.findings
-        ]
-    else:
-        findings = [
-            Finding("", level, saved_text=text)
-            for level, texts in (
-                (Level.WRONG, saved.reasons),
-                (Level.DOUBTFUL, saved.warnings),
-                (Level.NOTE, saved.advice),
-            )
-            for text in texts
-        ]
     return Verdict(saved.usable, saved.headline, tuple(findings))
 
 
