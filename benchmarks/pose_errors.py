@@ -38,6 +38,7 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA, Observation, concatenate
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.observe.predict import tubes_of
+from pkmcal.outcome.finding import Level
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, with_forearms
 from pkmcal.simulation.demo import camera_of_size
@@ -484,7 +485,7 @@ def judged(result: Any, scene: Scene) -> Outcome:
     sigma = float(np.sqrt(np.nanmean(error.position**2)))
     z = float(np.sqrt(np.nanmean(off.off_position**2))) / sigma
     v = result.verdict
-    said = (*v.reasons, *v.warnings)
+    said = tuple(f"{one.code}: {one.text}" for one in v.findings if one.level is not Level.NOTE)
     what = "refused" if not v.usable else "warned" if v.warnings else "silent"
     return Outcome(what, z, sigma, said)
 
@@ -497,7 +498,8 @@ def outcome(error: str, observer: str, seed: int) -> Outcome:
         try:
             return judged(calibrated(one, folder), one.scene)
         except PkmcalError as problem:
-            return Outcome("refused", float("nan"), float("nan"), (str(problem),))
+            text = f"{problem.code}: {problem}"
+            return Outcome("refused", float("nan"), float("nan"), (text,))
 
 
 def main() -> None:

@@ -39,20 +39,23 @@ HINGED = ("h4-rods",)
 
 
 class Outcome(NamedTuple):
-    """What became of a session: right, refused or wrong; what was said; processor's seconds."""
+    """What became of a session: right, refused or wrong; what was said; processor's seconds; the
+    code of what it was refused for.
+    """
 
     what: str
     said: str
     seconds: float
+    code: str = ""
 
 
 class Mistake(NamedTuple):
-    """A usual mistake: how a session's folder gets it, and words by which it is named; none where
-    the session is as good as before.
+    """A usual mistake: how a session's folder gets it, and the code by which it is named; none
+    where the session is as good as before.
     """
 
     make: Callable[[Path, np.random.Generator], None]
-    named: tuple[str, ...]
+    code: str = ""
 
 
 def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) -> Path:
@@ -93,7 +96,7 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         begin = time.process_time()  # of the search alone, where it comes to that
         found = station_poses(session, photographs, boards, np.random.default_rng(seed))
     except PkmcalError as error:
-        return Outcome("refused", str(error), time.process_time() - begin)
+        return Outcome("refused", str(error), time.process_time() - begin, error.code)
     seconds = time.process_time() - begin
     true = load_truth(folder, session.machine).T_camera_base
     if upside_down:
@@ -103,7 +106,7 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         try:
             end = calibrate_session(session, seed=seed).estimate.state.T_camera_base
         except PkmcalError as error:
-            return Outcome("refused", f"{said} at first; {error}", seconds)
+            return Outcome("refused", f"{said} at first; {error}", seconds, error.code)
         right, after = _near(end, true)
         said = f"{said}; calibrated, {after}"
     return Outcome("right" if right else "wrong", said, seconds / len(session.stations))
@@ -131,7 +134,7 @@ def calibrated(folder: Path, seed: int) -> Outcome:
     try:
         verdict = calibrate_session(folder, seed=seed).verdict
     except PkmcalError as error:
-        return Outcome("refused", str(error), time.process_time() - begin)
+        return Outcome("refused", str(error), time.process_time() - begin, error.code)
     what = "wrong" if verdict.usable else "refused"
     return Outcome(what, verdict.headline, time.process_time() - begin)
 
@@ -243,25 +246,25 @@ def _stations(folder: Path, _: np.random.Generator) -> None:
 
 
 MISTAKES: dict[str, Mistake] = {
-    "columns exchanged": Mistake(_columns, ("are mixed up",)),
+    "columns exchanged": Mistake(_columns, "readings.exchanged"),
     "numbering turned": Mistake(
-        lambda f, _: readings(f, lambda row: row[1:] + row[:1]), ("numbered differently", "round")
+        lambda f, _: readings(f, lambda row: row[1:] + row[:1]), "readings.numbering_turned"
     ),
     "numbering backwards": Mistake(
-        lambda f, _: readings(f, lambda row: row[::-1]), ("numbered differently", "backwards")
+        lambda f, _: readings(f, lambda row: row[::-1]), "readings.numbering_reversed"
     ),
     "photographs exchanged": Mistake(
-        lambda f, rng: renamed(f, lambda paths: _exchanged(paths, rng)), ("each other's names",)
+        lambda f, rng: renamed(f, lambda paths: _exchanged(paths, rng)), "image.exchanged"
     ),
     "photographs shifted": Mistake(
-        lambda f, _: renamed(f, lambda paths: paths[1:] + paths[:1]), ("are shifted",)
+        lambda f, _: renamed(f, lambda paths: paths[1:] + paths[:1]), "image.shifted"
     ),
-    "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
-    "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
-    "diameters": Mistake(_radii, ("look like diameters",)),
-    "millimetres": Mistake(_millimetres, ("look like millimetres",)),
-    "another machine": Mistake(_another, ("not recognised",)),
-    "stations exchanged": Mistake(_stations, ("are mixed up",)),
+    "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), "image.mirrored"),
+    "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1])),
+    "diameters": Mistake(_radii, "tube.diameter"),
+    "millimetres": Mistake(_millimetres, "readings.units"),
+    "another machine": Mistake(_another, "station.not_recognised"),
+    "stations exchanged": Mistake(_stations, "station.exchanged"),
 }
 
 
@@ -275,14 +278,13 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
             without_poses(copy)
         mistake.make(copy, np.random.default_rng(seed))
         found = recognised(copy, seed, upside_down=name == "upside down")
-        if mistake.named and found.what != "refused":
+        if mistake.code and found.what != "refused":
             found = calibrated(copy, seed)
-    if not mistake.named:
+    if not mistake.code:
         return found._replace(what="named" if found.what == "right" else found.what)
     if found.what != "refused":
         return found._replace(what="not noticed")
-    named = all(word in found.said for word in mistake.named)
-    return found._replace(what="named" if named else "refused")
+    return found._replace(what="named" if found.code == mistake.code else "refused")
 
 
 # ------------------------------------------------------------------ told

@@ -319,9 +319,15 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
     verdict, statistics = result.verdict, result.estimate.statistics
     findings = {
         "refused": list(verdict.reasons),
-        "departure": [one.sentence for one in result.departures],
-        "outvoted": [text for text in verdict.warnings if "outvoted" in text],
-        "noise": [text for text in verdict.warnings if "noise" in text and " scatters " in text]
+        "departure": [one.finding.text for one in result.departures],
+        "outvoted": [
+            one.text
+            for code in ("readings.outvoted", "configurations.misnamed")
+            for one in verdict.of(code)
+        ],
+        "noise": [
+            one.text for code in ("poses.noise", "readings.noise") for one in verdict.of(code)
+        ]
         + ["joints.noise contradicted"] * (statistics.reading_scale != 1),
         "rejected": [f"{lost} of {result.estimate.pose_weights.size} measured poses"] * (lost > 0),
         "other": list(verdict.warnings),

@@ -36,12 +36,12 @@ FAR = 3.0
 
 
 class Fact(NamedTuple):
-    """What is wrong: how a session's folder gets it, words of which one names it, and in which
-    sessions it can be wrong. words : none where it is enough that the result is right.
+    """What is wrong: how a session's folder gets it, codes of findings of which one names it, and
+    in which sessions it can be wrong. codes : none where it is enough that the result is right.
     """
 
     make: Callable[[Path, np.random.Generator], None]
-    words: tuple[str, ...]
+    codes: tuple[str, ...]
     seen: tuple[str, ...] = ("legs", "board")
 
 
@@ -248,31 +248,33 @@ def exchanged(folder: Path, rng: np.random.Generator) -> None:
     two.write_bytes(data)
 
 
+LENS = ("camera.focal", "camera.aspect", "camera.centre", "camera.distortion")
+MOVED = ("station.moved", "board.moved")
+SCALE = ("readings.scale", "readings.scale_estimates")
+BOARD = ("board.size", "board.size_estimate", "board.size_disagrees", "machine.scale")
+NOISE = ("readings.noise", "readings.noise_beyond_tolerance", "readings.noise_beyond_encoders")
+
 FACTS: dict[str, Fact] = {
     "none": Fact(lambda _f, _r: None, ()),
-    "encoder's scale 1 %": Fact(scaled(0.01), ("another scale",)),
-    "encoder's scale .1 %": Fact(scaled(0.001), ("another scale",)),
-    "board's squares .2 %": Fact(
-        board(0.002), ("squares are", "board came out", "as if the board"), ("board",)
-    ),
-    "board's squares 1 %": Fact(
-        board(0.01), ("squares are", "came out", "as if the board", "another size"), ("board",)
-    ),
-    "focal length .2 %": Fact(focal(0.002), ("is not the one that took",)),
-    "focal length 1 %": Fact(focal(0.01), ("is not the one that took",)),
-    "pixel aspect .3 %": Fact(aspect(0.003), ("is not the one that took",)),
-    "centre 3 px": Fact(centre(3.0), ("is not the one that took",)),
-    "centre 30 px": Fact(centre(30.0), ("is not the one that took",)),
-    "distortion omitted": Fact(camera(undistorted), ("is not the one that took",)),
-    "camera moved 1 mm": Fact(moved(1e-3, 0.0), ("elsewhere", "moved")),
-    "camera turned .2 degrees": Fact(moved(0.0, 0.0035), ("elsewhere", "moved")),
-    "play of .3 mm": Fact(play(3e-4), ("play",)),
-    "readings worse, .3 mm": Fact(noisier(3e-4), ("readings scatter",)),
-    "one reading 1 mm off": Fact(one_off(1e-3), ("is off: what was seen",)),
-    "a sleeve of .3 mm": Fact(sleeve(3e-4), ("in radius than",), ("legs",)),
-    "a sleeve of 1.5 mm": Fact(sleeve(1.5e-3), ("in radius than",), ("legs",)),
-    "a frozen reading": Fact(frozen, ("frozen", "never change")),
-    "two photographs exchanged": Fact(exchanged, ("each other's names", "the other way round")),
+    "encoder's scale 1 %": Fact(scaled(0.01), SCALE),
+    "encoder's scale .1 %": Fact(scaled(0.001), SCALE),
+    "board's squares .2 %": Fact(board(0.002), BOARD, ("board",)),
+    "board's squares 1 %": Fact(board(0.01), BOARD, ("board",)),
+    "focal length .2 %": Fact(focal(0.002), LENS),
+    "focal length 1 %": Fact(focal(0.01), LENS),
+    "pixel aspect .3 %": Fact(aspect(0.003), LENS),
+    "centre 3 px": Fact(centre(3.0), LENS),
+    "centre 30 px": Fact(centre(30.0), LENS),
+    "distortion omitted": Fact(camera(undistorted), LENS),
+    "camera moved 1 mm": Fact(moved(1e-3, 0.0), MOVED),
+    "camera turned .2 degrees": Fact(moved(0.0, 0.0035), MOVED),
+    "play of .3 mm": Fact(play(3e-4), ("readings.play", "discrepancy.readings.step")),
+    "readings worse, .3 mm": Fact(noisier(3e-4), NOISE),
+    "one reading 1 mm off": Fact(one_off(1e-3), ("readings.single", "readings.outvoted")),
+    "a sleeve of .3 mm": Fact(sleeve(3e-4), ("tube.radius",), ("legs",)),
+    "a sleeve of 1.5 mm": Fact(sleeve(1.5e-3), ("tube.radius",), ("legs",)),
+    "a frozen reading": Fact(frozen, ("readings.frozen", "readings.unmoved")),
+    "two photographs exchanged": Fact(exchanged, ("configurations.misnamed", "image.exchanged")),
 }
 
 
@@ -340,15 +342,15 @@ def outcome(fact: str, seen: str, seed: int, keep: Path) -> Outcome:
         folder = Path(temporary) / right.name
         shutil.copytree(right, folder)
         FACTS[fact].make(folder, np.random.default_rng(seed))
-        words = FACTS[fact].words
+        codes = FACTS[fact].codes
         try:
             result = calibrate(folder)
         except PkmcalError as error:
-            named = any(word in str(error) for word in words)
-            return Outcome("named" if named else "refused", float("nan"), str(error))
+            what = "named" if error.code in codes else "refused"
+            return Outcome(what, float("nan"), f"{error.code}: {error}")
         z, verdict = off_by(result, folder), result.verdict
-    told = " ".join([*verdict.reasons, *verdict.warnings, *verdict.advice])
-    if words and any(word in told for word in words):
+    told = " ".join(f"{one.code}: {one.text}" for one in verdict.findings)
+    if not set(codes).isdisjoint(verdict.codes):
         return Outcome("named", z, told)
     if not verdict.usable:
         return Outcome("refused", z, told)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -131,15 +130,15 @@ def test_a_hint_says_what_size_all_else_would_have(size):
     _, data = seen_by(drawing, np.random.default_rng(1), size, TOLERANCE)
     session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
     (told,) = sizes_told(session, data, estimated(drawing, data))
-    assert told.startswith("Nothing but board.yaml tells how large the board is: to 0.2 %")
+    code = "board.size_disagrees" if size else "board.size_by_file"
+    assert (told.code, told.subject) == (code, "board.yaml")
+    assert told.facts["tolerance"] == pytest.approx(0.2)
     if size == 0:
-        assert "All else" not in told
         return
-    value, sigma, way = re.search(r"were ([\d.]+) ± ([\d.]+) % (\w+)\.$", told).groups()
-    assert way == ("larger" if size > 0 else "smaller")
+    value, sigma = told.facts["value"], told.facts["sigma"]
     # the file's own deviation is not in it: what all else tells is off by its own alone
-    assert float(sigma) < 100 * TOLERANCE * 1.6
-    assert abs(float(value) - 100 * abs(size)) < 3 * float(sigma)
+    assert sigma < TOLERANCE * 1.6
+    assert abs(value - size) < 3 * sigma
 
 
 def test_files_say_how_well_the_size_is_known():

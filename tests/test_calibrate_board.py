@@ -150,8 +150,9 @@ def test_a_photograph_of_another_configuration_is_let_go(folder):
     assert any(
         r.configuration == 5 and "board lies" in r.reason for r in result.observation.rejected
     )
-    warned = [text for text in result.verdict.warnings if f"images/station1/{names[5]}" in text]
-    assert any(f"1 of {len(lost)} boards" in text for text in warned)
+    (warned,) = result.verdict.of("rejected.units")
+    assert warned.facts["of"] == f"{len(lost)} boards"
+    assert f"images/station1/{names[5]}" in warned.subject
     assert used_photographs(result.session, result.observation, result.estimate) == (11,)
 
 

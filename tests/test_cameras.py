@@ -555,6 +555,6 @@ def test_a_changed_aspect_leaves_the_mean_focal_length(case):
     assert other[0] * other[1] == pytest.approx(np.prod(camera.parameters[:2]), rel=share**2)
     np.testing.assert_array_equal(other[2:], camera.parameters[2:])
     parts = camera.departures()
-    assert len({part.kind for part in parts}) == len(parts)
+    assert len({part.code for part in parts}) == len(parts)
     every = np.concatenate([part.columns for part in parts], axis=1)
     assert np.linalg.matrix_rank(every[:4] / camera.image_size[0]) == 4

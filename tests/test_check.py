@@ -230,16 +230,19 @@ def test_a_pose_under_several_names_is_told(demo):
 
 def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
     session = load_session(demo.session)
-    assert numbering_told(session) == ()
+    assert [*numbering_told(session)] == []
     stations = tuple(replace(s, T_camera_base=None) for s in session.stations)
-    (text,) = numbering_told(replace(session, stations=stations))
-    assert text.startswith(
+    (found,) = numbering_told(replace(session, stations=stations))
+    assert (found.code, found.subject) == ("readings.first_leg_unknown", "joints.csv")
+    assert found.facts["columns"] == ["leg3", "leg5"]
+    assert found.text.startswith(
         "The drawing is alike from three sides: with the legs counted from the column leg3 or leg5"
         " of joints.csv on, photographs"
     )
-    assert numbering_told(replace(session, stations=(session.stations[0], *stations[1:]))) == ()
+    placed = replace(session, stations=(session.stations[0], *stations[1:]))
+    assert [*numbering_told(placed)] == []
     board = tuple(replace(s, observe=("board",)) for s in stations)
-    assert numbering_told(replace(session, stations=board)) == ()
+    assert [*numbering_told(replace(session, stations=board))] == []
 
 
 @pytest.mark.parametrize(

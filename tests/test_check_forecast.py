@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from pkmcal.check.pictures import (
     write_pictures,
 )
 from pkmcal.check.words import outcome_of
+from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.observe.images import binned
@@ -117,7 +117,8 @@ def test_no_forecast_of_photographs_without_edges(found):
     grey = [replace(s.photographs, images=[np.full_like(i, 90) for i in s.photographs.images])
             for s in look.stations]  # fmt: skip
     stations = [replace(s, photographs=p) for s, p in zip(look.stations, grey, strict=True)]
-    assert forecast(replace(look, stations=tuple(stations))) is None
+    with pytest.raises(ResultError):
+        forecast(replace(look, stations=tuple(stations)))
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,9 @@ def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
 def test_a_second_place_is_advised_where_it_is_worth_it(found):
     told = replace(found.forecast, position=2e-4, second=1e-4)
     (said,) = words._second_place(told)
-    assert "15 in all then tell the platform's position to 0.10 mm, not 0.20 mm" in said
+    assert said.code == "images.second_place"
+    assert (said.facts["tool_sigma"], said.facts["tool_sigma_before"]) == (1e-4, 2e-4)
+    assert "15 in all then tell the platform's position to 0.10 mm, not 0.20 mm" in said.text
     assert words._second_place(replace(told, second=1.8e-4)) == []
     assert words._second_place(replace(told, second=float("nan"))) == []
 
@@ -152,8 +155,8 @@ def test_stations_on_one_side_are_told(found):
     beside = first.found @ inverse(pose(turn, middle - turn @ middle))
     near = replace(found.look, stations=(first, replace(first, name="b", found=beside)))
     (said,) = words._from_one_side(near)
-    angle = int(re.search(r"lines that are (\d+)° apart", said)[1])
-    assert 20 < angle <= 25
+    assert said.code == "images.one_side"
+    assert 20 < said.facts["degrees"] < 25.5
     assert words._from_one_side(found.look) == []
 
 
@@ -165,7 +168,8 @@ def test_slim_tubes_are_told(found):
     every = np.broadcast_to(half_width, first.quality.half_width.shape)
     slim = replace(first, quality=replace(first.quality, half_width=every))
     (said,) = words._slim(replace(found.look, stations=(slim, *others)))
-    assert said.startswith(f"{first.name}: legs are slim in the photographs, tube 2 4.5 px wide.")
+    assert (said.code, said.station) == ("images.slim", first.name)
+    assert said.facts["tubes"] == ["tube 2 4.5 px"]
 
 
 def test_hidden_legs_are_told_where_no_station_sees_them(found):
@@ -179,19 +183,20 @@ def test_hidden_legs_are_told_where_no_station_sees_them(found):
     assert words._hidden(one) == []
     every = replace(found.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
     (said,) = words._hidden(every)
-    assert said.startswith("Leg 4 is hidden for 80% (best from station1), behind other legs")
+    assert (said.code, said.subject, said.station) == ("images.hidden", "leg 4", "station1")
+    assert said.facts["share"] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(
-    ("level", "behind", "said"),
+    ("level", "behind", "code"),
     [
-        (255.0, 100.0, "beside white"),
-        (4.0, 2.0, "in the dark"),
-        (200.0, 195.0, "hang a plain dark sheet behind"),
-        (200.0, 90.0, "another line lies beside them"),
+        (255.0, 100.0, "images.lost_white"),
+        (4.0, 2.0, "images.lost_black"),
+        (200.0, 195.0, "images.lost_faint"),
+        (200.0, 90.0, "images.lost_clear"),
     ],
 )
-def test_why_edges_are_lost(found, level, behind, said):
+def test_why_edges_are_lost(found, level, behind, code):
     """Half of all edges lost, which look so; the others are white legs before a grey wall."""
     station = found.look.stations[0]
     shape = station.quality.level.shape
@@ -201,9 +206,10 @@ def test_why_edges_are_lost(found, level, behind, said):
     own[:, ::2], other[:, ::2] = level, behind
     station = replace(station, quality=replace(station.quality, level=own, behind=other))
     edges = EdgesOf(np.array([0]), np.ones_like(lost), ~lost)
-    (text,) = words._lost(found.look, station, edges)
-    assert text.startswith("station1: 50% of the edges that ought to be seen are lost")
-    assert said in text
+    (one,) = words._lost(found.look, station, edges)
+    assert (one.code, one.station) == (code, "station1")
+    assert one.facts["share"] == pytest.approx(0.5)
+    assert one.facts.get("sheet", "dark") == "dark"
     assert words._lost(found.look, station, replace(edges, found=np.ones_like(lost))) == []
 
 

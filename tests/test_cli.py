@@ -29,6 +29,7 @@ from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 from test_pose_sessions import make
@@ -299,7 +300,7 @@ def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path
         session = load_session(folder, measured=False)
         assert (session.board is None) == (seen == "legs")
     assert session.machine.n_joints == drawn.n_joints
-    untouched = " ".join(untouched_files(folder))
+    untouched = " ".join(one.text for one in untouched_files(folder))
     assert all(f"{what}" in untouched for what in TO_FILL if (folder / what).exists())
 
 
@@ -311,7 +312,9 @@ def test_a_new_session_with_a_board_and_places(tmp_path):
     assert [s.name for s in session.stations] == ["front", "left", "right", "back", "place5"]
     assert {s.observe for s in session.stations} == {("legs", "board")}
     assert load_board(session.board).tolerance == 0.001
-    assert "board.yaml is still the example" in " ".join(untouched_files(folder))
+    assert "board.yaml is still the example" in " ".join(
+        one.text for one in untouched_files(folder)
+    )
     refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs")
     assert refused.code == 2
     assert "the drawing of delta has no cylinders that a camera could see" in refused.err
@@ -458,8 +461,8 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
     found = calibrated
-    doubts = ("Somebody ran into the machine.",)
-    verdict = judge(found.observation, found.estimate, found.findings, doubts=doubts)
+    others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
+    verdict = judge(found.observation, found.estimate, found.findings, others=others)
     found = replace(found, verdict=verdict)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: found)
     done = run("calibrate", session)

@@ -27,6 +27,7 @@ from pkmcal.identify.score import Departures, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome.finding import doubtful
 from pkmcal.planning.subject import of_machine
 from pkmcal.session.load import load_session
 from pkmcal.session.moved import FEWEST_BESIDE_MOVEMENT
@@ -348,20 +349,22 @@ def test_a_tube_that_is_thicker_is_named():
     off = {(2, 0, s, side): 3.0 for s in (0, 1) for side in (0, 1)}
     (found,), thicker = outlined(11, off)
     one = found.departure
-    assert (one.kind, one.of) == ("tube radius", "legs[3].tubes[1]")
+    assert (one.code, one.of) == ("tube.radius", "legs[3].tubes[1]")
     assert found.value == pytest.approx(1e-3 * thicker, rel=0.15)
-    what, todo = one.says(np.array([0.0015]), np.array([0.0001]))
-    assert "Tube 1 of leg 3 is 1.5 mm thicker in radius than mechanism.yaml says" in what
-    assert "legs[3].tubes[1].radius" in todo
+    facts = one.facts(np.array([0.0015]), np.array([0.0001]))
+    assert (facts["leg"], facts["tube"], facts["value"]) == (3, 1, 0.0015)
+    text = doubtful("tube.radius", **facts, tool_shift=1e-4, tool_shift_sigmas=0.5).text
+    assert "Tube 1 of leg 3 is 1.5 mm thicker in radius than mechanism.yaml says" in text
+    assert "correct legs[3].tubes[1].radius" in text
 
 
 def test_an_edge_that_is_off_alone_is_named_with_its_station():
     (found,), _ = outlined(12, {(4, 0, 1, 0): -4.0})
     one = found.departure
     assert found.value < -5 * found.sigma
-    assert (one.kind, one.of) == ("tube edge", "legs[5].tubes[1], two")
-    what, _ = one.says(np.array([-0.002]), np.array([0.0001]))
-    assert "Of tube 1 of leg 5, two sees one edge 2.0 mm inside" in what
+    assert (one.code, one.of) == ("tube.edge", "legs[5].tubes[1], two")
+    facts = one.facts(np.array([-0.002]), np.array([0.0001]))
+    assert (facts["leg"], facts["tube"], facts["station"]) == (5, 1, "two")
 
 
 def test_right_tubes_are_not_named():
@@ -379,7 +382,7 @@ def test_a_sleeve_is_named_and_harms_little(session):
     path.write_text(yaml.safe_dump(document))
     found = calibrate(session)
     (one,) = found.departures
-    assert (one.kind, one.of) == ("tube radius", "legs[2].tubes[1]")
+    assert (one.code, one.of) == ("tube.radius", "legs[2].tubes[1]")
     assert abs(one.value[0] - 2e-3) < 4 * one.sigma[0]
     assert one.value[0] > 1e-3
     assert not one.against
@@ -402,7 +405,7 @@ def test_an_encoder_of_another_scale_is_named_and_the_result_refused(session, tm
     assert "The readings of leg4 have another scale" in told
     assert "Multiply this column of joints.csv by 1.0" in told
     (found,) = load(out).document["departures"]
-    assert found["kind"] == "reading scale"
+    assert (found["code"], found["kind"]) == ("readings.scale", "reading scale")
     assert found["value"][0] == pytest.approx(0.02, rel=0.25)
     assert found["moves_tool_in_sigmas"] > 1
 
@@ -415,11 +418,10 @@ def test_another_camera_is_named(session):
     path.write_text(yaml.safe_dump(document))
     found = calibrate(session)
     (one,) = found.departures
-    assert (one.kind, one.of) == ("focal length", "cameras/camera.yaml")
+    assert (one.code, one.of) == ("camera.focal", "cameras/camera.yaml")
     assert one.value[0] == pytest.approx(-0.03, rel=0.3)
-    assert "--refine-camera" in one.sentence
-    told = (*found.verdict.reasons, *found.verdict.warnings)
-    assert one.sentence in told
+    assert "--refine-camera" in one.finding.next_step
+    assert one.finding in found.verdict.of("camera.focal")
 
 
 def test_one_wrong_reading_is_named_with_its_configuration(session):
@@ -431,10 +433,11 @@ def test_one_wrong_reading_is_named_with_its_configuration(session):
     path.write_text("\n".join(lines) + "\n")
     found = calibrate(session)
     (one,) = found.departures
-    assert (one.kind, one.of) == ("reading", f"leg3, {cells[0]}")
+    assert (one.code, one.of) == ("readings.single", f"leg3, {cells[0]}")
     assert one.value[0] == pytest.approx(-0.004, rel=0.3)
-    assert f"The reading of leg3 in configuration {cells[0]} is off" in one.sentence
-    assert "mm less" in one.sentence
+    facts = one.finding.facts
+    assert (facts["column"], facts["configuration"]) == ("leg3", cells[0])
+    assert facts["value"] < 0
 
 
 @pytest.mark.slow

@@ -18,6 +18,8 @@ from pkmcal.identify.change import machine_change
 from pkmcal.identify.gauge import moved_centres
 from pkmcal.judge.difference import _shared, difference
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.pages.page import page_html
 from pkmcal.report.difference import outcome_of
 from test_bundle import estimate
@@ -198,7 +200,9 @@ def test_photographs_are_counted_however_they_are_grouped(saved):
 
 
 def test_a_refused_calibration_is_no_base_for_a_comparison(saved):
-    refused = replace(saved, verdict=replace(saved.verdict, usable=False, reasons=("No light.",)))
+    refused = replace(
+        saved, verdict=Verdict(False, "Bad.", (Finding("", Level.WRONG, saved_text="No light."),))
+    )
     found = difference(saved, refused)
     assert not found.changed
     assert not found.verdict.usable

@@ -15,7 +15,6 @@ from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.model_errors import (
     CORRELATION_LENGTHS,
     discrepancy_components,
-    sentences,
     smooth_functions,
     with_discrepancy,
 )
@@ -262,7 +261,7 @@ def test_pixels_that_are_not_square_are_named(calibrated):
     stations = list(range(len(calibrated.session.stations)))
     found = through_lens(calibrated, 0.006 * camera.aspect_part, stations)
     first = found.departures[0]
-    assert (first.kind, first.of) == ("pixel aspect", "cameras/camera.yaml")
+    assert (first.code, first.of) == ("camera.aspect", "cameras/camera.yaml")
     assert abs(first.value[0] - 0.006) < 4 * first.sigma[0]
 
 
@@ -271,24 +270,25 @@ def test_a_station_with_another_lens_than_its_file_is_named(calibrated):
     found = through_lens(calibrated, 0.02 * camera.aspect_part, [1])
     first = found.departures[0]
     name = calibrated.session.station_names[1]
-    assert (first.kind, first.of) == ("station's pixel aspect", name)
+    assert (first.code, first.of) == ("station.aspect", name)
     assert first.value[0] == pytest.approx(0.02, abs=4 * first.sigma[0] + 4e-3)
 
 
 def test_a_right_session_has_no_errors_left_out(calibrated):
     assert calibrated.model_errors == ()
-    assert sentences(calibrated.model_errors) == ()
+    assert calibrated.verdict.of("discrepancy") == ()
 
 
 def test_readings_far_beyond_their_noise_are_no_noise(calibrated):
     def reasons(factor):
         statistics = replace(calibrated.estimate.statistics, reading_scale=factor)
-        return noise_doubt(calibrated.session, replace(calibrated.estimate, statistics=statistics))
+        found = replace(calibrated.estimate, statistics=statistics)
+        return [one.code for one in noise_doubt(calibrated.session, found)]
 
     tolerance = calibrated.session.machine.document.tolerance.offset
     assert WRONG_MODEL_READING_SCALE * calibrated.session.joint_noise < tolerance
-    assert reasons(0.9 * WRONG_MODEL_READING_SCALE) == ()
-    assert len(reasons(1.1 * WRONG_MODEL_READING_SCALE)) == 1
+    assert reasons(0.9 * WRONG_MODEL_READING_SCALE) == []
+    assert reasons(1.1 * WRONG_MODEL_READING_SCALE) == ["readings.noise_beyond_encoders"]
 
 
 def test_edges_measured_elsewhere_give_the_same_machine(calibrated):

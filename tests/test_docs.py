@@ -198,8 +198,8 @@ def test_keys_of_files_are_explained(schema):
     assert keys <= quoted(text_of("docs/files.md"))
 
 
-FREE = {"mechanism", "session", "versions", "timings"}
-"""Parts of calibration.json whose keys are names, or those of another file."""
+FREE = {"mechanism", "session", "versions", "timings", "facts"}
+"""Parts of calibration.json whose keys are names, or those of another file or of a finding."""
 
 
 def written_keys(value: object, free: set[str]) -> set[str]:

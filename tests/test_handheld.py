@@ -42,6 +42,7 @@ from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
 from pkmcal.observe.tubes import PAIR_DIRECTIONS, RARITY_STEPS, tube_chart
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Level
 from pkmcal.report.calibration import outcome_of
 from pkmcal.session.exif import camera_by_exif
 from pkmcal.session.load import load_session
@@ -338,24 +339,30 @@ def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
     statistics = found.estimate.statistics
     worse = replace(statistics, chi2=10 * statistics.chi2, chi2_edges=10 * statistics.chi2_edges)
     misfit = replace(found, estimate=replace(found.estimate, statistics=worse))
-    assert worse_refined(found, found) == ""
-    assert worse_refined(fewer, found) == "2 of 3 photographs have a sure place, not 3"
+    assert worse_refined(found, found) is None
+    rejects = worse_refined(fewer, found)
+    assert rejects.code == "camera.refinement_rejects"
+    assert (rejects.facts["kept"], rejects.facts["of"], rejects.facts["by_files"]) == (2, 3, 3)
     for bad in (fewer, refused, misfit):
         assert worse_refined(bad, found)
-        assert worse_refined(found, bad) == ""
+        assert worse_refined(found, bad) is None
         taken = better_refined(lambda bad=bad: bad, lambda: found)
         assert taken.session == found.session
         assert taken.estimate is found.estimate
-        (warning,) = taken.verdict.warnings
-        assert "--refine-camera" in warning
+        (warning,) = taken.verdict.findings
+        assert warning.code.startswith("camera.refinement_")
+        assert "--refine-camera" in warning.text
         assert better_refined(lambda: found, lambda bad=bad: bad) is found
     assert better_refined(lambda: fewer, lambda: refused) is fewer  # first of all, it may be used
 
     def failed():
         raise ResultError("the search has diverged")
 
-    assert "the search has diverged" in better_refined(failed, lambda: found).verdict.warnings[0]
-    assert better_refined(lambda: found, failed) is found
+    (warning,) = better_refined(failed, lambda: found).verdict.findings
+    assert warning.code == "camera.refinement_failed"
+    assert "the search has diverged" in warning.text
+    (remark,) = better_refined(lambda: found, failed).verdict.findings
+    assert (remark.code, remark.level) == ("camera.files_intrinsics_failed", Level.NOTE)
     with pytest.raises(ResultError, match="diverged"):
         better_refined(failed, failed)
 

@@ -92,7 +92,7 @@ def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
     assert bed["sigma"] < 0.02e-3 < 0.1e-3 < bed["by_drawing"]
     assert bed["size"] > 5e-4
     assert "Along x and y nothing is promised" in saved.verdict.headline
-    assert any("Heights do not tell x and y" in text for text in saved.verdict.advice)
+    assert saved.verdict.of("bed.sideways")
     # nineteen heights of nine values leave some over
     assert bed["touches"] == 19
     assert bed["unnoticed"] < 0.2 * bed["by_drawing"]
@@ -265,10 +265,11 @@ def test_a_rejection_that_nothing_confirms_is_refused_and_named(tmp_path):
         found = calibrate_session(kit)
         assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [3]
         assert found.verdict.usable == usable
-        (named,) = [text for text in found.verdict.warnings if " rejected" in text]
-        assert f"1 of {n} heights" in named
-        assert "004" in named
-        assert any("004" in text for text in found.verdict.reasons) != usable
+        (named,) = found.verdict.of("rejected.units")
+        assert (named.facts["of"], named.facts["names"]) == (f"{n} heights", ["004"])
+        unconfirmed = found.verdict.of("rejected.unconfirmed")
+        assert len(unconfirmed) == (not usable)
+        assert all("004" in one.subject for one in unconfirmed)
     done = run("calibrate", tmp_path / "7" / "kit")
     assert done.code == 1
     assert "6 of 7 heights" in done.out
@@ -318,11 +319,10 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
         bent[n] = float(np.std(flat(true, pasted(text))))
         assert found.verdict.usable
         assert (found.estimate.pose_weights < 0.5).sum() == (n == 13)
-        warned = [w for w in found.verdict.warnings if "do not show a wrong one" in w]
+        warned = found.verdict.of("bed.height_unnoticed")
         assert len(warned) == (n == 7)
         if n == 7:
-            assert "So few heights, 7, do" in warned[0]
-            assert "Probe these again and compare, or 8 more places" in warned[0]
+            assert (warned[0].facts["touches"], warned[0].facts["more"]) == (7, 8)
     assert bent[7] > 2 * bent[13]
 
 
@@ -405,7 +405,7 @@ def test_a_board_on_a_printer(cfg):
     corners = load_board(session.board).points
     across = np.linalg.norm(np.ptp(corners, axis=0))
     assert 0.5 * 0.09 < across < 0.09
-    untouched = " ".join(untouched_files(folder))
+    untouched = " ".join(one.text for one in untouched_files(folder))
     assert "joints.csv is still the example" in untouched
     assert "board.yaml is still the example" in untouched
 

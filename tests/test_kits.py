@@ -75,16 +75,15 @@ def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
     assert 0.2 < flatness(kit, found.machine) / bed.sigma < 2.2
     assert f"height above it to {bed.sigma * 1e3:.2g} mm" in found.verdict.headline
     assert "Along x and y nothing is promised" in found.verdict.headline
-    (told,) = [text for text in found.verdict.advice if "Heights do not tell x and y" in text]
-    assert f"{bed.sideways * 1e3:.2g} mm" in told
-    assert f"{bed.size:.2%}" in told
+    (told,) = found.verdict.of("bed.sideways")
+    assert (told.facts["sigma"], told.facts["size_sigma"]) == (bed.sideways, bed.size)
 
 
 def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     """As few as the bed's four bends, which leave little over: warned of, and explained."""
     found = probe_kit(tmp_path / "session", n=7).calibrated()
     assert found.verdict.usable
-    assert any("do not show a wrong one" in warning for warning in found.verdict.warnings)
+    assert found.verdict.of("bed.height_unnoticed")
     assert found.findings.bed.unnoticed is None or (
         found.findings.bed.unnoticed > 0.5 * found.findings.bed.by_drawing
     )
@@ -100,7 +99,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     assert "Measure x and y too, by a board on the platform" in said
     for word in ("camera", "tube", "hotograph", "caliper", "extreme leg lengths"):
         assert word not in said
-    assert not any("extreme leg lengths" in advice for advice in found.verdict.advice)
+    assert not found.verdict.of("configurations.few")
 
 
 def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):

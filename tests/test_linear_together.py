@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -205,10 +204,10 @@ def test_verdict_says_how_far_the_method_goes(scenes):
     told = Identifiability(0, 0, 0, (), (), np.zeros(0))
     verdict = judge(observation, estimate, Findings(told, (), (), 1.0), "linear")
     assert not verdict.usable
-    told = verdict.reasons[0]
-    assert "tells of the base alone" in told
-    assert "bundle" in told
-    both, edges, drawing = (float(number) for number in re.findall(r"([\d.]+) mm", told))
+    (base,) = verdict.of("estimate.base_only")
+    both, edges, drawing = (
+        1e3 * base.facts[name] for name in ("sigma", "edges_sigma", "nominal_sigma")
+    )
     assert both < min(edges, drawing)
     # of 18 coordinates with 2 mm each, six are frames
     assert drawing == pytest.approx(2 * np.sqrt(12 / 18), rel=0.05)

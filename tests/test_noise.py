@@ -166,8 +166,8 @@ def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
     for content, told in ((text, 0), (wrong, 1)):
         (folder / "session.yaml").write_text(content, encoding="utf-8")
         found = calibrate_session(folder)
-        said = [w for w in found.verdict.warnings if "stations.tracker.tracker.noise" in w]
-        assert len(said) == told
+        said = found.verdict.of("poses.noise")
+        assert [one.facts["keys"] for one in said] == [["stations.tracker.tracker.noise"]] * told
         assert found.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
 
 

@@ -143,6 +143,6 @@ def test_photographs_by_hand(tmp_path, seed):
         hold_together(found, error.exit_code, str(error))
         return
     hold_together(found, 0 if result.verdict.usable else 1, None)
-    lost = {one.station.name: one.sentence for one in result.session.rejected}
+    lost = {one.station.name: one.finding.text for one in result.session.rejected}
     assert {f.station: f.text for f in found.findings if f.station in lost} == lost
     assert {s.name for s in found.stations if not s.recognised} == lost.keys()

@@ -197,8 +197,9 @@ def test_outliers_are_let_go_and_named(folder):
     assert all("standard deviations from where all others put it" in r.reason for r in told)
     # thirty poses of six numbers confirm that these two are wrong
     assert result.verdict.usable
-    (named,) = [text for text in result.verdict.warnings if text.startswith("2 of 30 poses")]
-    assert all(result.session.configurations[k] in named for k in (7, 20))
+    (named,) = result.verdict.of("rejected.units")
+    assert (named.facts["number"], named.facts["of"]) == (2, "30 poses")
+    assert named.facts["names"] == [result.session.configurations[k] for k in (7, 20)]
     assert tool_error(result.machine, made) < 6e-5
 
 
@@ -210,7 +211,8 @@ def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
     (folder / "session.yaml").write_text(document)
     poor = calibrate_session(load_session(folder, "design"))
     assert not poor.verdict.usable
-    assert any("--model calibration they fit" in reason for reason in poor.verdict.reasons)
+    (misfit,) = poor.verdict.of("poses.misfit")
+    assert misfit.facts["model"] == "calibration"
     rich = calibrate_session(load_session(folder, "calibration"))
     assert rich.verdict.usable
     assert tool_error(rich.machine, made) < 0.2 * tool_error(poor.machine, made)
@@ -257,10 +259,9 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     write_joints(folder, joints)
     found = calibrate_session(folder)
     assert tool_error(found.machine, made) < 1.5e-4
-    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
-    assert "The reading of motor3 in configuration 007 is off" in told
-    assert "1.1" in told or "1.2" in told  # degrees: .02 rad
-    assert "less" in told
+    (told,) = found.verdict.of("readings.outvoted")
+    assert told.subject == "motor3, 007"
+    assert told.facts["value"] == pytest.approx(-0.02, rel=0.06)
 
 
 def test_no_configuration_is_exchanged_with_itself(folder):
@@ -280,7 +281,8 @@ def test_no_configuration_is_exchanged_with_itself(folder):
             replace(estimate, pose_weights=weights),
         )
     assert said  # far off enough it is named
-    assert not [text for text in said if "007 and 007" in text or "readings of 007" in text]
+    assert "007" not in {one.facts.get("other") for one in said}
+    assert "007" not in {one.facts.get("like") for one in said}
     assert len(made.joints) == 30
 
 
@@ -303,9 +305,9 @@ def test_exchanged_rows_are_outvoted_and_told(folder):
     write_joints(folder, made.joints[[*range(11), 20, *range(12, 20), 11, *range(21, 30)]])
     found = calibrate_session(folder)
     assert tool_error(found.machine, made) < 1.5e-4
-    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
-    assert "joints.csv, configuration 011 and 020: what was seen in 011 is what" in told
-    assert "and the other way round" in told
+    (told,) = found.verdict.of("configurations.misnamed")
+    assert told.subject == "joints.csv, configuration 011 and 020"
+    assert (told.facts["configuration"], told.facts["both"]) == ("011", "yes")
 
 
 def test_a_pose_under_another_name_is_told(folder):
@@ -314,8 +316,9 @@ def test_a_pose_under_another_name_is_told(folder):
     seen[4] = seen[17]
     write_poses(folder, seen)
     found = calibrate_session(folder)
-    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
-    assert "configuration 004: what was seen in 004 is what the readings of 017 say" in told
+    (told,) = found.verdict.of("configurations.misnamed")
+    assert (told.facts["configuration"], told.facts["other"]) == ("004", "017")
+    assert told.facts["both"] == "no"
 
 
 @pytest.mark.slow
@@ -382,18 +385,22 @@ def test_lengths_of_another_scale(folder):
     write_poses(folder, seen)
     verdict = calibrate_session(folder).verdict
     assert not verdict.usable
-    assert any("All of the machine came out" in reason for reason in verdict.reasons)
+    (scale,) = verdict.of("machine.scale")
+    assert scale.facts["value"] == pytest.approx(0.05, rel=0.1)
 
 
 def test_check_tells_how_the_platform_turns(folder):
     made = make(folder, "h4", n=20)
     found = check_session(folder)
     assert found.exit_code < 2
-    assert any("turn about one axis" in f.text for f in found.findings)
+    assert "poses.turning" in [one.code for one in found.findings]
     rng = np.random.default_rng(1)
     seen = perturb(seen_poses(made), np.concatenate([0.01 * rng.normal(size=(20, 3)),
                                                      np.zeros((20, 3))], axis=1))  # fmt: skip
     write_poses(folder, seen)
-    found = pose_findings(load_session(folder), Boards())
-    doubts = [finding.text for finding in found if finding.level is Level.DOUBTFUL]
-    assert any("do not just turn about one axis" in t or "not turn about" in t for t in doubts)
+    doubts = [
+        finding.code
+        for finding in pose_findings(load_session(folder), Boards())
+        if finding.level is Level.DOUBTFUL
+    ]
+    assert "poses.not_turning" in doubts

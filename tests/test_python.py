@@ -20,6 +20,8 @@ from pkmcal.calibration import plots
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.identify.tool import ToolError
+from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.planning.defaults import NOMINAL_EDGE_SIGMA, PLANNED_IMAGE_SIZE
 from pkmcal.simulation import Sensor, Settings
 from pkmcal.simulation.demo import camera_of_size, demo_camera
@@ -143,10 +145,11 @@ def test_a_summary_has_verdict_and_figures(result, loaded):
 def test_what_a_notebook_shows_is_escaped(loaded):
     from dataclasses import replace
 
+    hostile = Finding("", Level.DOUBTFUL, saved_text="a < b & c")
     odd = replace(
         loaded,
         method="<script>",
-        verdict=replace(loaded.verdict, warnings=("a < b & c",), usable=False),
+        verdict=Verdict(False, loaded.verdict.headline, (hostile,)),
     )
     html = odd._repr_html_()
     assert "&lt;script&gt;" in html

@@ -222,8 +222,9 @@ def test_repeats_of_a_pose_count_once(tmp_path):
     session = load_session(write(tmp_path / "repeats", drawing, again, NOISE))
     assert session.configurations == tuple(f"{4 * k:03d}" for k in range(20))
     np.testing.assert_allclose(session.joints, again.reshape(20, 4, 4).mean(axis=1), atol=1e-15)
-    (told,) = session.warnings
-    assert "80 rows are of 20 poses" in told
+    (told,) = session.findings
+    assert told.code == "readings.repeated_poses"
+    assert (told.facts["number"], told.facts["poses"]) == (80, 20)
     once = calibrate_session(write(tmp_path / "once", drawing, joints, NOISE)).estimate
     found = calibrate_session(session).estimate
     sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, found)]
@@ -247,7 +248,7 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
     joints = joints + 0.01 * rng.standard_normal(joints.shape)
     found = calibrate_session(write(tmp_path / "wild", drawing, joints, NOISE))
     assert not found.verdict.usable
-    assert any("may belong to other configurations" in text for text in found.verdict.reasons)
+    assert found.verdict.of("readings.noise_beyond_tolerance")
 
 
 def test_what_needs_a_camera_says_so(belts):

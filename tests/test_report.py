@@ -19,6 +19,7 @@ from pkmcal.identify.found import found_parameters
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import wrong
 from pkmcal.pages import drawn
 from pkmcal.pages.charts import enlargement, ticks_between
 from pkmcal.pages.drawn import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
@@ -91,7 +92,7 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
         s, chi2=1040.0, chi2_edges=940.0, chi2_joints=60.0, chi2_drawing=40.0, chi2_poses=0.0,
         dof=1000.0, noise_scale=7.0, pose_scale=1.0, reading_scale=1.0,
     )  # fmt: skip
-    refused = Verdict(False, "Not to be used.", ("The edges disagree with the machine.",))
+    refused = Verdict(False, "Not to be used.", (wrong("edges.misfit", scale=5.0),))
     estimate = replace(case.estimate, statistics=noisy)
     found = report_of(calibration(case.session, case.observation, estimate, refused))
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))

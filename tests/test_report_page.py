@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from pkmcal.measurements import Rejection
-from pkmcal.outcome import Level, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.pages.charts import UprightBar, bar_chart
 from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
@@ -32,7 +33,15 @@ def case(tmp_path_factory) -> Case:
 
 @pytest.fixture(scope="module")
 def page(case) -> str:
-    verdict = Verdict(True, "Good to use.", ("fits",), ("a little noisy",), ("more poses",))
+    verdict = Verdict(
+        True,
+        "Good to use.",
+        (
+            Finding("", Level.WRONG, saved_text="fits"),
+            Finding("", Level.DOUBTFUL, saved_text="a little noisy"),
+            Finding("", Level.NOTE, saved_text="more poses"),
+        ),
+    )
     return report_html(
         case.session, case.observation, case.estimate, verdict, timings={"observe": 1.5}
     )
@@ -111,8 +120,9 @@ def test_page_asks_for_nothing_outside(page):
 def test_hostile_names_stay_text(tmp_path):
     case = make_case(tmp_path, n_poses=2, n_stations=2, station=HOSTILE, prefix=HOSTILE)
     observation = replace(case.observation, rejected=(Rejection(0, 0, 0, 0, 0, HOSTILE),))
-    session = replace(case.session, folder=Path(HOSTILE), warnings=(HOSTILE,))
-    verdict = Verdict(False, HOSTILE, (HOSTILE,), (HOSTILE,), (HOSTILE,))
+    hostile = Finding("", Level.DOUBTFUL, saved_text=HOSTILE)
+    session = replace(case.session, folder=Path(HOSTILE), findings=(hostile,))
+    verdict = Verdict(False, HOSTILE, tuple(Finding("", x, saved_text=HOSTILE) for x in Level))
     estimate = replace(case.estimate, gauge=HOSTILE)
     page = report_html(session, observation, estimate, verdict, timings={HOSTILE: 1.0})
     found = Found(page)

@@ -14,6 +14,7 @@ from conftest import run
 from pkmcal.commands.reproduce import Paper
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check
+from pkmcal.outcome.finding import wrong
 from pkmcal.pages.page import page_html
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies import engine, reproduction
@@ -149,7 +150,8 @@ def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
     checks = found.parts[-1].checks
     bad = replace(checks[1], passed=False)
     part = replace(found.parts[-1], checks=(checks[0], bad))
-    verdict = replace(found.verdict, usable=False, reasons=(bad.sentence,))
+    missed = wrong("study.missed", bad.what, found=bad.found, expected=bad.expected)
+    verdict = replace(found.verdict, usable=False, findings=(missed,))
     failed = replace(found, verdict=verdict, stamp="Not reproduced", parts=(part,))
     failed.document["passed"] = False
     monkeypatch.setattr(

@@ -152,7 +152,7 @@ def test_a_response_that_there_is_not(session):
 
 
 def test_a_session_that_is_as_usual_says_nothing(calibrated):
-    assert not any("levels of the photographs" in hint for hint in calibrated.verdict.advice)
+    assert not calibrated.verdict.of("image.response")
 
 
 @pytest.fixture(scope="module")
@@ -163,15 +163,12 @@ def coded(demo, tmp_path_factory):
     return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
 
 
-SAID = {"srgb": "sRGB (as telephones write it)", "linear": "linear (as sensors count light)"}
-
-
 def check_overruled(calibration, found, usual, demo, worse=1.0):
     """And the machine is found as well as where it is as usual, but for what the file's kind does:
     errors that are so many times as large.
     """
-    (hint,) = [text for text in calibration.verdict.advice if "levels of the photographs" in text]
-    assert f"are {SAID[found]}, not {SAID[usual]}, as is usual for such files" in hint
+    (hint,) = calibration.verdict.of("image.response")
+    assert (hint.facts["other"], hint.facts["usual"]) == (found, usual)
     check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480 * worse)
     assert {station.response for station in calibration.session.stations} == {found}
 
@@ -300,7 +297,7 @@ def test_a_stated_response_is_not_asked_about(session):
     stated(session, "srgb")
     calibration = calibrate_session(session)
     assert calibration.verdict.usable
-    assert not any("levels of the photographs" in hint for hint in calibration.verdict.advice)
+    assert not calibration.verdict.of("image.response")
 
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
@@ -309,15 +306,16 @@ def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
     assert told.sure == sure
     assert told.response == ("srgb" if sure else "linear")
     if sure:
-        assert "at odds of more than 1000 to 1. They are measured so" in told.sentence
-        assert "write response: srgb in session.yaml, under the stations front" in told.sentence
+        assert "at odds of more than 1000 to 1. They are measured so" in told.finding.text
+        assert "write response: srgb in session.yaml, under the stations front" in told.finding.text
     else:
         assert (
             "do not tell whether the levels of the photographs of front and left are linear"
-            in told.sentence
+            in told.finding.text
         )
         assert (
-            "Write response: linear or response: srgb in session.yaml, under the" in told.sentence
+            "Write response: linear or response: srgb in session.yaml, under the"
+            in told.finding.text
         )
 
 
@@ -336,8 +334,7 @@ def test_each_camera_is_asked_by_itself(session):
     calibration = calibrate_session(session)
     told = {station.camera_file: station.response for station in calibration.session.stations}
     assert told == {"cameras/own.yaml": "srgb", f"cameras/{camera.name}": "linear"}
-    said = [text for text in calibration.verdict.advice if "are sRGB (as telephones" in text]
-    assert len(said) == 1
+    assert [one.facts["other"] for one in calibration.verdict.of("image.response")] == ["srgb"]
 
 
 def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(coded, tmp_path):

@@ -16,7 +16,7 @@ from pkmcal.calibration import results
 from pkmcal.calibration.results import base_camera_covariance, calibration_document, check_output
 from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
-from pkmcal.files import json_text
+from pkmcal.files import json_text, json_value
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import save
@@ -57,7 +57,7 @@ def test_it_comes_back(calibrated, tmp_path):
     assert np.array_equal(saved.T_base_platform, estimate.state.T_base_platform)
     assert np.array_equal(saved.joints, calibrated.session.joints)
     assert np.array_equal(saved.used, estimate.configurations)
-    assert saved.verdict == calibrated.verdict
+    assert json_value(saved.verdict.document()) == json_value(calibrated.verdict.document())
     assert (saved.gauge, saved.method, saved.seed) == (estimate.gauge, "bundle", 0)
     found = np.stack([station.T_base_camera for station in saved.stations])
     assert np.array_equal(found, inverse(estimate.state.T_camera_base))
@@ -369,6 +369,16 @@ def test_a_pose_that_is_none(folder):
 
 def test_a_missing_field(folder):
     assert "gauge" in rewritten(folder, lambda data: data.pop("gauge"))
+
+
+def test_a_verdict_of_before_findings_had_codes_still_loads(folder):
+    data = everything(folder)
+    del data["verdict"]["findings"]
+    data["verdict"] |= {"reasons": ["No."], "warnings": ["Look."], "advice": ["Do."]}
+    (folder / "calibration.json").write_text(json.dumps(data))
+    verdict = load(folder).verdict
+    assert (verdict.reasons, verdict.warnings, verdict.advice) == (("No.",), ("Look.",), ("Do.",))
+    assert set(verdict.codes) == {""}
 
 
 def test_fields_of_a_newer_version_do_not_matter(folder):

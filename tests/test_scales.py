@@ -195,10 +195,12 @@ def test_scales_that_surely_differ_are_told_once(demo):
     estimate = SimpleNamespace(machine=machine.with_values(values), covariance=np.diag(sigma**2))
     columns = [f"leg{j}" for j in range(1, 7)]
     session = SimpleNamespace(machine=machine, document={"joints": {"columns": columns}})
-    (told,) = scales_told(session, estimate, ())
-    assert "0.040 ± 0.010 % larger (leg1) and 0.030 ± 0.009 % smaller (leg2)." in told
-    assert "leg3" not in told
-    assert "leg1" not in scales_told(session, estimate, ("leg1",))[0]
+    (found,) = scales_told(session, estimate, ())
+    assert (found.code, found.facts["columns"]) == ("readings.scale_estimates", ["leg1", "leg2"])
+    assert found.facts["values"] == pytest.approx((4e-4, -3e-4), rel=1e-3)
+    assert "0.040 ± 0.010 % larger (leg1) and 0.030 ± 0.009 % smaller (leg2)." in found.text
+    (other,) = scales_told(session, estimate, ("leg1",))
+    assert other.facts["columns"] == ["leg2"]
 
 
 def test_a_changed_lead_is_a_cause_of_its_own():

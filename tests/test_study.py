@@ -178,8 +178,9 @@ def test_a_session_without_photographs_can_be_studied(session):
         assert subject.design.configurations == 15
         assert not subject.design.shared
         assert subject.design.T_camera_base.shape == (3, 4, 4)
-        assert "over the whole reach, not over its workspace" in subject.warnings[0]
-        assert "There are no photographs yet: 15 are taken" in subject.warnings[1]
+        reach, images = subject.findings
+        assert reach.code == "study.whole_reach"
+        assert (images.code, images.facts) == ("study.no_images", {"number": 15})
 
 
 def test_a_folder_called_like_a_machine_is_not_taken_for_a_session(tmp_path, monkeypatch, demo):

@@ -61,14 +61,13 @@ def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
     """
     found = pkmcal.calibrate(turned)
     check_found(found, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
-    (hint,) = [text for text in found.verdict.advice if "upside down" in text]
-    assert hint.startswith(
-        "The photographs of station1, station2 and station3 are upside down against"
-        " cameras/camera.yaml: so say their edges, at odds of more than 1000 to 1."
-    )
+    (hint,) = found.verdict.of("image.upside_down")
+    assert hint.subject == "cameras/camera.yaml"
+    assert hint.facts["stations"] == ("station1", "station2", "station3")
     # 447 less 241.18, 339 less 178.48
-    assert "by the same camera turned by half, whose centre is at [205.82, 160.52]." in hint
-    assert "Copy camera-camera.yaml from the result's folder to the session's and name it" in hint
+    assert hint.facts["centre_x"] == pytest.approx(205.82)
+    assert hint.facts["centre_y"] == pytest.approx(160.52)
+    assert "Copy camera-camera.yaml from the result's folder to the session's" in hint.text
     assert not found.departures
     own = load_camera(turned / "cameras" / "camera.yaml").turned_by_half()
     for station in found.session.stations:
@@ -76,7 +75,7 @@ def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
 
 
 def test_upright_photographs_are_left_as_they_are(calibrated):
-    assert not any("upside down" in text for text in calibrated.verdict.advice)
+    assert not calibrated.verdict.of("image")
     for station in calibrated.session.stations:
         own = load_camera(calibrated.session.folder / station.camera_file)
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)

@@ -35,10 +35,13 @@ class PkmcalError(Exception):
         What was there, and what should have been.
     next_step :
         What the reader can do about it, a sentence.
+    code :
+        What kind of fault it is, for programs, such as readings.sign; of its class unless given.
 
     """
 
     exit_code: ClassVar[int] = 1
+    class_code: ClassVar[str] = "error.other"
 
     def __init__(
         self,
@@ -48,7 +51,9 @@ class PkmcalError(Exception):
         found: object = None,
         expected: object = None,
         next_step: str | None = None,
+        code: str | None = None,
     ) -> None:
+        self.code = code or self.class_code
         self.what = _brief(what)
         self.where = None if where is None else _brief(where)
         self.found = None if found is None else _brief(str(found), LONGEST_FOUND)
@@ -91,6 +96,7 @@ class PkmcalError(Exception):
             "exit_code": self.exit_code,
             "message": str(self),
             **self._fields(),
+            "code": self.code,
         }
 
     def _fields(self) -> dict[str, Any]:
@@ -100,6 +106,7 @@ class PkmcalError(Exception):
             "found": self.found,
             "expected": self.expected,
             "next_step": self.next_step,
+            "code": None if self.code == self.class_code else self.code,
         }
 
 
@@ -107,14 +114,19 @@ class InputError(PkmcalError):
     """The input is wrong: a file, a line, a field or an option."""
 
     exit_code = 2
+    class_code = "error.input"
 
 
 class ResultError(PkmcalError):
     """The program ran, but its result should not be used."""
 
+    class_code = "error.result"
+
 
 class GeometryError(PkmcalError):
     """No usable answer here: a leg through the camera, a singular pose, no convergence."""
+
+    class_code = "error.geometry"
 
 
 def legible(text: str, keep: str = "") -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest
 from pkmcal.geometry.rigid import dot
+from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
 LEAST_VIEWS = 3
@@ -91,7 +92,12 @@ class CameraCalibration:
     compared: tuple[Candidate, ...]
     board: Board
     detections: tuple[Detection, ...]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings' sentences."""
+        return tuple(one.text for one in self.findings)
 
     @property
     def sigma(self) -> Array:
@@ -151,6 +157,7 @@ class CameraCalibration:
             "not_used": {d.name: d.reason for d in self.detections if not d.found},
             "board": self.board.document,
             "warnings": list(self.warnings),
+            "findings": [one.document() for one in self.findings],
         }
 
 
@@ -208,9 +215,9 @@ def calibrate_camera(
         compared=pool,
         board=board,
         detections=tuple(detections),
-        warnings=(),
+        findings=(),
     )
-    return replace(calibration, warnings=(*doubt, *warnings_of(calibration)))
+    return replace(calibration, findings=(*doubt, *calibration_findings(calibration)))
 
 
 def _check_known(model: str) -> None:
@@ -244,8 +251,8 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
     )
 
 
-def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
-    """Sentences of doubt about a model named by the user; `InputError` where it does not fit."""
+def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]:
+    """Warnings about a model named by the user; `InputError` where it does not fit."""
     if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
         return []
     ratio = chosen.left_out / best.left_out
@@ -256,8 +263,13 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
             expected=f"{best.model}, with {best.left_out:.2g} px",
         )
     return [
-        f"The model {best.model} predicts views left out better than {model}:"
-        f" {best.left_out:.3g} px against {chosen.left_out:.3g} px."
+        doubtful(
+            "lens.other_model",
+            best.model,
+            model=model,
+            rms=best.left_out,
+            own_rms=chosen.left_out,
+        )
     ]
 
 
@@ -338,70 +350,38 @@ def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
     return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
 
 
-def warnings_of(calibration: CameraCalibration) -> list[str]:
-    """Sentences about what is not wrong but should be known."""
+def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
+    """Warnings about a camera's calibration that may be used."""
     c = calibration
-    found: list[str] = []
     missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.found]
     if missed:
-        found.append(
-            f"{len(missed)} of {len(c.detections)} photographs are not used: {listed(missed)}."
-        )
+        yield doubtful("lens.unused", number=len(missed), of=len(c.detections), names=missed)
     if len(c.views) < GOOD_VIEWS:
-        found.append(
-            f"Only {len(c.views)} photographs: how far they agree says little; ten are better."
-        )
+        yield doubtful("lens.few_views", number=len(c.views))
     mirrored = [d.name for d in c.detections if d.mirrored]
     if mirrored and len(mirrored) < sum(d.found for d in c.detections):
-        one = len(mirrored) == 1
-        found.append(
-            f"{listed(mirrored)} {'is a mirror image' if one else 'are mirror images'}, the other"
-            f" photographs are not: flip {'this one' if one else 'these'} alone, or take"
-            f" {'it' if one else 'them'} again."
-        )
+        yield doubtful("lens.some_mirrored", listed(mirrored), names=mirrored)
     elif mirrored:
-        found.append(
-            f"{len(mirrored)} photographs are mirror images, such as {mirrored[0]}: flip all of"
-            " this camera's photographs, for the calibration and for the machine, or the machine's"
-            " model comes out as its mirror image."
-        )
+        yield doubtful("lens.all_mirrored", number=len(mirrored), first=mirrored[0])
     if c.spread > 1:
-        found.append(
-            f"The views disagree by {c.spread:.1f} times what the corners' noise explains (a board"
-            " that is not flat, or a lens that the model does not describe wholly); the standard"
-            " deviations contain it."
-        )
-    most = tilts(c.T_camera_board, c.board.points).max()
+        yield doubtful("lens.views_disagree", scale=c.spread)
+    most = float(tilts(c.T_camera_board, c.board.points).max())
     if most < FACING_CAMERA_TILT:
-        found.append(
-            f"The board is tilted by {most:.0f} degrees at most; tilts of 20 to 45 degrees tell the"
-            " focal length better."
-        )
+        yield doubtful("lens.little_tilt", degrees=most)
     covered = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
     if covered < LEAST_COVERED_SHARE:
-        found.append(
-            f"Corners cover {100 * covered:.0f} % of the picture; outside, the camera is"
-            " extrapolated."
-        )
+        yield doubtful("lens.little_covered", percent=100 * covered)
     seen = np.isfinite(c.residuals).all(axis=-1)
-    aside = int((seen & ~c.kept).sum())
-    if aside:
-        found.append(
-            f"{aside} of {int(seen.sum())} corners lie too far off and have lost their weight."
-        )
+    rejected = int((seen & ~c.kept).sum())
+    if rejected:
+        yield doubtful("lens.rejected_corners", number=rejected, of=int(seen.sum()))
     middle = float(np.median(c.held_out.by_view))
-    found += [
-        f"The residuals of {name} are {rms / middle:.1f} times those of the middle photograph."
-        for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True)
-        if rms > ODD_VIEW_RMS_FACTOR * middle
-    ]
+    for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
+        if rms > ODD_VIEW_RMS_FACTOR * middle:
+            yield doubtful("lens.odd_view", name, scale=rms / middle)
     # xi with f, and the like: known together, not alone
     others = [
         f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in c.correlations if "xi" in (a, b)
     ]
     if c.camera.model == "unified" and others:
-        found.append(
-            f"xi is hardly told apart from {listed(others)}, the correlation in brackets: use them"
-            " together, never one of them with another calibration's rest."
-        )
-    return found
+        yield doubtful("lens.xi_correlated", others=others)

@@ -180,6 +180,7 @@ def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> N
         " side, as other programs have it"
         if ratio
         else "Measure a marker and a gap with a ruler, the marker with its black border",
+        code="board.gaps",
     )
 
 
@@ -201,6 +202,7 @@ def _check_size(markers: Markers, board: Board, detection: Detection, path: Path
         found=f"markers {share:.2f} of a square wide",
         expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",
         next_step="Measure a marker and a square with a ruler, the marker with its black border",
+        code="board.size",
     )
 
 

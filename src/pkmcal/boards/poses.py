@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
-from pkmcal.wording import count, listed, ratio_in_per_cent
+from pkmcal.wording import count, listed
 
 BOARD_RESIDUAL_LIMIT = 0.004
 """Share of the image's width that corners lie off their prediction, rms, from which the board file
@@ -473,12 +473,7 @@ def size_departure(poses: PoseSet, mount: int, file: str) -> Departure:
     mine = poses.mount == mount
     by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
 
-    def says(value: Array, sigma: Array) -> tuple[str, str]:
-        return (
-            f"The board's squares are {ratio_in_per_cent(value[0], sigma[0])}"
-            f" {'larger' if value[0] > 0 else 'smaller'} than {file} says",
-            "Measure them over as many as there are; if a ruler agrees, multiply square and marker"
-            f" by {1 + value[0]:.5f}",
-        )
+    def facts(value: Array, sigma: Array) -> dict[str, Any]:
+        return {"value": value[0], "sigma": sigma[0], "file": file, "factor": 1 + value[0]}
 
-    return Departure("board size", file, says, Effect(poses=by))
+    return Departure("board.size", file, facts, Effect(poses=by))

@@ -12,7 +12,7 @@ place.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,6 +38,7 @@ from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, listed
 
@@ -193,19 +194,35 @@ def search_by_hand(
             out[k] = so_far.scene.T_camera_base[k]
         elif k in so_far.bare:
             out[k] = np.nan
-    return found(), so_far.scene._replace(T_camera_base=out)
+    untested = tuple(_untested(session, so_far, answers, out))
+    return found(), so_far.scene._replace(T_camera_base=out, findings=untested)
+
+
+def _untested(
+    session: Session, so_far: _SoFar, answers: Mapping[int, _Answer], T_camera_base: Array
+) -> Iterator[Finding]:
+    """Notes on what could not be tested, of the photographs that have no place in the end."""
+    if so_far.failure:
+        yield note("image.not_taken_together", why=so_far.failure.rstrip("."))
+    for k, answer in answers.items():
+        failures = answer.asked.failures if answer.asked else ()
+        if failures and np.isnan(T_camera_base[k]).any():
+            label, why = session.label(k), failures[0].rstrip(".")
+            yield note("image.places_untested", label, number=len(failures), why=why)
 
 
 class _SoFar(NamedTuple):
     """What is known when a photograph is asked: the scene, the photographs that are placed, and
     what they show of the room; bare : those in which too few legs can be measured from where they
-    were believed to be.
+    were believed to be. failure : why the last photographs that were believed could not be taken
+    together with the others.
     """
 
     scene: KnownScene
     placed: Mapping[int, Neighbour] = MappingProxyType({})
     landmarks: Mapping[int, Landmarks] = MappingProxyType({})
     bare: frozenset[int] = frozenset()
+    failure: str = ""
 
 
 @dataclass(frozen=True)
@@ -254,8 +271,8 @@ def _with_sure(
             rest = {k: T for k, T in new.items() if k not in bare}
             joined = join(session, photographs, scene, rest, boards)
         scene = joined
-    except PkmcalError:
-        return so_far  # with all that is observed it is told better why
+    except PkmcalError as error:
+        return so_far._replace(failure=str(error))
     placed: dict[int, Neighbour] = {}
     for k in sorted(scene.edges):
         p, T = photographs[k], scene.T_camera_base[k]
@@ -458,7 +475,7 @@ def _without(seen: SeenSession, lost: Mapping[int, str]) -> SeenSession:
         raise InputError(
             "the photographs that are recognised show one configuration only",
             where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
-            found=f"{listed(names)}; {left.rejected[0].sentence}"
+            found=f"{listed(names)}; {left.rejected[0].finding.text}"
             if left.rejected
             else listed(names),
             expected="two at least",

@@ -31,7 +31,7 @@ from pkmcal.calibration.doubts import (
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.model_errors import ModelError, explains_heights, sentences
+from pkmcal.calibration.model_errors import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
@@ -42,7 +42,7 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
-from pkmcal.calibration.rejected import rejections_in_words, unused_configurations
+from pkmcal.calibration.rejected import rejection_findings, unused_configurations
 from pkmcal.calibration.responses import overruled
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
@@ -65,6 +65,7 @@ from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
 from pkmcal.ranges import check_number
@@ -193,46 +194,50 @@ def better_refined(
         found = refined()
     except PkmcalError as error:
         try:
-            return _with_files_intrinsics(held(), f"there is no result ({str(error).rstrip('.')})")
+            other = held()
         except PkmcalError:
             raise error from None
+        why = str(error).rstrip(".")
+        return _with_warning(other, doubtful("camera.refinement_failed", why=why))
     try:
         other = held()
-    except PkmcalError:
-        return found
-    why = worse_refined(found, other)
-    return _with_files_intrinsics(other, why) if why else found
+    except PkmcalError as error:
+        why = str(error).rstrip(".")
+        return _with_warning(found, note("camera.files_intrinsics_failed", why=why))
+    worse = worse_refined(found, other)
+    return _with_warning(other, worse) if worse else found
 
 
-def worse_refined(refined: Calibration, held: Calibration) -> str:
-    """Why a calibration with estimated intrinsics is worse than one with those of the files, in
-    words; empty where it is not.
+def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
+    """A warning where a calibration with estimated intrinsics is worse than one with those of the
+    files.
     """
     if refined.verdict.usable != held.verdict.usable:
-        return "" if refined.verdict.usable else "the result should not be used"
+        return None if refined.verdict.usable else doubtful("camera.refinement_refused")
     taken = refined.session.images_taken
     kept, more = (
         taken - sum(len(one.station.photographs) for one in found.session.rejected)
         for found in (refined, held)
     )
     if kept != more:
-        return f"{kept} of {taken} photographs have a sure place, not {more}" if kept < more else ""
+        if kept > more:
+            return None
+        return doubtful("camera.refinement_rejects", kept=kept, of=taken, by_files=more)
     by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
     # the mean square of n numbers that are noise has the standard deviation sqrt(2 / n)
     chance = 1 + 4 * np.sqrt(2 / max(by_refined.dof, 1.0))
     if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
-        return "the data fit worse than with the intrinsics of the files"
-    return ""
+        return doubtful(
+            "camera.refinement_fits_worse",
+            chi2=by_refined.chi2_as_stated,
+            by_files=by_held.chi2_as_stated,
+        )
+    return None
 
 
-def _with_files_intrinsics(held: Calibration, why: str) -> Calibration:
-    """A calibration with the files' intrinsics, taken because with estimated ones ``why``."""
-    warning = (
-        "The cameras' intrinsics are those of their files, although --refine-camera was given: with"
-        f" estimated ones {why}."
-    )
-    verdict = replace(held.verdict, warnings=(warning, *held.verdict.warnings))
-    return replace(held, verdict=verdict)
+def _with_warning(found: Calibration, warning: Finding) -> Calibration:
+    verdict = replace(found.verdict, findings=(warning, *found.verdict.findings))
+    return replace(found, verdict=verdict)
 
 
 def calibrate_measurements(
@@ -254,7 +259,7 @@ def calibrate_measurements(
     turns = Turns(observation, measurements, estimate, refinement_of(session, False), start=start)
     known = KnownScene.as_drawn(session.machine, T_camera_base, session.joints)
     seen = SeenSession(session, [], Boards(), known)
-    return _judge(seen, _Identified(turns, estimate, (), None), (), "bundle", 0, clock)
+    return _judge(seen, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -276,7 +281,7 @@ class Settled(NamedTuple):
     no known mistake explains better.
 
     stated : the estimate with the readings' noise as it is stated. turned : cameras whose
-    photographs are upside down, or may be.
+    photographs are upside down, or may be. findings : notes on hypotheses that could not be tested.
     """
 
     seen: SeenSession
@@ -284,6 +289,7 @@ class Settled(NamedTuple):
     stated: Estimate
     richer: tuple[RicherModel, ...]
     turned: tuple[UpsideDown, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def settle(
@@ -310,16 +316,24 @@ def settle(
     machine = seen.session.machine
     stated = as_stated(machine, turns.measurements, turns.estimate)
     richer = richer_models(seen.session, turns.measurements, stated)
-    check_poses(seen.session, turns.measurements, stated, richer)
-    check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed)
-    return Settled(seen, turns, stated, richer, turned)
+    untested = (
+        *seen.known.findings,
+        *(
+            note("poses.model_failed", model.name, why=model.failure.rstrip("."))
+            for model in richer
+            if model.failure
+        ),
+        *check_poses(seen.session, turns.measurements, stated, richer),
+        *check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed),
+    )
+    return Settled(seen, turns, stated, richer, turned, untested)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
     """The calibration of a settled session."""
-    seen, turns, stated, richer, turned = settled
+    seen, turns, stated, richer, turned, untested = settled
     machine = seen.session.machine
     turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
     clock.lap("identify")
@@ -328,7 +342,7 @@ def _finished(
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
     found = _estimated(machine, turns, richer, method, seed, holdout, clock)
-    return _judge(seen, found, turned, method, seed, clock)
+    return _judge(seen, found, turned, untested, method, seed, clock)
 
 
 class _Identified(NamedTuple):
@@ -421,6 +435,7 @@ def _judge(
     seen: SeenSession,
     found: _Identified,
     turned: tuple[UpsideDown, ...],
+    untested: tuple[Finding, ...],
     method: CalibrationMethod,
     seed: int,
     clock: Clock,
@@ -455,12 +470,31 @@ def _judge(
         )
         found = found._replace(estimate=estimate)
     findings = _findings(found.turns.measurements, without, ended[1], uneven)
-    rejections = rejections_in_words(
-        session,
-        found.turns.measurements,
-        found.estimate,
-        findings,
-        at_minimum=method == "bundle",
+    uneven_bed = explains_heights(errors)
+    named, images = bool(departed or any(one.sure for one in errors)), found.turns.responses
+    others = (
+        *scale_doubt(session, found.estimate),
+        *(() if uneven_bed else noise_doubt(session, found.estimate)),
+        *found.turns.doubts,
+        *chance_doubt(found.turns),
+        *unused_configurations(session, found.estimate, found.out.region.rows if found.out else ()),
+        *rejection_findings(
+            session,
+            found.turns.measurements,
+            found.estimate,
+            findings,
+            at_minimum=method == "bundle",
+        ),
+        *(one.finding for one in departed),
+        *discrepancy_findings(errors),
+        *outvoted(session, found.turns.measurements, found.estimate),
+        *noise_told(session, found.estimate, named, explained=uneven_bed),
+        *lens_told(found.turns.cameras),
+        *sizes_told(session, found.turns.measurements, found.estimate),
+        *scales_told(session, found.estimate, tuple(x.of for x in departed)),
+        *numbering_told(session),
+        *(one.finding for one in (*turned, *images)),
+        *untested,
     )
     verdict = judge(
         found.turns.observation,
@@ -468,38 +502,8 @@ def _judge(
         findings,
         method,
         richer=found.richer,
-        explained=explains_heights(errors),
-        doubts=(
-            *scale_doubt(session, found.estimate),
-            *(() if explains_heights(errors) else noise_doubt(session, found.estimate)),
-            *found.turns.doubts,
-            *chance_doubt(found.turns),
-            *rejections.reasons,
-            *(one.sentence for one in departed if one.against),
-        ),
-        cautions=(
-            *unused_configurations(
-                session, found.estimate, found.out.region.rows if found.out else ()
-            ),
-            *rejections.warnings,
-            *(one.sentence for one in departed if not one.against),
-            *sentences(errors),
-            *outvoted(session, found.turns.measurements, found.estimate),
-            *noise_told(
-                session,
-                found.estimate,
-                bool(departed or sentences(errors)),
-                explained=explains_heights(errors),
-            ),
-            *lens_told(found.turns.cameras),
-            *(one.sentence for one in (*turned, *found.turns.responses) if not one.sure),
-        ),
-        hints=(
-            *sizes_told(session, found.turns.measurements, found.estimate),
-            *scales_told(session, found.estimate, tuple(x.of for x in departed)),
-            *numbering_told(session),
-            *(one.sentence for one in (*turned, *found.turns.responses) if one.sure),
-        ),
+        explained=uneven_bed,
+        others=others,
     )
     clock.lap("identify")
     return Calibration(

@@ -21,6 +21,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.photographs import Photographs, placed_at
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.stations import BY_CHANCE
+from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
@@ -41,20 +42,22 @@ class _Offered(NamedTuple):
     chance: float
 
 
-def chance_doubt(turns: Turns) -> tuple[str, ...]:
-    """Why the result is not to be used, if chance may have offered the edges by which it is told;
-    asked only where less than a third of the edges in sight were measured.
+def chance_doubt(turns: Turns) -> tuple[Finding, ...]:
+    """A reason where chance may have offered the edges by which the result was estimated; tested
+    only where less than a third of the edges in sight were measured.
     """
     offered = _offered(turns, [p.station for p in turns.photographs])
     if offered is None:
         return ()
     return (
-        f"Of {offered.in_sight} edges in sight only {offered.measured} were measured where the"
-        f" machine has them, and about {offered.aside:.0f} are where nothing of it is,"
-        f" {MOVED_ASIDE:.0f} px aside:"
-        f" chance offers as many {how_often(offered.chance)}. So this may not be the machine in"
-        " the photographs, or hardly anything of it shows: check the drawing, the order of its"
-        " legs, and the photographs' names; `pkmcal check` shows the drawing laid over them.",
+        wrong(
+            "edges.by_chance",
+            in_sight=offered.in_sight,
+            measured=offered.measured,
+            aside=offered.aside,
+            distance=MOVED_ASIDE,
+            chance=offered.chance,
+        ),
     )
 
 

@@ -164,12 +164,14 @@ def _looked(
 
 class AskedPlaces(NamedTuple):
     """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
-    machine from there, and what was paid (n,) for the machine.
+    machine from there, and what was paid (n,) for the machine. failures : why further places could
+    not be tested.
     """
 
     T_camera_base: Array
     evidence: Array
     paid: Array
+    failures: tuple[str, ...] = ()
 
     @classmethod
     def nothing(cls) -> AskedPlaces:
@@ -208,26 +210,28 @@ def look_closer(
     order = order[[k - count for k in distinct_silhouettes(view, both, one) if k >= count]]
     at, fits = [*seen.T_camera_base, *settled[order]], [*seen.evidence, *evidence[order]]
     paid = [*seen.paid, *np.zeros(len(order))]
+    failures = [*seen.failures]
     for number, T in enumerate(places[order], start=count):
         best = max(fit / found.unit - cost for fit, cost in zip(fits, paid, strict=True))
         if before.edges and fits[number] / found.unit < best - MOST_BEHIND_BEST:
             break  # what is known of the machine already does not change by so much
         try:
             known, cost = ask(session, before, p.station, T, view)
-        except PkmcalError:
-            continue  # too few legs are where they should be
+        except PkmcalError as error:  # such as too few legs where they should be from there
+            failures.append(str(error))
+            continue
         changed = replace(view, machine=known.machine, all_poses=known.T_base_platform)
         there, fit = settle_by_evidence(
             changed, known.T_camera_base[[p.station]], one, 16, 6, SILHOUETTE_SCATTER
         )
         at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
-    seen = AskedPlaces(np.stack(at), np.array(fits), np.array(paid))
+    seen = AskedPlaces(np.stack(at), np.array(fits), np.array(paid), tuple(failures))
     return _weighed(view, seen, found.unit), seen
 
 
 def _weighed(view: StationView, asked: AskedPlaces, unit: float) -> Alone:
     """Places by what was found out of them, the likeliest first."""
-    at, evidence, paid = asked
+    at, evidence, paid, _ = asked
     edge = grain(view, at[np.argmax(evidence)])
     by_edges, by_legs = evidence / edge - paid, evidence / unit - paid
     first = at[np.argmax(by_edges)]

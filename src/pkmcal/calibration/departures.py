@@ -7,7 +7,7 @@ measurements and in which words it is told; here they are put together and teste
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, NamedTuple
@@ -41,9 +41,9 @@ from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
 from pkmcal.mechanisms.closure import scales as scales_of
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
-from pkmcal.wording import amount
 
 FALSE_DEPARTURE_CHANCE = 0.005
 """Chance at which any departure at all is found in a session that has none."""
@@ -51,34 +51,63 @@ MOST_TOOL_DEPARTURE = 1.0
 """Standard deviations by which a departure moves the tool, beyond which the result is refused."""
 
 
+KINDS = {
+    "readings.scale": "reading scale",
+    "readings.play": "backlash",
+    "readings.single": "reading",
+    "station.moved": "station moved",
+    "tube.radius": "tube radius",
+    "tube.edge": "tube edge",
+    "board.size": "board size",
+    "camera.focal": "focal length",
+    "camera.aspect": "pixel aspect",
+    "camera.centre": "picture centre",
+    "camera.distortion": "distortion",
+    "station.focal": "station's focal length",
+    "station.aspect": "station's pixel aspect",
+    "station.centre": "station's picture centre",
+    "station.distortion": "station's distortion",
+}
+"""``kind`` of a departure in calibration.json, by its code."""
+
+
 @dataclass(frozen=True)
 class Departed:
     """A departure that the data show.
 
-    value, sigma : (k,) that fit, all that were found free together. tool : by how many of its
-    standard deviations the platform's position moves if it is taken up, root mean square over the
-    session's poses. shift : the same in m. what : the data show; todo : next.
+    finding : for the verdict, a reason where it moves the tool by more than MOST_TOOL_DEPARTURE.
+    value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
+    many of its standard deviations the platform's position moves if it is taken up, root mean
+    square over the session's poses. shift : the same in m.
     """
 
-    kind: str
-    of: str
+    finding: Finding
     value: Array
     sigma: Array
     score: Score
     tool: float
     shift: float
-    what: str
-    todo: str
+
+    @property
+    def code(self) -> str:
+        """Of its finding."""
+        return self.finding.code
+
+    @property
+    def of(self) -> str:
+        """What departs, by name."""
+        return self.finding.subject
 
     @property
     def against(self) -> bool:
         """Whether the result should not be used for it."""
-        return self.tool > MOST_TOOL_DEPARTURE
+        return self.finding.level is Level.WRONG
 
     def document(self) -> dict[str, Any]:
         """For programs."""
         return {
-            "kind": self.kind,
+            "code": self.code,
+            "kind": KINDS[self.code],
             "of": self.of,
             "value": self.value,
             "sigma": self.sigma,
@@ -88,12 +117,6 @@ class Departed:
             "moves_tool": self.shift,
             "moves_tool_in_sigmas": self.tool,
         }
-
-    @property
-    def sentence(self) -> str:
-        """For a verdict."""
-        moves = f"taken up, it moves the tool by {amount(self.shift, 'm')}"
-        return f"{self.what}; {moves}, {self.tool:.2g} standard deviations. {self.todo}."
 
 
 class ModelViolations(NamedTuple):
@@ -224,8 +247,15 @@ def _departed(one: Departure, score: Score, fit: Freed, tool: ToolError) -> Depa
     shift = float(np.sqrt(np.nanmean(moved**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
     ratio = shift / sigma if sigma > 0 else np.inf  # where nothing that is free moves the tool
-    what, todo = one.says(fit.value, fit.sigma)
-    return Departed(one.kind, one.of, fit.value, fit.sigma, score, ratio, shift, what, todo)
+    level = Level.WRONG if ratio > MOST_TOOL_DEPARTURE else Level.DOUBTFUL
+    # what the data do not determine is no number
+    facts = {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in one.facts(fit.value, fit.sigma).items()
+    }
+    facts |= {"chance": score.adjusted, "tool_shift": shift, "tool_shift_sigmas": ratio}
+    found = Finding(one.code, level, facts, one.of)
+    return Departed(found, fit.value, fit.sigma, score, ratio, shift)
 
 
 def _lenses(
@@ -242,7 +272,7 @@ def _lenses(
         own = np.array([station.camera_file == file for station in session.stations])
         for part in camera.departures():
             effect = changed.effect(own, part.columns)
-            yield Departure(part.kind, file, _of_lens(part.says, file), effect)
+            yield Departure(f"camera.{part.code}", file, _of_lens(part.facts, file=file), effect)
 
 
 def _lenses_of_stations(
@@ -262,20 +292,21 @@ def _lenses_of_stations(
     for s in np.flatnonzero(shared).tolist():
         station, own = session.stations[s], np.arange(len(files)) == s
         for part in station.camera.departures():
-            says = _of_lens_at(part.says, station.name, station.camera_file)
+            facts = _of_lens(part.facts, file=station.camera_file, station=station.name)
             effect = changed.effect(own, part.columns)
-            yield Departure(f"station's {part.kind}", station.name, says, effect)
+            yield Departure(f"station.{part.code}", station.name, facts, effect)
 
 
-def _of_lens_at(
-    says: Callable[[Array, Array], str], station: str, file: str
-) -> Callable[[Array, Array], tuple[str, str]]:
-    return lambda value, sigma: (
-        f"The camera of {station} is not that of the other stations, which share {file}:"
-        f" {says(value, sigma)}",
-        f"Calibrate the camera of {station} by itself with `pkmcal camera`, and give the station a"
-        " file of its own",
-    )
+def _of_lens(facts: Mapping[str, Any], **where: str) -> Callable[[Array, Array], dict[str, Any]]:
+    """Facts about a camera's file, from estimates of one number, or of one in x and one in y."""
+
+    def described(value: Array, sigma: Array) -> dict[str, Any]:
+        more = {"y": value[1], "sigma_y": sigma[1]} if len(value) > 1 else {}
+        if "stated" in facts:
+            more["fits"] = facts["stated"] + value[0]
+        return {"value": value[0], "sigma": sigma[0], **more, **facts, **where}
+
+    return described
 
 
 @dataclass(frozen=True)
@@ -312,16 +343,6 @@ class CameraChange:
             edges=np.where(stations[self.edge_station][:, None, None], edges, 0.0),
             poses=np.where(also[:, None, None], poses, 0.0),
         )
-
-
-def _of_lens(
-    says: Callable[[Array, Array], str], file: str
-) -> Callable[[Array, Array], tuple[str, str]]:
-    return lambda value, sigma: (
-        f"The camera in {file} is not the one that took these photographs: {says(value, sigma)}",
-        "Calibrate the camera again with `pkmcal camera`, focus and zoom as for these photographs,"
-        " or estimate it with the machine: --refine-camera",
-    )
 
 
 def _boards(session: Session, measured: Measurements) -> Iterator[Departure]:

@@ -26,13 +26,15 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.diagnose import diameters
+from pkmcal.outcome.finding import Finding, note
 
 
 def check_radii(
     seen: SeenSession, estimate: Estimate | None, by_chance: bool, refine_camera: bool, seed: int
-) -> None:
+) -> tuple[Finding, ...]:
     """Raise `InputError` where edges disagree with the machine more than with one whose mistake is
-    put right, and more of them agree with a machine of half the radii.
+    put right, and more of them agree with a machine of half the radii; a note where the machine of
+    half the radii has no estimate.
 
     estimate : with the drawing's radii, None where there is none. by_chance : whether chance may
     have offered its edges, which then agree with anything. refine_camera : whether it estimated the
@@ -41,20 +43,22 @@ def check_radii(
     agree = CURED_MISFIT_SHARE * TOO_NOISY
     bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
     if not bad or not seen.photographs:
-        return
+        return ()
     thinner = replace(seen.session, machine=_of_half_the_radii(seen.session.machine))
     try:
         rng = np.random.default_rng(seed)
         again = place(thinner, seen.photographs, seen.boards, rng)
         cameras = refinement_of(again.session, refine_camera)
         turns = take_turns(again, cameras, lambda _text, _share: None, lambda _step: None)
-    except PkmcalError:  # it is not found in these photographs, or not known by them
-        return
+    except PkmcalError as error:  # it is not found in these images, or they do not determine it
+        mechanism = seen.session.document["mechanism"]
+        return (note("tube.diameter_untested", mechanism, why=str(error).rstrip(".")),)
     found = turns.estimate
     cured = found.statistics.noise_scale <= agree
     kept = 0.0 if estimate is None else estimate.edge_weights.sum()
     if cured and found.edge_weights.sum() > kept:
         raise diameters(seen.session.document["mechanism"])
+    return ()
 
 
 def _of_half_the_radii(machine: Machine) -> Machine:

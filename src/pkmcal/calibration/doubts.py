@@ -36,9 +36,10 @@ from pkmcal.mechanisms.reading_hypotheses import (
     exchanged_motors,
     reversed_motors,
 )
+from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.session.load import Session
 from pkmcal.session.moved import how_far
-from pkmcal.wording import SHOWN_UNITS, listed, number, ratio_in_per_cent
+from pkmcal.wording import SHOWN_UNITS, listed, number
 
 SUSPECT_POSE_SCALE = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
@@ -73,9 +74,10 @@ richer model no help: what is believed ends below MOST_CURED_MISFIT."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise from which it is no noise: between a data sheet's figure and
 what a mounted encoder does lies a factor of ten or thirty."""
+NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
+"""Errors by which an estimate under a hypothesis fails."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
-BOARDS_TURN_WORDS = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class Doubt:
     constant : of the former, a reading and what it stands for together, m or rad. configuration :
     the first after a movement; before : the last before it. size : of the board, true over
     written. moved : (6,) (omega, tau) of the board, or the station, from before to after, NaN where
-    the data do not determine it. misfit : what is left, in standard deviations.
+    the data do not determine it. misfit : what is left, in standard deviations; infinite where
+    there is no estimate with the mistake put right, and failure says why.
     """
 
     kind: Literal["sign", "order", "board moved", "camera moved", "size"]
@@ -99,6 +102,7 @@ class Doubt:
     moved: Array = field(default_factory=lambda: np.zeros(6))
     size: float = 1.0
     constant: float = 0.0
+    failure: str = ""
 
 
 def pose_misfit(estimate: Estimate) -> float:
@@ -144,8 +148,10 @@ def wrong_scale(estimate: Estimate) -> float:
     return 1 / back if gain > COMMON_FACTOR_CHI2 and gain > left else 1.0
 
 
-def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:
-    """The mistake that explains the poses; None where none does.
+def find_doubt(
+    machine: Machine, measurements: Measurements, estimate: Estimate
+) -> tuple[Doubt | None, tuple[Doubt, ...]]:
+    """The mistake that explains the poses, None where none does; and those that could not be tried.
 
     machine : by the drawing. estimate : of these measurements.
     """
@@ -153,21 +159,23 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
     found: Doubt | None = None
     # heights do not know where a tracker stands: whether it moved, score tests say
     whole = () if only_heights(estimate) else _movements(machine, measurements, estimate)
+    failed: list[Doubt] = []
     for doubt in chain(
         whole,
         _other_readings(machine, measurements),
         _sizes(machine, measurements, estimate),
     ):
+        if doubt.failure:
+            failed.append(doubt)
+            continue
         if found is None or doubt.misfit < found.misfit:
             found = doubt
         # a board that moved and a camera that moved are alike, so both are always tried
         if found.misfit < SURELY_CURED_MISFIT and doubt.kind not in ("board moved", "camera moved"):
             break
-    return (
-        found
-        if found and found.misfit < min(CURED_MISFIT_SHARE * before, MOST_CURED_MISFIT)
-        else None
-    )
+    if found and found.misfit >= min(CURED_MISFIT_SHARE * before, MOST_CURED_MISFIT):
+        found = None
+    return found, tuple(failed)
 
 
 def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
@@ -177,9 +185,22 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Do
     one that is not there a misfit as large as before, after many steps: only what halves it at the
     start is estimated.
     """
+    failures: dict[str, str] = {}
 
     def misfit(hypothesis: ReadingHypothesis) -> float:
-        return _first_misfit(machine, replace(measurements, joints=hypothesis.joints))
+        try:
+            return _first_misfit(machine, replace(measurements, joints=hypothesis.joints))
+        except NO_ESTIMATE as error:
+            failures[f"{hypothesis.code} {hypothesis.motors}"] = str(error)
+            return np.inf
+
+    def doubt_of(hypothesis: ReadingHypothesis, failure: str = "") -> Doubt:
+        kind = "sign" if hypothesis.code == "readings.reversed" else "order"
+        motor, *other = hypothesis.motors
+        return Doubt(
+            kind, np.inf, motor=motor, other=other[0] if other else -1,
+            constant=hypothesis.constant, failure=failure,
+        )  # fmt: skip
 
     joints = measurements.joints
     reversed_ = reversed_motors(joints, machine.joint_ranges)
@@ -189,47 +210,45 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Do
         hypotheses += [(misfit(constants[k]), constants[k]) for k in few]
     limit = CURED_MISFIT_SHARE * _first_misfit(machine, measurements)
     for first, hypothesis in sorted(hypotheses, key=lambda item: item[0]):
+        if first == np.inf:
+            yield doubt_of(hypothesis, failures[f"{hypothesis.code} {hypothesis.motors}"])
         if first > limit:
-            break
+            continue
         if hypothesis.constant:  # the best of the motor's; its offset, estimated, takes up the rest
             hypothesis = min(reversed_[hypothesis.motors[0]], key=misfit)
-        estimate = _tried(machine, replace(measurements, joints=hypothesis.joints), None)
-        if estimate is not None:
-            kind = "sign" if hypothesis.code == "readings.reversed" else "order"
-            motor, *other = hypothesis.motors
-            yield Doubt(
-                kind, pose_misfit(estimate), motor=motor, other=other[0] if other else -1,
-                constant=hypothesis.constant,
-            )  # fmt: skip
+        other_readings = replace(measurements, joints=hypothesis.joints)
+        yield _tried(doubt_of(hypothesis), machine, other_readings)[0]
 
 
 def _first_misfit(machine: Machine, measurements: Measurements) -> float:
     """:func:`pose_misfit` where an estimate would start, platform poses by the drawing and the
-    readings; infinite where it cannot.
+    readings. Raises an error of NO_ESTIMATE where it cannot.
     """
     from pkmcal.papers.hand_eye import start_from_poses
 
-    try:
-        assembled = assemble(machine, measurements, default_gauge(machine))
-        start = batch_of(machine, assembled, start_from_poses(machine, measurements))
-    except (PkmcalError, np.linalg.LinAlgError):
-        return np.inf
+    assembled = assemble(machine, measurements, default_gauge(machine))
+    start = batch_of(machine, assembled, start_from_poses(machine, measurements))
     rows = assembled.places.poses.taken(assembled.problem.unweighted(start).poses[0])
     return _usual(np.nan_to_num(rows, nan=np.inf))
 
 
-def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
-    """The estimate from other measurements, from the drawing unless told; None where it fails."""
+def _tried(
+    doubt: Doubt, machine: Machine, measurements: Measurements, start: State | None = None
+) -> tuple[Doubt, Estimate | None]:
+    """A mistake with its misfit, and the estimate from measurements in which it is put right, from
+    the drawing unless a start is given; with its failure and None where there is no estimate.
+    """
     from pkmcal.papers.hand_eye import start_from_poses
 
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
-        return bundle(
+        estimate = bundle(
             machine, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
         )
-    except (PkmcalError, np.linalg.LinAlgError):
-        return None
+    except NO_ESTIMATE as error:
+        return replace(doubt, failure=str(error)), None
+    return replace(doubt, misfit=pose_misfit(estimate)), estimate
 
 
 def _movements(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
@@ -256,16 +275,16 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             start = replace(
                 state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
             )
-            tried = _tried(machine, board, start)
+            doubt = Doubt(
+                "board moved", np.inf, station=int(s), before=place[0], configuration=place[1]
+            )
+            doubt, tried = _tried(doubt, machine, board, start)
             pair = np.array([m, -1])
-            if tried is not None and _certain(
-                tried.state.T_mount[pair], tried.mount_covariance[pair]
-            ):
+            if tried is None:
+                yield doubt
+            elif _certain(tried.state.T_mount[pair], tried.mount_covariance[pair]):
                 change = _movement(machine, tried.state.T_mount[pair], tried.mount_covariance[pair])
-                yield Doubt(
-                    "board moved", pose_misfit(tried), station=int(s), before=place[0],
-                    configuration=place[1], moved=change,
-                )  # fmt: skip
+                yield replace(doubt, moved=change)
             if len(measurements.edges):
                 continue  # its edges would have to move with the camera
             yield from _camera_moved(machine, measurements, state, int(s), later, place)
@@ -306,16 +325,14 @@ def _camera_moved(
         camera_of_station=np.append(number, number[s]),
     )
     start = replace(state, T_camera_base=np.concatenate([state.T_camera_base, station[None]]))
-    tried = _tried(machine, camera, start)
-    if tried is not None and _certain(
-        tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
-    ):
+    doubt = Doubt("camera moved", np.inf, station=s, before=place[0], configuration=place[1])
+    doubt, tried = _tried(doubt, machine, camera, start)
+    if tried is None:
+        yield doubt
+    elif _certain(tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]):
         places = inverse(tried.state.T_camera_base[[s, -1]])
         change = _movement(machine, places, tried.station_covariance[[s, -1]])
-        yield Doubt(
-            "camera moved", pose_misfit(tried), station=s, before=place[0], configuration=place[1],
-            moved=change,
-        )  # fmt: skip
+        yield replace(doubt, moved=change)
 
 
 def _changed(index: Integers, rows: Integers, value: int) -> Integers:
@@ -360,9 +377,7 @@ def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> 
         return
     T[rows] = pose(T[rows, :3, :3], spread * T[rows, :3, 3])
     other = replace(measurements, poses=replace(poses, T_station_target=T))
-    tried = _tried(machine, other, None)
-    if tried is not None:
-        yield Doubt("size", pose_misfit(tried), size=float(spread))
+    yield _tried(Doubt("size", np.inf, size=float(spread)), machine, other)[0]
 
 
 def check_poses(
@@ -370,19 +385,24 @@ def check_poses(
     measurements: Measurements,
     estimate: Estimate,
     richer: tuple[RicherModel, ...] = (),
-) -> None:
+) -> tuple[Finding, ...]:
     """Raise `InputError` where one of the usual mistakes explains why poses do not fit, or where a
-    reading never changes.
+    reading never changes; a note where mistakes could not be tried.
 
     richer : models that were tried; where one of them fits, it is the model that is at fault.
     """
     if not in_doubt(estimate) or any(model.scale < SUSPECT_POSE_SCALE for model in richer):
-        return
+        return ()
     if error := frozen_in(session):
         raise error
-    doubt = find_doubt(session.machine, measurements, estimate)
+    doubt, failed = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:
         raise _error(session, doubt, pose_misfit(estimate))
+    if not failed:
+        return ()
+    kinds = [one.kind for one in failed]
+    why = failed[0].failure.rstrip(".")
+    return (note("poses.mistakes_untested", number=len(failed), mistakes=kinds, why=why),)
 
 
 def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
@@ -400,29 +420,24 @@ def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
     return best < max(POOR_MODEL_POSE_SCALE, CURED_MISFIT_SHARE * estimate.statistics.pose_scale)
 
 
-def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """A reason where readings scatter by more than the drawing is off, and so tell nothing, or by
-    so much more than is stated that it is no noise.
+def noise_doubt(session: Session, estimate: Estimate) -> Iterator[Finding]:
+    """A reason where readings scatter by more than the nominal model is off, and so determine
+    nothing, or by so much more than is stated that it is no noise.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
     most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
     if s.reading_scale <= 1:
-        return ()
-    if noise <= most and s.reading_scale < WRONG_MODEL_READING_SCALE:
-        return ()
-    if noise <= most:
-        return (
-            f"The readings scatter by {_lengths(noise, units)},"
-            f" {s.reading_scale:.0f} times what joints.noise in session.yaml says: encoders are"
-            " not stated so wrong, something moves the machine beside its readings, or they are"
-            " not those of these configurations. If they really are no better, state their noise.",
+        return
+    if noise > most:
+        yield wrong("readings.noise_beyond_tolerance", noise=noise, limit=most, units=sorted(units))
+    elif s.reading_scale >= WRONG_MODEL_READING_SCALE:
+        yield wrong(
+            "readings.noise_beyond_encoders",
+            noise=noise,
+            scale=s.reading_scale,
+            units=sorted(units),
         )
-    return (
-        f"The readings scatter by {_lengths(noise, units)}, more than the drawing's tolerance of"
-        f" {_lengths(most, units)}: they may belong to other configurations, or to another"
-        " machine.",
-    )
 
 
 def richer_models(
@@ -446,162 +461,124 @@ def richer_models(
             found = bundle(
                 other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
             )
-        except (PkmcalError, np.linalg.LinAlgError):
+        except NO_ESTIMATE as error:
+            out.append(RicherModel(name, np.inf, str(error)))
             continue
         out.append(RicherModel(name, found.statistics.pose_scale))
     return tuple(out)
 
 
-def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence where the whole machine came out larger or smaller than drawn."""
+def scale_doubt(session: Session, estimate: Estimate) -> Iterator[Finding]:
+    """A reason where the whole machine came out larger or smaller than drawn."""
     scale = wrong_scale(estimate)
-    if scale == 1.0 or not estimate.pose_weights.size:
-        return ()
-    more = "larger" if scale > 1 else "smaller"
-    cause = (
-        "the board's squares are not of the size that its file says. Measure them over as many as"
-        " there are"
-        if session.board
-        else "the table's lengths have another scale"
-    )
-    return (
-        f"All of the machine came out {abs(scale - 1):.2%} {more} than its drawing, as if {cause}:"
-        " every displacement of the platform is wrong by as much.",
-    )
+    if scale != 1.0 and estimate.pose_weights.size:
+        cause = "board" if session.board else "table"
+        yield wrong("machine.scale", value=scale - 1, cause=cause)
 
 
 def noise_told(
     session: Session, estimate: Estimate, departed: bool = False, *, explained: bool = False
-) -> tuple[str, ...]:
-    """Sentences where the data do not allow a noise that session.yaml states.
+) -> Iterator[Finding]:
+    """Warnings where the data do not allow a noise that session.yaml states.
 
     departed : whether something was found that makes readings scatter. explained : whether an
     uneven bed is what makes heights scatter, and not their noise.
     """
     if explained:
-        return ()
-    s, out = estimate.statistics, list[str]()
-    units, file = set(session.machine.joint_units), "session.yaml"
+        return
+    s, units = estimate.statistics, sorted(set(session.machine.joint_units))
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
         least, most = s.reading_range
-        used, stated, bound = (
-            _lengths(session.joint_noise * scale, units)
-            for scale in (s.reading_scale, 1.0, most or 0.0)
-        )
-        found, taken = used, "What they scatter by"
-        if most is not None and not least:
-            found, taken = f"no more than some {bound}", used
-        out.append(
-            f"The readings scatter by {found}; joints.noise in {file} says {stated}. {taken} was"
-            f" used (the data allow {_between(s.reading_range)} times the stated noise): "
-            + (
-                "what is named before may be all that they scatter by."
-                if departed
-                else "correct joints.noise, or look for what moves the machine beside its readings."
-            )
+        yield doubtful(
+            "readings.noise",
+            "session.yaml, joints.noise",
+            noise=session.joint_noise * s.reading_scale,
+            stated=session.joint_noise,
+            bound=session.joint_noise * most if most is not None and not least else None,
+            range=s.reading_range,
+            units=units,
+            explained="yes" if departed else "no",
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:
-        where = listed([f"stations.{table.name}.tracker.noise" for table in session.trackers])
-        out.append(
-            f"What was measured of the platform scatters by {_between(s.pose_range)} times what"
-            f" {where} in {file} says. The stated noise was used all the same, for errors that all"
-            " measurements share do not scatter; if there are none, state it smaller, and standard"
-            " deviations follow."
-        )
-    return tuple(out)
+        keys = [f"stations.{table.name}.tracker.noise" for table in session.trackers]
+        yield doubtful("poses.noise", f"session.yaml, {keys[0]}", range=s.pose_range, keys=keys)
 
 
-def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
-    """A sentence for each camera that was refined and whose file does not tell how well it is
-    known.
-    """
-    usual = ", ".join(
-        (
-            f"focal lengths to {USUAL_FOCAL:.1%}",
-            f"their ratio to {USUAL_ASPECT:.1%}",
-            f"the centre to {USUAL_CENTRE:.0%} of the width",
-            f"distortion to {USUAL_DISTORTION:g}",
-        )
-    )
-    return tuple(
-        f"{file} states no covariance, so its camera was taken to be known as cameras usually are:"
-        f" {usual}. One that `pkmcal camera` calibrates is better known."
-        for file, camera in zip(cameras.files, cameras.calibrated, strict=True)
-        if cameras.refined and camera.covariance is None
-    )
+def lens_told(cameras: CameraRefinement) -> Iterator[Finding]:
+    """A warning for each camera that was refined and whose file states no covariance."""
+    for file, camera in zip(cameras.files, cameras.calibrated, strict=True):
+        if cameras.refined and camera.covariance is None:
+            yield doubtful(
+                "camera.no_covariance",
+                file,
+                focal=USUAL_FOCAL,
+                aspect=USUAL_ASPECT,
+                centre=USUAL_CENTRE,
+                distortion=USUAL_DISTORTION,
+            )
 
 
-def sizes_told(session: Session, measurements: Measurements, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence on how large the board is, where that is not known exactly."""
+def sizes_told(
+    session: Session, measurements: Measurements, estimate: Estimate
+) -> Iterator[Finding]:
+    """A note on how large the board is, where that is not known exactly."""
     tolerances = [mount.tolerance for mount in measurements.mounts if mount.tolerance > 0]
-    told = zip(tolerances, estimate.state.sizes, estimate.size_sigma, strict=False)
-    out: list[str] = []
-    for tolerance, value, sigma in told:
+    for tolerance, value, sigma in zip(
+        tolerances, estimate.state.sizes, estimate.size_sigma, strict=False
+    ):
         file = session.document["board"]["file"]
+        if sigma <= UNTOLD_BOARD_SIZE_SIGMA:
+            yield note(
+                "board.size_estimate", file, value=tolerance * value, sigma=tolerance * sigma
+            )
+            continue
         # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
         other = max(1 - sigma**2, np.finfo(float).eps)
-        without, apart = value / other, abs(value) / np.sqrt(other)
-        if sigma > UNTOLD_BOARD_SIZE_SIGMA:
-            out.append(
-                f"Nothing but {file} tells how large the board is: to {100 * tolerance:.2g} %, its"
-                " tolerance, and standard deviations contain that. Measure its squares over as many"
-                " as there are, correct square and marker, and state how well you measured."
-                + (
-                    " All else, the drawing's lengths first, fits best as if the board were"
-                    f" {ratio_in_per_cent(tolerance * without, tolerance * sigma / np.sqrt(other))}"
-                    f" {'larger' if value > 0 else 'smaller'}."
-                    if apart > BOARD_SIZE_DISAGREEMENT
-                    else ""
-                )
-            )
+        known = {"tolerance": 100 * tolerance}
+        if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT:
+            known |= {
+                "value": tolerance * value / other,
+                "sigma": tolerance * sigma / np.sqrt(other),
+            }
+            yield note("board.size_disagrees", file, **known)
         else:
-            out.append(
-                f"The board came out {100 * tolerance * abs(value):.3f} ±"
-                f" {100 * tolerance * sigma:.3f} % {'larger' if value > 0 else 'smaller'} than"
-                f" {file} says; that is taken into account."
-            )
-    return tuple(out)
+            yield note("board.size_by_file", file, **known)
 
 
-def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> tuple[str, ...]:
-    """A sentence on readings whose scale is surely not the drawing's, beside those that are named
+def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:
+    """A note on readings whose scale is surely not the nominal one, beside those that are named
     already.
     """
     layout, table = session.machine.layout, session.machine.parameters
-    unsure = np.flatnonzero(layout.unsure_scales)
-    out: dict[str, str] = {}
-    for leg in unsure:
+    found: dict[str, tuple[float, float]] = {}
+    for leg in np.flatnonzero(layout.unsure_scales):
         k, column = layout.scale[leg], int(layout.actuated[leg])
         name = session.document["joints"]["columns"][column]
-        share = estimate.machine.values[k] / table.drawing[k] - 1
+        share = float(estimate.machine.values[k] / table.drawing[k] - 1)
         sigma = float(np.sqrt(estimate.covariance[k, k]))
         if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
-            more = "larger" if share > 0 else "smaller"
-            out[name] = f"{100 * abs(share):.3f} ± {100 * sigma:.3f} % {more} ({name})"
-    if not out:
-        return ()
-    return (
-        "Readings have another scale than the drawing says: true ones are"
-        f" {listed([*out.values()])}. That is in the calibrated machine, under scale, and in what"
-        " is exported of it.",
-    )
+            found[name] = share, sigma
+    if found:
+        values, sigmas = zip(*found.values(), strict=True)
+        each = [
+            f"{100 * abs(share):.3f} ± {100 * sigma:.3f} %"
+            f" {'larger' if share > 0 else 'smaller'} ({name})"
+            for name, (share, sigma) in found.items()
+        ]
+        yield note(
+            "readings.scale_estimates",
+            listed([*found]),
+            columns=[*found],
+            values=values,
+            sigmas=sigmas,
+            each=each,
+        )
 
 
 def _within(value: float, limits: tuple[float, float | None]) -> bool:
     low, high = limits
     return low <= value and (high is None or value <= high)
-
-
-def _between(limits: tuple[float, float | None]) -> str:
-    low, high = limits
-    return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
-
-
-def _lengths(value: float, units: set[str]) -> str:
-    """A reading's noise where readings are lengths (m), turns (rad), or both."""
-    each = {"m": f"{value * 1e3:.2g} mm", "rad": f"{np.rad2deg(value):.2g}°"}
-    return " or ".join(each[unit] for unit in ("m", "rad") if unit in units)
 
 
 def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
@@ -619,6 +596,7 @@ def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
                 found=found,
                 expected=f"the readings with the other sign; {left}",
                 next_step="Turn the sign of this column round, or the axis in the mechanism file",
+                code="readings.sign",
             )
         unit = session.machine.joint_units[doubt.motor]
         scale, shown = SHOWN_UNITS[unit]
@@ -630,6 +608,7 @@ def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
             expected=f"{constant}, or nearly so, less the reading; {left}",
             next_step=f"Turn the motor's direction round where it is set, or write {constant} less"
             " the reading into this column; what is left of the constant is calibrated",
+            code="readings.reversed",
         )
     if doubt.kind == "order":
         one, other = (joints["columns"][k] for k in (doubt.motor, doubt.other))
@@ -639,6 +618,7 @@ def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
             found=found,
             expected=f"the two columns in the other order; {left}",
             next_step="Exchange the two columns, or the motors in the mechanism file",
+            code="readings.exchanged",
         )
     if doubt.kind == "size":
         return InputError(
@@ -647,6 +627,7 @@ def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
             found=f"a board {doubt.size:.4f} times as large, by how far the platform moved",
             expected=f"the size as measured with a ruler over many squares; {left}",
             next_step=f"Multiply square and marker by {doubt.size:.4f}, if a ruler agrees",
+            code="board.size",
         )
     what = "the board was moved on the platform" if doubt.kind == "board moved" else \
         "the camera was moved"  # fmt: skip
@@ -657,12 +638,14 @@ def _error(session: Session, doubt: Doubt, misfit_before: float) -> InputError:
         found=f"{how_far(doubt.moved).removeprefix(', ')}; {left}",
         expected="a board screwed to the platform, and a camera that stands still",
         next_step=f"Calibrate with the configurations before {after}, or with those from it on",
+        code="board.moved" if doubt.kind == "board moved" else "station.moved",
     )
 
 
-def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tuple[bool, str]]:
-    """Whether the platform turns as the mechanism file says, by every station that saw it whole: in
-    doubt or not, and the words. on_platform : (M,) of the mounts.
+def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:
+    """Whether the platform turns as the mechanism file says, by every station that saw it whole.
+
+    on_platform : (M,) of the mounts.
     """
     motion = session.machine.document.motion
     if motion == "spatial" or not len(poses):
@@ -670,22 +653,30 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
     from pkmcal.papers.rotation_axis import rotation_axis
 
     whole = (poses.rows == 6) & on_platform[poses.mount]
-    out: list[tuple[bool, str]] = []
+    out: list[Finding] = []
     for s in np.unique(poses.station[whole]).tolist():
         part = poses.select(whole & (poses.station == s))
-        if len(part) >= FEWEST_POSES:
-            found = rotation_axis(part, motion)
-            # Noise that is stated a little too small is no reason to doubt a mechanism.
-            doubt = not found.tenable and found.chi2 > POOR_MODEL_POSE_SCALE**2 * found.dof
-            said = found.sentence
-            if not (doubt or found.tenable):
-                off, noise = (
-                    np.rad2deg(np.sqrt(np.mean(tilt**2)))
-                    for tilt in (found.tilt, found.expected_tilt)
-                )
-                said = (
-                    f"The boards {BOARDS_TURN_WORDS[found.hypothesis]} but for {off:.3f}°, where"
-                    f" their stated noise alone gives {noise:.3f}°."
-                )
-            out.append((doubt, f"{session.station_names[s]}: {said}"))
+        if len(part) < FEWEST_POSES:
+            continue
+        found = rotation_axis(part, motion)
+        name = session.station_names[s]
+        off, noise = (
+            float(np.rad2deg(np.sqrt(np.mean(tilt**2))))
+            for tilt in (found.tilt, found.expected_tilt)
+        )
+        facts = {
+            "station": name,
+            "motion": found.hypothesis,
+            "off": off,
+            "noise": noise,
+            "chi2": found.chi2,
+            "dof": found.dof,
+        }
+        # Noise that is stated a little too small is no reason to doubt a mechanism.
+        if found.tenable:
+            out.append(note("poses.turning", name, **facts))
+        elif found.chi2 > POOR_MODEL_POSE_SCALE**2 * found.dof:
+            out.append(doubtful("poses.not_turning", name, **facts))
+        else:
+            out.append(note("poses.turning_roughly", name, **facts))
     return out

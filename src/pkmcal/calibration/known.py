@@ -12,6 +12,7 @@ from pkmcal.identify.bundle import MachineTold
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.photographs import Photographs
+from pkmcal.outcome.finding import Finding
 from pkmcal.session.load import Session
 
 
@@ -21,7 +22,7 @@ class KnownScene(NamedTuple):
 
     Of photographs by hand that have told the machine: edges, the silhouettes found in each, by its
     station; told, what they and the drawing know of the machine together; scatter, by how much more
-    or less these edges scatter than each says.
+    or less these edges scatter than each says. findings : notes on places that could not be tested.
     """
 
     machine: Machine
@@ -30,6 +31,7 @@ class KnownScene(NamedTuple):
     edges: Mapping[int, EdgeSet] = MappingProxyType({})
     told: MachineTold | None = None
     scatter: float = 1.0
+    findings: tuple[Finding, ...] = ()
 
     @classmethod
     def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> KnownScene:

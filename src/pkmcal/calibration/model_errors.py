@@ -30,7 +30,7 @@ from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Effect, Measurements
-from pkmcal.wording import amount, joined
+from pkmcal.outcome.finding import Finding, doubtful
 
 CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
 """Distances over which errors of neighbouring poses are alike, in the root mean square distance of
@@ -101,54 +101,23 @@ class ModelError:
 
 UNEVEN_BED = "bed.surface"
 """Code of the component that heights have."""
-SUBJECTS = {
-    "readings.workspace": (
-        "in the readings that vary smoothly over the workspace",
-        "Look for what gives way under load or droops, or measure the platform itself",
-    ),
-    "readings.step": (
-        "in the readings that follow the motors' last step, as backlash and lag do",
-        "Come to every configuration from the same side, and wait before reading",
-    ),
-    "readings.time": (
-        "in the readings that change with time",
-        "Let the machine warm up first, and measure in random order",
-    ),
-    "base.workspace": (
-        "in where the base stands, which moves with the platform",
-        "Clamp the base, or measure it too",
-    ),
-    "station.time": (
-        "in where stations stand, which changes with time",
-        "Fix camera and tracker better, or measure in less time",
-    ),
-    "legs.shape": (
-        "in the legs' shape, which are no straight cylinders",
-        "Measure the tubes' radii at both ends and how straight they are",
-    ),
-}
-"""By component: where the errors are, and what helps."""
 
 
-def sentences(errors: tuple[ModelError, ...]) -> tuple[str, ...]:
-    """For the verdict: one of the bed, one of all other components, the largest by evidence first;
-    none without sure ones.
+def discrepancy_findings(errors: tuple[ModelError, ...]) -> Iterator[Finding]:
+    """A warning for each component, the bed first, then the largest by evidence; none without sure
+    ones.
     """
     if not any(one.sure for one in errors):
-        return ()
-    beds = tuple(uneven_bed(one) for one in errors if one.code == UNEVEN_BED)
-    errors = tuple(one for one in errors if one.code != UNEVEN_BED)
-    if not errors:
-        return beds
-    first = errors[0]
-    parts = [f"{amount(one.scale, one.unit)} {SUBJECTS[one.code][0]}" for one in errors]
-    return (
-        *beds,
-        f"The model leaves out errors of {joined(parts)} (standard deviations). Those of the"
-        " result contain what they may have done: the tool's is"
-        f" {amount(first.tool, 'm')} in place of {amount(first.tool_before, 'm')}."
-        f" {SUBJECTS[first.code][1]}.",
-    )
+        return
+    for one in errors:
+        if one.code == UNEVEN_BED:
+            yield uneven_bed(one)
+    for k, one in enumerate(one for one in errors if one.code != UNEVEN_BED):
+        tool: dict[str, Any] = {}
+        if not k:
+            tool = {"tool_sigma": one.tool, "tool_sigma_before": one.tool_before}
+        yield doubtful(f"discrepancy.{one.code}", sigma=one.scale, unit=one.unit,
+                       log_odds=one.ratio / 2, **tool)  # fmt: skip
 
 
 def explains_heights(errors: tuple[ModelError, ...]) -> bool:
@@ -156,13 +125,14 @@ def explains_heights(errors: tuple[ModelError, ...]) -> bool:
     return any(one.code == UNEVEN_BED and one.sure for one in errors)
 
 
-def uneven_bed(error: ModelError) -> str:
-    """The bed's unevenness in words."""
-    return (
-        f"The bed, or what the model leaves out, is uneven by {amount(error.scale, error.unit)}"
-        f" (standard deviation), varying smoothly over some {amount(error.length or 0.0, 'm')}."
-        " Standard deviations contain what it may have done to the result; its map is in the"
-        " report. Let the firmware probe its mesh once the new values are in."
+def uneven_bed(error: ModelError) -> Finding:
+    """The warning about an uneven bed."""
+    return doubtful(
+        f"discrepancy.{error.code}",
+        sigma=error.scale,
+        unit=error.unit,
+        log_odds=error.ratio / 2,
+        length=error.length,
     )
 
 

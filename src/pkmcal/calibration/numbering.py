@@ -7,6 +7,8 @@ camera's pose by hand tells whether the readings' first leg is the drawing's.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, evenly
@@ -14,6 +16,7 @@ from pkmcal.calibration.recognise import legs_stations
 from pkmcal.geometry.rigid import register
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
@@ -65,26 +68,25 @@ def _alike(machine: Machine, readings: Array, order: Integers) -> bool:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) < limit
 
 
-def numbering_told(session: Session) -> tuple[str, ...]:
-    """A sentence where nothing in a session tells which leg of the drawing is the readings' first.
+def numbering_told(session: Session) -> Iterator[Finding]:
+    """A note where nothing in a session determines which leg of the drawing is the readings' first.
 
     A station's pose by hand does.
     """
     if not legs_stations(session) or any(
         station.T_camera_base is not None for station in session.stations
     ):
-        return ()
+        return
     orders = equal_numberings(session.machine, session.joints)
-    if not orders:
-        return ()
-    names, file = session.document["joints"]["columns"], session.document["joints"]["file"]
-    pose = ""  # which photographs by hand have none of
-    if not all(station.handheld for station in session.stations):
-        pose = ", or give one station its pose by hand, even roughly, which tells"
-    others = " or ".join(names[order[0]] for order in orders)
-    return (
-        f"The drawing is alike from {in_full(len(orders) + 1)} sides: with the legs counted from"
-        f" the column {others} of {file} on, photographs and readings would fit as well, in a"
-        " turned base frame. They tell the order of the legs, not which is the first: make sure"
-        f" that {names[0]} is the drawing's first leg{pose}.",
-    )
+    if orders:
+        names, file = session.document["joints"]["columns"], session.document["joints"]["file"]
+        by_hand = all(station.handheld for station in session.stations)
+        yield note(
+            "readings.first_leg_unknown",
+            file,
+            sides=in_full(len(orders) + 1),
+            columns=[names[order[0]] for order in orders],
+            others=" or ".join(names[order[0]] for order in orders),
+            first=names[0],
+            pose=None if by_hand else "pose",  # which photographs by hand have none of
+        )

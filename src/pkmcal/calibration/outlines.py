@@ -10,7 +10,7 @@ that stands beside the tube.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from pkmcal.identify.score import Score
 from pkmcal.measurements import Departure, Effect, Measurements
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
-from pkmcal.wording import amount
 
 DISTANCE_SAMPLE_EDGES = 4000
 """Edges, spread over all, by which it is told how far away each line is."""
@@ -85,7 +84,7 @@ def outlines(
         j, t = keys[mine[0], 1:3].tolist()
         by = _effect(measurements, number, mine, size)
         name = f"legs[{j + 1}].tubes[{t + 1}]"
-        departure = Departure("tube radius", name, _another_radius(j, t, file), by)
+        departure = Departure("tube.radius", name, _tube(j, t, file=file), by)
         yield Outline(departure, score, value, known)
     z = np.abs(shift) / sigma
     chance = np.where(np.isin(np.arange(len(keys)), told), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
@@ -97,29 +96,16 @@ def outlines(
         j, t, of = int(leg[k]), int(tube[k]), session.station_names[station[k]]
         by = _effect(measurements, number, np.array([k]), size)
         name = f"legs[{j + 1}].tubes[{t + 1}], {of}"
-        departure = Departure("tube edge", name, _one_edge(j, t, of), by)
+        departure = Departure("tube.edge", name, _tube(j, t, station=of), by)
         told_by = estimate.line_shift_sigma[k]
         yield Outline(departure, score, float(shift[k] * size[k]), float(told_by * size[k]))
 
 
-def _another_radius(leg: int, tube: int, file: str) -> Callable[[Array, Array], tuple[str, str]]:
-    return lambda value, sigma: (
-        f"Tube {tube + 1} of leg {leg + 1} is {amount(abs(value[0]), 'm')}"
-        f" {'thicker' if value[0] > 0 else 'thinner'} in radius than {file} says, to"
-        f" {amount(sigma[0], 'm')}",
-        "Measure it with calipers where it is seen, or look for a sleeve, a bellows or a label on"
-        f" it; correct legs[{leg + 1}].tubes[{tube + 1}].radius",
-    )
-
-
-def _one_edge(leg: int, tube: int, station: str) -> Callable[[Array, Array], tuple[str, str]]:
-    return lambda value, sigma: (
-        f"Of tube {tube + 1} of leg {leg + 1}, {station} sees one edge {amount(abs(value[0]), 'm')}"
-        f" {'outside' if value[0] > 0 else 'inside'} the place that all else gives it, to"
-        f" {amount(sigma[0], 'm')}, and not the other",
-        "Look at the tube from there: a ring, a cable or a bright stripe along it may stand for its"
-        " edge; cut the tube (from, to) to its clean part",
-    )
+def _tube(leg: int, tube: int, **more: str) -> Callable[[Array, Array], dict[str, Any]]:
+    """Facts about a tube, numbered from 0."""
+    return lambda value, sigma: {
+        "leg": leg + 1, "tube": tube + 1, "value": value[0], "sigma": sigma[0], **more
+    }  # fmt: skip
 
 
 def _effect(measurements: Measurements, number: Integers, mine: Integers, size: Array) -> Effect:

@@ -16,6 +16,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements
+from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
@@ -30,8 +31,8 @@ MOST_USUAL_MISFIT = 100.0
 configuration stands out."""
 
 
-def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -> Iterator[str]:
-    """A sentence for each configuration that stands against the others and is explained."""
+def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
+    """A warning for each configuration that stands against the others and is explained."""
     whole = (measurements.poses.rows == 6) & measurements.on_platform[measurements.poses.mount]
     which = np.flatnonzero(whole)
     if not which.size:
@@ -79,25 +80,23 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
         if np.count_nonzero(explains) == 1:
             motor = int(np.argmax(explains))
             one = wrong_reading(columns[motor], units[motor], name)
-            what, todo = one.says(value[[motor]], sigma[[motor]])
-            as_in = ""
-            if alike[n].any():
-                row = session.configurations[int(np.argmax(alike[n]))]
-                as_in = f", and so is what configuration {row} reads"
-            yield f"{what}{as_in}; it was outvoted, and the result does not rest on it. {todo}."
+            row = session.configurations[int(np.argmax(alike[n]))] if alike[n].any() else None
+            facts = one.facts(value[[motor]], sigma[[motor]])
+            yield doubtful("readings.outvoted", one.of, **facts, like=row)
         elif alike[n].any():
             yield _misnamed(session, name, session.configurations[int(np.argmax(alike[n]))], False)
 
 
-def _misnamed(session: Session, name: str, other: str, both: bool) -> str:
-    file = session.document["joints"]["file"]
-    where = f"{file}, configuration {listed([name, other] if both else [name])}"
-    shows = f"what was seen in {name} is what the readings of {other} say" + (
-        ", and the other way round" if both else ""
-    )
-    return (
-        f"{where}: {shows}; {'both were' if both else 'it was'} outvoted, and the result does not"
-        " rest on it. Look whether photographs, or rows of the table, bear each other's names."
+def _misnamed(session: Session, name: str, other: str, both: bool) -> Finding:
+    names = [name, other] if both else [name]
+    where = f"{session.document['joints']['file']}, configuration {listed(names)}"
+    return doubtful(
+        "configurations.misnamed",
+        where,
+        configurations=names,
+        configuration=name,
+        other=other,
+        both="yes" if both else "no",
     )
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.identify.bed import bed_by_parameters
-from pkmcal.identify.confirmation import RejectedUnit, Rejections, rejected_units, rejections_of
+from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejections_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.outcome.finding import Finding, doubtful, wrong
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 from pkmcal.wording import count, listed
@@ -22,38 +22,44 @@ from pkmcal.wording import count, listed
 LEAST_CHECKED_SHARE = 0.1
 """Degrees of freedom that a link leaves on average, below which a wrong one goes unnoticed up to
 ``4.13 / sqrt(0.1)``, thirteen, of its standard deviations (Baarda 1968)."""
-MOST_UNITS_NAMED = 6
-"""Units that a sentence names; the report and calibration.json have all."""
 
 
-@dataclass(frozen=True)
-class RejectionWords:
-    """Sentences on rejected units: reasons against the result, and warnings that name them."""
-
-    reasons: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
-def rejections_in_words(
+def rejection_findings(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
     findings: Findings,
     *,
     at_minimum: bool,
-) -> RejectionWords:
-    """What is to be said of the rejected units of an estimate.
+) -> Iterator[Finding]:
+    """Warnings that name the rejected units of an estimate, and a reason where the result rests on
+    a rejection that nothing confirms.
 
     at_minimum : whether the estimate is the joint problem's best, as hypotheses about it need.
     """
     units = rejected_units(measurements, estimate)
-    unchecked = _unchecked_links(measurements, estimate) if at_minimum else ()
+    if at_minimum:
+        yield from _unchecked_links(measurements, estimate)
     if not units:
-        return RejectionWords((), unchecked)
-    warnings = tuple(_naming_sentences(session, measurements, units))
+        return
+    edges = measurements.edges
+    kinds = np.array([_kind(session, k) for k in range(len(session.station_names))])
+    every = kinds[measurements.poses.station].tolist() if len(measurements.poses) else []
+    every += [name for links in measurements.links for name in [_link_name(links)] * len(links)]
+    images = np.unique(np.stack([edges.station, edges.configuration]), axis=1).shape[1]
+    for kind in dict.fromkeys(_kind_of(session, measurements, unit) for unit in units):
+        mine = [unit for unit in units if _kind_of(session, measurements, unit) == kind]
+        names = [_name(session, measurements, unit) for unit in mine]
+        yield doubtful(
+            "rejected.units",
+            listed(names),
+            kind=kind,
+            number=len(names),
+            of=count(images if kind == "image" else every.count(kind), kind),
+            names=names,
+        )
     if not at_minimum:
-        return RejectionWords((), warnings)
-    warnings += unchecked
+        return
     if findings.bed:
         tool, sigma, what = bed_by_parameters(estimate), findings.bed.sigma, "the bed"
     else:
@@ -61,85 +67,43 @@ def rejections_in_words(
         tool, sigma = platform_by_parameters(estimate.machine, used), platform_sigma(estimate)
         what = "the platform"
     found = rejections_of(measurements, estimate, tool)
-    if found.shift <= sigma:
-        return RejectionWords((), warnings)
-    return RejectionWords((_doubt_sentence(session, measurements, found, sigma, what),), warnings)
+    if found.shift > sigma:
+        worst = sorted(found.units, key=lambda unit: -unit.shift)
+        share = [unit for unit in worst if unit.shift**2 * len(worst) >= found.shift**2]
+        names = [
+            f"{_kind_of(session, measurements, u)} {_name(session, measurements, u)}"
+            for u in share or worst[:1]
+        ]
+        yield wrong(
+            "rejected.unconfirmed",
+            listed(names),
+            names=names,
+            what=what,
+            tool_shift=found.shift,
+            sigma=sigma,
+        )
 
 
-def _unchecked_links(measurements: Measurements, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence on links that determine what no other measurement does, so that a wrong one leaves
-    hardly any residual.
+def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
+    """A warning about links that determine what no other measurement does, so that a wrong one
+    leaves hardly any residual.
     """
     s = estimate.statistics
-    if not measurements.n_links or s.dof_links >= LEAST_CHECKED_SHARE * s.n_links:
-        return ()
-    kinds = [measurement_kinds()[links.kind] for links in measurements.links]
-    labels = listed([kind.label for kind in kinds])
-    return (
-        f"Nothing would show that one of the {labels} is wrong: they determine what no other"
-        " measurement does. Measure each of them again, or more of them.",
-    )
+    if measurements.n_links and s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
+        labels = [measurement_kinds()[links.kind].label for links in measurements.links]
+        yield doubtful("links.unchecked", listed(labels), names=labels)
 
 
 def unused_configurations(
     session: Session, estimate: Estimate, held_out: Sequence[int] | Integers
-) -> tuple[str, ...]:
-    """A sentence on the configurations of which nothing was measured, but for those held out."""
+) -> Iterator[Finding]:
+    """A warning about configurations of which nothing was measured, but for those held out."""
     unused = ~estimate.configurations
     unused[np.asarray(held_out, dtype=int)] = False
     names = [session.configurations[k] for k in np.flatnonzero(unused)]
-    if not names:
-        return ()
-    had = "had no usable photograph" if session.stations else "had nothing measured"
-    return (
-        f"{count(len(names), 'configuration')} {had} and did not take part:"
-        f" {listed(names, MOST_UNITS_NAMED)}.",
-    )
-
-
-def _naming_sentences(
-    session: Session, measurements: Measurements, units: Sequence[RejectedUnit]
-) -> list[str]:
-    """A sentence for each kind of unit: how many of how many were rejected, and which."""
-    edges = measurements.edges
-    kinds = np.array([_kind(session, k) for k in range(len(session.station_names))])
-    every = kinds[measurements.poses.station].tolist() if len(measurements.poses) else []
-    every += [name for links in measurements.links for name in [_link_name(links)] * len(links)]
-    images = np.unique(np.stack([edges.station, edges.configuration]), axis=1).shape[1]
-    out: list[str] = []
-    for kind in dict.fromkeys(_kind_of(session, measurements, unit) for unit in units):
-        mine = [unit for unit in units if _kind_of(session, measurements, unit) == kind]
-        number = images if kind == "image" else every.count(kind)
-        names = listed([_name(session, measurements, unit) for unit in mine], MOST_UNITS_NAMED)
-        were = "was" if len(mine) == 1 else "were"
-        out.append(
-            f"{len(mine)} of {count(number, kind)} {were} rejected, for the others put"
-            f" {'it' if len(mine) == 1 else 'them'} elsewhere: {names}."
-        )
-    return out
-
-
-def _doubt_sentence(
-    session: Session, measurements: Measurements, found: Rejections, sigma: float, what: str
-) -> str:
-    """Why a result is not to be used that rests on a rejection."""
-    worst = sorted(found.units, key=lambda unit: -unit.shift)
-    share = [unit for unit in worst if unit.shift**2 * len(worst) >= found.shift**2]
-    names = listed(
-        [
-            f"{_kind_of(session, measurements, u)} {_name(session, measurements, u)}"
-            for u in share or worst[:1]
-        ]
-    )
-    one = len(share) < 2
-    return (
-        f"The other measurements do not confirm that {names} {'is' if one else 'are'} wrong: if"
-        f" {'it is' if one else 'they are'} right, or another one is wrong in"
-        f" {'its' if one else 'their'} place, {what} is {found.shift * 1e3:.2g} mm elsewhere, and"
-        f" the result's own standard deviation is {sigma * 1e3:.2g} mm. Measure"
-        f" {'it' if one else 'these'} again, and more configurations; if"
-        f" {'it stays' if one else 'they stay'}, the drawing's tolerances are too small."
-    )
+    if names:
+        by = "images" if session.stations else "others"
+        yield doubtful("configurations.unused", listed(names), names=names, by=by)
 
 
 def _kind(session: Session, station: int) -> str:

@@ -33,7 +33,8 @@ from pkmcal.observe.repeats import (
     same_edges,
     turns_from_first,
 )
-from pkmcal.outcome import Finding, Level, Part, Row, Table
+from pkmcal.outcome import Part, Row, Table
+from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
@@ -493,40 +494,24 @@ def _mm(value: float) -> str:
     return f"{value * 1e3:.2g} mm" if math.isfinite(value) else "–"
 
 
-_CAUSES = {
-    "camera": "{share:.0%} of it is common to all legs as if the camera moved: fix the camera, and"
-    " release the shutter without touching it.",
-    "platform": "{share:.0%} of it is common to all legs as if the platform moved, and not the"
-    " camera: wait until the machine stands still, with its brakes or drives holding it.",
-    "legs": "{share:.0%} of it is as if each leg moved by itself: they vibrate, or turn in their"
-    " joints between photographs.",
-    "noise": "It is each edge's own, so neither the camera nor the machine moves: sensor noise.",
-}
-
-
 def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
-    """What each station's repeats say, and what more of them would bring."""
-    nothing = "No edge shows in two photographs of one configuration: nothing tells the scatter."
-    found = [_finding(s) for s in stations] or [Finding(Level.DOUBTFUL, nothing)]
+    """What each station's repeats show, and what more of them would bring."""
+    found = [_finding(station) for station in stations] or [doubtful("repeats.none")]
     if stations and all(station.promised < MOSTLY_COMMON for station in stations):
-        text = (
-            "What the repeats have in common, such as shading, is most of an edge's error: more"
-            " repeats will hardly help, more configurations will."
-        )
-        found.append(Finding(Level.NOTE, text))
+        found.append(note("repeats.mostly_common"))
     return tuple(found)
 
 
 def _finding(station: StationScatter) -> Finding:
-    """How large the scatter of a station is and where it comes from, in words."""
-    cause = station.cause
+    """How large the scatter of a station is and where it comes from."""
     share = {"camera": station.camera, "platform": station.platform, "legs": station.legs}
-    text = (
-        f"{station.station}: repeats scatter by {station.shift:.3f} px,"
-        f" {station.promised:.2g} times what each photograph promises."
-        f" {_CAUSES[cause].format(share=share.get(cause, 0.0))}"
+    return finding(
+        f"repeats.by_{station.cause}",
+        Level.DOUBTFUL if station.promised > 1 else Level.NOTE,
+        station.station,
+        station=station.station,
+        scatter=station.shift,
+        scale=station.promised,
+        share=share.get(station.cause, 0.0),
+        taken="yes" if station.promised > 1 else "no",
     )
-    if station.promised > 1:
-        text += " The calibration takes the repeats' scatter for the edges' noise."
-        return Finding(Level.DOUBTFUL, text, station.station)
-    return Finding(Level.NOTE, text, station.station)

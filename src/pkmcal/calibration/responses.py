@@ -24,6 +24,7 @@ from pkmcal.identify.score import Departures
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
 from pkmcal.observe.photographs import Photographs
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -40,10 +41,6 @@ ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
 usual needs no caution."""
 _Camera = tuple[str, Response]
 """A camera's file, and what is usual for the photographs' kind."""
-_WORDS: dict[Response, str] = {
-    "linear": "linear (as sensors count light)",
-    "srgb": "sRGB (as telephones write it)",
-}
 
 
 @dataclass(frozen=True)
@@ -52,12 +49,13 @@ class ResponseTold:
 
     entries : of session.yaml's stations, of one camera. usual : by which their photographs were
     measured at first. gain : of chi2 by the other response, less what there would be to gain by
-    going back.
+    going back; NaN where the test failed, and failure says why.
     """
 
     entries: tuple[str, ...]
     usual: Response
     gain: float
+    failure: str = ""
 
     @property
     def sure(self) -> bool:
@@ -70,24 +68,20 @@ class ResponseTold:
         return OTHER_RESPONSE[self.usual] if self.sure else self.usual
 
     @property
-    def sentence(self) -> str:
-        """For a verdict: a hint where the edges are sure, else a caution."""
-        usual, other = _WORDS[self.usual], _WORDS[OTHER_RESPONSE[self.usual]]
-        of = listed(self.entries)
-        place = f"in session.yaml, under the station{'s' if len(self.entries) > 1 else ''} {of}"
+    def finding(self) -> Finding:
+        """A note where the edges are sure, else a warning."""
+        facts = {
+            "usual": self.usual,
+            "other": OTHER_RESPONSE[self.usual],
+            "stations": self.entries,
+            "log_odds": self.gain / 2,
+        }
+        where = listed(self.entries)
+        if self.failure:
+            return note("image.response_untested", where, **facts, why=self.failure)
         if self.sure:
-            return (
-                f"The levels of the photographs of {of} are {other}, not {usual}, as is usual for"
-                f" such files: so say their edges, at odds of more than"
-                f" {ODDS_FOR_OTHER_RESPONSE:.0f} to 1. They are measured so; write response:"
-                f" {self.response} {place}, and every command knows it."
-            )
-        return (
-            f"The edges do not tell whether the levels of the photographs of {of} are {usual},"
-            f" which is usual for such files and believed here, or {other}; then errors are larger"
-            f" than stated. Write response: linear or response: srgb {place}: a camera's setting"
-            " of gamma tells which, 1 or off is linear."
-        )
+            return note("image.response", where, **facts, odds=ODDS_FOR_OTHER_RESPONSE)
+        return doubtful("image.response_unknown", where, **facts)
 
 
 def overruled(told: Sequence[ResponseTold]) -> dict[str, Response]:
@@ -134,17 +128,26 @@ def told_by_edges(
         ended = bundle(estimate.machine, otherwise, estimate.state)
         before = {camera: edges.select(own[camera]) for camera in every}
         back, _ = _scored(otherwise, ended, before)
-    except PkmcalError:  # nothing, or too little, is found by the other
-        return ()
+    except PkmcalError as error:  # such as too few edges by the other response
+        why = str(error).rstrip(".")
+        return tuple(
+            ResponseTold(_entries(session, usual[camera]), camera[1], np.nan, why)
+            for camera in usual
+        )
     told = [
         ResponseTold(
-            tuple(dict.fromkeys(session.stations[p.station].entry for p in usual[camera])),
+            _entries(session, usual[camera]),
             camera[1],
             there[camera] - back[camera],
         )
         for camera in every
     ]
     return tuple(one for one in told if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+
+
+def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:
+    """Their entries in session.yaml."""
+    return tuple(dict.fromkeys(session.stations[p.station].entry for p in photographs))
 
 
 def _doubted(

@@ -167,7 +167,7 @@ def calibration_document(
     document = {
         FORMAT_KEY: CALIBRATION_FORMAT,
         "conventions": CALIBRATION_CONVENTIONS,
-        "verdict": asdict(calibration.verdict),
+        "verdict": calibration.verdict.document(),
         "method": calibration.method,
         "model": calibration.session.model,
         "seed": calibration.seed,

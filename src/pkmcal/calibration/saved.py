@@ -33,6 +33,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Statistics
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level
 from pkmcal.wording import listed
 
 SAVED_NUMBER_ROUNDING = 1e-9
@@ -321,9 +322,27 @@ class _Session(_Part):
     stations: dict[str, _SessionStation] | None = None
 
 
+class _Finding(_Part):
+    code: str
+    level: Level
+    text: str
+    subject: str = ""
+    next_step: str = ""
+    facts: dict[str, Any] = Field(default_factory=dict)
+
+
+class _Verdict(_Part):
+    usable: bool
+    headline: str
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    findings: tuple[_Finding, ...] = ()
+
+
 class _Saved(_Part):
     pkmcal_calibration: Literal[1] = Field(description="the file's version, 1")
-    verdict: Verdict
+    verdict: _Verdict
     method: str
     seed: int
     gauge: str
@@ -372,7 +391,7 @@ def load(source: Path | str) -> SavedCalibration:
         gauge=saved.gauge,
         method=saved.method,
         seed=saved.seed,
-        verdict=saved.verdict,
+        verdict=_verdict(saved.verdict),
         stations=tuple(
             SavedStation(
                 station.name,
@@ -394,6 +413,30 @@ def load(source: Path | str) -> SavedCalibration:
 def _deviations(values: Sigma3) -> Array:
     """Standard deviations (3,), infinite where the file has none."""
     return np.array([np.inf if value is None else value for value in values])
+
+
+def _verdict(saved: _Verdict) -> Verdict:
+    """The verdict in its own words; where a file is from before findings had codes, without."""
+    coded = {(one.level, one.text): one for one in saved.findings}
+    findings: list[Finding] = []
+    for level, texts in (
+        (Level.WRONG, saved.reasons),
+        (Level.DOUBTFUL, saved.warnings),
+        (Level.NOTE, saved.advice),
+    ):
+        for text in texts:
+            one = coded.get((level, text)) or _Finding(code="", level=level, text=text)
+            findings.append(
+                Finding(
+                    one.code,
+                    level,
+                    one.facts,
+                    one.subject,
+                    saved_text=text,
+                    saved_next_step=one.next_step,
+                )
+            )
+    return Verdict(saved.usable, saved.headline, tuple(findings))
 
 
 def _mechanism(saved: _Saved) -> MechanismDocument:

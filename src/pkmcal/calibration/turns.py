@@ -50,6 +50,7 @@ from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
 from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
+from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
 from pkmcal.solver.ranks import RANK_TOLERANCE
 from pkmcal.wording import listed
@@ -106,6 +107,7 @@ class Turns(NamedTuple):
     photographs : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
     edges, see :class:`KnownScene`. start : from where the estimate was sought. change : by how
     many of its deviations the last look has moved the machine, as SETTLED_MACHINE_CHANGE has it.
+    failures : why passes from machines as likely gave no estimate.
     """
 
     observation: Observation
@@ -118,17 +120,18 @@ class Turns(NamedTuple):
     scatter: float = 1.0
     start: State | None = None
     change: float = 0.0
+    failures: tuple[str, ...] = ()
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """Why the result is not to be used, if it did not settle."""
+    def doubts(self) -> tuple[Finding, ...]:
+        """A reason where the machine did not settle, and a note where passes failed."""
+        if self.failures:
+            why = self.failures[0].rstrip(".")
+            failed = note("edges.passes_failed", number=len(self.failures), of=LOOKS_AGAIN, why=why)
+            return (*self._replace(failures=()).doubts, failed)
         if self.change < SETTLED_MACHINE_CHANGE:
             return ()
-        return (
-            f"The machine does not settle: the last of {MOST_LOOKS_ASTRAY} looks at its edges still"
-            f" moved it by {self.change:.1f} of its standard deviations. A station's pose by hand,"
-            " or a drawing that is nearer to the machine, gives it a better start.",
-        )
+        return (wrong("estimate.unsettled", passes=MOST_LOOKS_ASTRAY, change=self.change),)
 
 
 def take_turns(
@@ -236,6 +239,7 @@ def looked_again(
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
     found: list[Array] = []
+    failures: list[str] = []
     for number, drawn in enumerate(_as_likely(session, turns.measurements, estimate, rng)):
         told(f"Looking by a machine as likely: {number + 1} of {LOOKS_AGAIN}", 0.87)
         cameras = turns.cameras.moved(drawn)
@@ -244,7 +248,8 @@ def looked_again(
             looks = _looked(session, photographs, drawn, turns.blur, turns.scatter, cameras.active)
             measurements = measurements_of(session, seen.boards, _edges(looks), cameras)
             ended = bundle(session.machine, measurements, _at_cameras(drawn.state, cameras))
-        except (PkmcalError, np.linalg.LinAlgError):
+        except (PkmcalError, np.linalg.LinAlgError) as error:
+            failures.append(str(error))
             continue
         found.append(ended.state.theta)
     variance = 1.0  # as much again as noise, where hardly a look ends
@@ -253,7 +258,7 @@ def looked_again(
         variance = _variance(apart, turns.measurements, estimate) * len(found) / (len(found) - 1)
     measurements = replace(turns.measurements, look_variance=variance)
     again = bundle(session.machine, measurements, turns.start)
-    return turns._replace(measurements=measurements, estimate=again)
+    return turns._replace(measurements=measurements, estimate=again, failures=tuple(failures))
 
 
 def _as_likely(

@@ -23,8 +23,8 @@ from pkmcal.cameras import Camera
 from pkmcal.cameras.files import written_camera
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.score import Departures
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.session.load import Session
-from pkmcal.wording import listed
 
 ODDS_FOR_UPSIDE_DOWN = 1000.0
 """Odds from which the edges overrule the file."""
@@ -58,23 +58,22 @@ class UpsideDown:
         return self.log_odds > np.log(ODDS_FOR_UPSIDE_DOWN)
 
     @property
-    def sentence(self) -> str:
-        """For a verdict: a hint where the edges are sure, else a caution."""
+    def finding(self) -> Finding:
+        """A note where the edges are sure, else a warning."""
+        facts = {"file": self.file, "stations": self.entries, "log_odds": self.log_odds}
         if not self.sure:
-            return (
-                f"The photographs of {listed(self.entries)} may be upside down against {self.file}:"
-                f" so say their edges, at odds of {np.exp(self.log_odds):.0f} to 1, too few to be"
-                " believed. They are measured as they are; if it is so, errors are larger than"
-                " stated. Hold one beside the machine: if a program has turned them by half, turn"
-                " them back."
+            return doubtful(
+                "image.perhaps_upside_down", self.file, **facts, odds=float(np.exp(self.log_odds))
             )
-        centre = ", ".join(f"{value:.6g}" for value in self.camera.document()["center"])
-        return (
-            f"The photographs of {listed(self.entries)} are upside down against {self.file}: so say"
-            f" their edges, at odds of more than {ODDS_FOR_UPSIDE_DOWN:.0f} to 1. They are measured"
-            f" by the same camera turned by half, whose centre is at [{centre}]. Copy"
-            f" {written_camera(self.file)} from the result's folder to the session's and name it in"
-            f" session.yaml in the place of {self.file}, and every command knows it."
+        x, y = self.camera.document()["center"]
+        return note(
+            "image.upside_down",
+            self.file,
+            **facts,
+            odds=ODDS_FOR_UPSIDE_DOWN,
+            centre_x=x,
+            centre_y=y,
+            written=written_camera(self.file),
         )
 
 

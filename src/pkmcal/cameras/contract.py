@@ -11,9 +11,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -73,18 +74,14 @@ class LensDeparture(NamedTuple):
     """How a camera may be another than its file says, by k numbers.
 
     columns : (n, k) change of its parameters by them. usual : their standard deviation where nobody
-    calibrated the camera with care. says : what to say of them, (k,), and of their deviations.
+    calibrated the camera with care. facts : of its finding, beside the estimates. code : the last
+    part of the finding's.
     """
 
-    kind: str
+    code: str
     columns: Array
     usual: float
-    says: Callable[[Array, Array], str]
-
-
-def _pixels(value: float, sigma: float) -> str:
-    """A length in an image, in words where the data do not determine it."""
-    return f"{value:+.1f} ± {sigma:.1f} px" if np.isfinite(sigma) else "an unknown number of pixels"
+    facts: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -190,41 +187,14 @@ class Camera(ABC):
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
         return (
-            LensDeparture(
-                "focal length",
-                self.focal_part[:, None],
-                USUAL_FOCAL,
-                lambda v, s: (
-                    f"focal lengths fit that are {abs(v[0]):.2%} ± {s[0]:.2%}"
-                    f" {'longer' if v[0] > 0 else 'shorter'}"
-                ),
-            ),
-            LensDeparture(
-                "pixel aspect",
-                self.aspect_part[:, None],
-                USUAL_ASPECT,
-                lambda v, s: (
-                    f"fx / fy fits that is {abs(v[0]):.2%} ± {s[0]:.2%}"
-                    f" {'larger' if v[0] > 0 else 'smaller'}"
-                ),
-            ),
-            LensDeparture(
-                "picture centre",
-                eye[:, 2:4],
-                USUAL_CENTRE * self.image_size[0],
-                lambda v, s: (
-                    f"a centre fits that is {_pixels(v[0], s[0])} in x and {_pixels(v[1], s[1])} in"
-                    " y beside its own"
-                ),
-            ),
+            LensDeparture("focal", self.focal_part[:, None], USUAL_FOCAL),
+            LensDeparture("aspect", self.aspect_part[:, None], USUAL_ASPECT),
+            LensDeparture("centre", eye[:, 2:4], USUAL_CENTRE * self.image_size[0]),
             LensDeparture(
                 "distortion",
                 eye[:, lens : lens + 1],
                 USUAL_DISTORTION,
-                # edges were looked for with the lens as stated: the truth is farther away
-                lambda v, _: (
-                    f"a distortion {name} of some {before + v[0]:.1g} fits, not of {before:.3g}"
-                ),
+                {"coefficient": name, "stated": before},
             ),
         )
 

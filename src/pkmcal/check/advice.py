@@ -7,6 +7,7 @@ lost and what is the matter with them, and from where the stations look.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,10 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_REACH_INSIDE, SATURATED_GREY_LEVEL
 from pkmcal.observe.quality import BLACK_GREY_LEVEL
 from pkmcal.outcome import Figure, Level, Part, Row, Table
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.planning.first import EdgesOf
 from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
-from pkmcal.wording import brief, capital, count, listed, named
+from pkmcal.wording import brief, count, listed, named
 
 ADVICE_WORTH_FACTOR = 1.2
 """Factor on a standard deviation from which its cause is worth advice: as much as half as many
@@ -41,8 +43,8 @@ ONE_LEGEND = (
 )
 
 
-def advice(look: Look, forecast: Forecast | None) -> tuple[str, ...]:
-    """Sentences, the most useful first."""
+def advice(look: Look, forecast: Forecast | None) -> tuple[Finding, ...]:
+    """Advice, the most useful first."""
     out = [*_second_place(forecast), *_from_one_side(look), *_hidden(look), *_slim(look)]
     if forecast is not None:
         for station, edges in zip(look.stations, forecast.edges, strict=True):
@@ -50,19 +52,21 @@ def advice(look: Look, forecast: Forecast | None) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _second_place(forecast: Forecast | None) -> list[str]:
+def _second_place(forecast: Forecast | None) -> list[Finding]:
     """Whether another place would do more than more photographs from this one."""
     if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
         return []
     return [
-        f"Take half of the photographs from a second place, a quarter round the machine:"
-        f" {forecast.photographs} in all then tell the platform's position to"
-        f" {brief(forecast.second * 1e3)} mm, not {brief(forecast.position * 1e3)} mm. A camera"
-        " sees badly along its line of sight, and how shading falls on one side is told by another."
+        note(
+            "images.second_place",
+            number=forecast.photographs,
+            tool_sigma=forecast.second,
+            tool_sigma_before=forecast.position,
+        )
     ]
 
 
-def _from_one_side(look: Look) -> list[str]:
+def _from_one_side(look: Look) -> list[Finding]:
     """Whether the stations look along nearly the same line.
 
     What one camera sees badly, along its line of sight, another sees by the sine of the angle
@@ -82,14 +86,10 @@ def _from_one_side(look: Look) -> list[str]:
     ):
         return []
     angle = math.degrees(math.asin(float(sine.max())))
-    return [
-        f"The stations see the machine along lines that are {angle:.0f}° apart at most: what one"
-        " sees badly, along its line of sight, the others hardly see better. Put one of them a"
-        " quarter round the machine."
-    ]
+    return [note("images.one_side", degrees=angle)]
 
 
-def _hidden(look: Look) -> list[str]:
+def _hidden(look: Look) -> list[Finding]:
     """Legs that no station sees well."""
     seen = [station for station in look.stations if station.quality is not None]
     if not seen or len(seen) < len(look.stations):
@@ -97,26 +97,28 @@ def _hidden(look: Look) -> list[str]:
     hidden = np.stack([s.quality.hidden.mean(axis=0) for s in seen if s.quality is not None])
     best = np.argmin(np.nan_to_num(hidden, nan=np.inf), axis=0)
     least = hidden[best, np.arange(hidden.shape[1])]
-    out: list[str] = []
+    out: list[Finding] = []
     for s, station in enumerate(seen):
         bad = np.flatnonzero((least > INFORMATION_LOST_SHARE) & (best == s))
         if not bad.size:
             continue
-        share = f"{least[bad].mean():.0%}"
-        where = f" (best from {station.name})" if len(seen) > 1 else ""
         out.append(
-            f"{capital(named(bad))} {'is' if bad.size == 1 else 'are'} hidden for"
-            f" {share}{where}, behind other legs or outside the photograph. Move the camera aside"
-            " until the legs stand one beside the other, or back, or add a place that sees"
-            f" {'it' if bad.size == 1 else 'them'}."
+            note(
+                "images.hidden",
+                named(bad),
+                legs=named(bad),
+                number=bad.size,
+                share=float(least[bad].mean()),
+                station=station.name if len(seen) > 1 else None,
+            )
         )
     return out
 
 
-def _slim(look: Look) -> list[str]:
+def _slim(look: Look) -> list[Finding]:
     """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
     tubes, least = tubes_of(look.session.machine), 2 * PROFILE_REACH_INSIDE
-    out: list[str] = []
+    out: list[Finding] = []
     for station in look.stations:
         if station.quality is None:
             continue
@@ -128,16 +130,12 @@ def _slim(look: Look) -> list[str]:
         ]
         slim = [f"tube {tube + 1} {brief(px)} px" for tube, px in usual if px < least]
         if slim:
-            out.append(
-                f"{station.name}: legs are slim in the photographs, {listed(slim)} wide. Below"
-                f" {least:.0f} px what is measured of one edge reaches the other: something bright"
-                " between moves both alike, and the result is off by more than stated. Take the"
-                " camera nearer, or more pixels, or a longer lens."
-            )
+            at = {"station": station.name, "tubes": slim, "least": least}
+            out.append(note("images.slim", station.name, **at))
     return out
 
 
-def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
+def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[Finding]:
     """Why edges that ought to be seen are lost, where these are many."""
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.found
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
@@ -155,33 +153,20 @@ def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(known & of)) for name, of in kinds.items()}
     kind = max(number, key=lambda name: number[name])
-    said = (
-        f"{station.name}: {lost.sum() / expected:.0%} of the edges that ought to be seen are"
-        " lost, or disagree with the rest."
-    )
-    faint = contrast[known & kinds["faint"]]
-    why = {
-        "white": "Most of these lie beside white: expose more shortly, with softer light.",
-        "black": "Most of these lie in the dark: expose longer, or bring light.",
-        "faint": (
-            f"Most of these stand out by some {np.median(faint) if faint.size else 0:.0f} grey"
-            f" levels, the others by {usual:.0f}: hang a plain {_sheet(station)} sheet behind the"
-            " machine."
-        ),
-        "clear": (
-            "Most of these stand out as well as the others, so another line lies beside them: a"
-            " highlight, a shadow, a cable, a part on the leg. Soften the light (against a wall or"
-            " the ceiling), clear what is behind, and let tubes in the mechanism file be the clean"
-            " part of each leg only."
-        ),
-    }
     tubes = tubes_of(look.session.machine)
     by_leg = [int((lost[:, tubes.leg == j]).sum()) for j in range(look.session.machine.n_legs)]
     worst = np.flatnonzero(np.array(by_leg) > 2 * lost.sum() / len(by_leg))
-    where = f" {capital(named(worst))} lose most." if worst.size > 1 else ""
-    if worst.size == 1:
-        where = f" {capital(named(worst))} loses most."
-    return [f"{said} {why[kind]}{where}"]
+    at: dict[str, Any] = {
+        "station": station.name,
+        "share": float(lost.sum() / expected),
+        "legs": named(worst) if worst.size else None,
+        "number": worst.size,
+    }
+    if kind == "faint":
+        faint = contrast[known & kinds["faint"]]
+        at |= {"contrast": float(np.median(faint)) if faint.size else 0.0, "usual": usual}
+        at["sheet"] = _sheet(station)
+    return [note(f"images.lost_{kind}", station.name, **at)]
 
 
 def _sheet(station: StationLook) -> str:

@@ -25,7 +25,7 @@ from pkmcal.calibration.departures import model_violations
 from pkmcal.calibration.doubts import turning
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.calibration.known import SeenSession
-from pkmcal.calibration.model_errors import explains_heights, sentences
+from pkmcal.calibration.model_errors import discrepancy_findings, explains_heights
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
     board_images,
@@ -54,7 +54,7 @@ from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
 from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
-from pkmcal.outcome import Finding, Level, doubtful, note, wrong
+from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
@@ -83,12 +83,12 @@ def check_session(
 def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     """:func:`check_session`, step by step."""
     told("Reading the session", 0.0)
-    findings = [doubtful(text) for text in untouched_files(folder)]
+    findings = [*untouched_files(folder)]
     try:
         session = load_session(folder)
     except PkmcalError as error:
-        return SessionCheck(str(folder), (wrong(error), *findings))
-    findings += [note(text) for text in session.warnings] + _workspace(session)
+        return SessionCheck(str(folder), (of_error(error), *findings))
+    findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
     told("Reading photographs", 0.1)
     photographs, broken = _decoded(session)
     told("Recognising the machine", 0.4)
@@ -97,10 +97,15 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
-    findings += [note(text) for text in numbering_told(session)]
+    findings += numbering_told(session)
     told("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
-    expected = forecast(seen.look) if seen.look and not by_hand else None
+    expected = None
+    if seen.look and not by_hand:
+        try:
+            expected = forecast(seen.look)
+        except (PkmcalError, np.linalg.LinAlgError) as error:
+            findings.append(note("images.no_forecast", why=str(error).rstrip(".")))
     for station in stations:
         findings += station_findings(station, session.machine.n_legs)
     return SessionCheck(
@@ -126,7 +131,7 @@ def _workspace(session: Session) -> list[Finding]:
     try:
         poses_in(session.machine.limits(), session.workspace, 1)
     except PkmcalError as error:
-        return [doubtful(str(error.located("session.yaml, workspace")))]
+        return [of_error(error.located("session.yaml, workspace"), Level.DOUBTFUL)]
     return []
 
 
@@ -150,18 +155,15 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
             except InputError as error:
                 broken += 1
                 if broken <= BROKEN_PHOTOGRAPHS_NAMED:
-                    findings.append(wrong(error, station.name))
+                    findings.append(of_error(error, station=station.name))
                 continue
             if image.size <= room:
                 kept[len(rows)], room = image, room - image.size
             rows.append(photo.configuration)
             files.append((photo.path, label))
         if broken > BROKEN_PHOTOGRAPHS_NAMED:
-            findings.append(
-                wrong(
-                    _more_broken(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED), station.name
-                )
-            )
+            more = _more_broken(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
+            findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], kept)  # fmt: skip
@@ -205,25 +207,16 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
             first = session.machine.inverse(poses[0])
         modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
-        return _Motion(None, math.nan, 0, (wrong(error),))
+        return _Motion(None, math.nan, 0, (of_error(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(found.singularity < NEAR_SINGULAR)]
     if weak:
-        findings.append(
-            doubtful(
-                f"Near a singular pose in configuration {listed(weak)}: there the readings hardly"
-                " say where the platform is. Leave them out.",
-            )
-        )
+        findings.append(doubtful("configurations.singular_readings", listed(weak), names=weak))
     turns = np.linalg.norm(pose_difference(modes, poses[0])[:, :3], axis=-1)
     if np.any((turns > 1e-3) & (turns < OTHER_MODE)):
-        findings.append(
-            doubtful(
-                f"At configuration {session.configurations[0]} the same readings allow another"
-                f" pose, turned by only {np.rad2deg(turns[turns > 1e-3].min()):.0f} degrees."
-                " Give home: {position: ...} in the mechanism file, near the machine's real pose.",
-            )
-        )
+        turn = float(np.rad2deg(turns[turns > 1e-3].min()))
+        first_name = session.configurations[0]
+        findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
     return _Motion(poses, float(found.singularity.min()), len(modes), tuple(findings))
 
 
@@ -256,7 +249,7 @@ def _observed(
     try:
         check_observable(session)
     except InputError as error:
-        return _Observed(unlooked(), (wrong(error),))
+        return _Observed(unlooked(), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
         return _Observed(unlooked(), ())
     # Of photographs that are broken is told already.
@@ -286,12 +279,10 @@ def _observed(
         *([_refused(settled)] if isinstance(settled, PkmcalError) else []),
         *boards.findings,
         *turns,
-        *(doubtful(one.sentence, one.station.name) for one in rejected),
+        *(one.finding for one in rejected),
     ]
     if isinstance(settled, Settled):
-        findings += [
-            note(one.sentence) if one.sure else doubtful(one.sentence) for one in settled.turned
-        ]
+        findings += [*(one.finding for one in settled.turned), *settled.findings]
         findings += _verdict_of_poses(settled)
     stations = [  # as it is known of one that observes no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
@@ -332,8 +323,7 @@ def _refused(error: PkmcalError) -> Finding:
     """Why `calibrate` gives no result, as it says so: wrong where the session is at fault, doubtful
     where these data tell too little.
     """
-    found = wrong(error)
-    return found if error.exit_code > 1 else replace(found, level=Level.DOUBTFUL)
+    return of_error(error, Level.WRONG if error.exit_code > 1 else Level.DOUBTFUL)
 
 
 def _found_places(
@@ -414,7 +404,7 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
     try:
         board = board_of(session)
     except InputError as error:
-        return BoardsCheck(findings=(wrong(error),))
+        return BoardsCheck(findings=(of_error(error),))
     if board is None:
         return BoardsCheck()
     found: dict[int, StationBoard] = {}
@@ -424,7 +414,7 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
         try:
             found[number] = station_board(session, board, number, images[number])
         except InputError as error:
-            findings.append(wrong(error, station.name))
+            findings.append(of_error(error, station=station.name))
     checks = {number: _board_check(one) for number, one in found.items()}
     for number, check in checks.items():
         findings += board_findings(session, number, check)
@@ -481,12 +471,9 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
         return []
     try:
         measurements = measurements_of(session, boards)
-        turns = turning(session, measurements.poses, measurements.on_platform)
-        return [doubtful(text) if bad else note(text) for bad, text in turns]
-    except InputError as error:
-        return [wrong(error)]
+        return turning(session, measurements.poses, measurements.on_platform)
     except PkmcalError as error:
-        return [doubtful(str(error))]
+        return [_refused(error)]
 
 
 def _verdict_of_poses(settled: Settled) -> list[Finding]:
@@ -507,8 +494,8 @@ def _verdict_of_heights(settled: Settled) -> list[Finding]:
         as_ended(turns.measurements, turns.estimate),
     )
     return [
-        *(doubtful(one.sentence) for one in found.departures),
-        *(doubtful(text) for text in sentences(found.errors)),
+        *(replace(one.finding, level=Level.DOUBTFUL) for one in found.departures),
+        *discrepancy_findings(found.errors),
         *([] if explains_heights(found.errors) else _unexplained_poses(settled)),
     ]
 
@@ -518,7 +505,7 @@ def _unexplained_poses(settled: Settled) -> list[Finding]:
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []
-    better = min(richer, key=lambda model: model.scale, default=None)
-    told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""
-    text = f"The machine explains the measured poses only to {scale:.1f} times their noise.{told}"
-    return [doubtful(text)]
+    fits = (model for model in richer if not model.failure)
+    better = min(fits, key=lambda model: model.scale, default=None)
+    model = {"model": better and better.name, "model_scale": better and better.scale}
+    return [doubtful("poses.explained", scale=scale, **model)]

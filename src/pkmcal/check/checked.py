@@ -10,7 +10,7 @@ from typing import Any
 from pkmcal.check.forecast import Forecast
 from pkmcal.check.look import Look
 from pkmcal.files import json_value
-from pkmcal.outcome import Finding, Level, first_error
+from pkmcal.outcome.finding import Finding, Level, first_error
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class SessionCheck:
     singularity: float = math.nan
     assemblies: int = 0
     forecast: Forecast | None = None
-    advice: tuple[str, ...] = ()
+    advice: tuple[Finding, ...] = ()
     look: Look | None = None
 
     @property
@@ -99,9 +99,10 @@ class SessionCheck:
     def as_dict(self) -> dict[str, Any]:
         """Everything under its name, for ``--json``, and the first error as every command's."""
         seen = self.forecast and replace(self.forecast, edges=())
-        out = json_value(asdict(replace(self, look=None, forecast=seen, findings=())))
+        out = json_value(asdict(replace(self, look=None, forecast=seen, findings=(), advice=())))
         out.pop("look")
-        out["findings"] = [finding.document() for finding in self.findings]
+        out["findings"] = [finding.document() for finding in (*self.findings, *self.advice)]
+        out["advice"] = [finding.text for finding in self.advice]
         if self.forecast:
             out["forecast"].pop("edges")
         return first_error(self.findings) | out

@@ -16,7 +16,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, numbered
 from pkmcal.check.look import Look
-from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
@@ -77,26 +76,24 @@ class Forecast:
 
 
 def forecast(look: Look, photographs: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
-    """The forecast from the first photographs; None where these do not carry one.
+    """The forecast from the first photographs; None where the machine was not recognised in all.
 
-    By the legs alone, whatever boards and trackers say besides.
+    By the legs alone, whatever boards and trackers say besides. Raises a `PkmcalError` or a
+    `LinAlgError` where these photographs do not carry one.
     """
     machine, stations = look.session.machine, look.stations
     whole = bool(stations) and all(station.recognised for station in stations)
     # where hinges turn is not known where nothing was measured
     if not whole or machine.layout.n_internal:
         return None
-    try:
-        first = first_edges(
-            look.session,
-            [station.photographs for station in stations],
-            look.measured,
-            np.stack([station.found for station in stations]),
-            look.poses,
-        )
-        capture = _planned(look, first, photographs)
-    except (PkmcalError, np.linalg.LinAlgError):
-        return None  # `calibrate` would tell; a forecast is no finding
+    first = first_edges(
+        look.session,
+        [station.photographs for station in stations],
+        look.measured,
+        np.stack([station.found for station in stations]),
+        look.poses,
+    )
+    capture = _planned(look, first, photographs)
     told = _told(capture)
     second = np.nan
     one = stations[0].photographs

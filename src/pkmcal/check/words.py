@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,12 @@ from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
-from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
-from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, doubtful, note
+from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.outcome import Mark, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import brief, count, listed
+from pkmcal.wording import count, listed
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
@@ -50,79 +52,54 @@ KINEMATICS_SENTENCE = (
 
 
 def link_findings(session: Session, poses: Array | None) -> list[Finding]:
-    """How far what links configurations is from the nominal machine, a sentence for each kind.
+    """How far what links configurations is from the nominal machine, a note for each kind.
 
     poses : T_base_platform (K, 4, 4) by the nominal machine, None where it has none.
     """
     out: list[Finding] = []
     for links in session.links:
         kind = measurement_kinds()[links.kind]
-        joined = count(len(np.unique(links.configuration)), "configuration")
-        text = f"{links.label}: {count(len(links), kind.one)} between {joined}"
+        off: dict[str, float] = {}
         if poses is not None:
             first, second = (poses[links.configuration[:, k]][None] for k in (0, 1))
             still = np.broadcast_to(np.eye(4), (1, len(links), 4, 4))
-            off = links.rows(first, second, still).value[0] * links.sigma
-            unit, factor = DISPLAY_UNITS[kind.unit]
-            rms = float(np.sqrt(np.mean(off**2))) * factor
-            text += (
-                f"; by the readings and the drawing they are {brief(rms)} {unit} off (root mean"
-                " square)"
-            )
-        out.append(note(f"{text}."))
+            rows = links.rows(first, second, still).value[0] * links.sigma
+            off["rms"] = float(np.sqrt(np.mean(rows**2)))
+        joined = len(np.unique(links.configuration))
+        out.append(
+            note("session.links", links.label, links=count(len(links), kind.one), number=joined,
+                 unit=kind.unit, **off)
+        )  # fmt: skip
     return out
 
 
 def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
     """What is doubtful about a station's photographs, of a machine of so many legs."""
-    texts: list[str] = []
+    found: list[Finding] = []
+    at = {"subject": station.name, "station": station.name}
+    where = "legs" if station.recognised else "pictures"
     if station.saturated > OVEREXPOSED_PIXEL_SHARE:
-        where = "the legs" if station.recognised else "the pictures"
-        texts.append(
-            f"{station.saturated:.0%} of {where} are overexposed: edges vanish in white. Take the"
-            " photographs again with a shorter exposure."
-        )
+        found.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
     if station.black > TOO_DARK:
-        where = "the legs" if station.recognised else "the pictures"
-        texts.append(
-            f"{station.black:.0%} of {where} are black. Take the photographs again with a longer"
-            " exposure, or more light."
-        )
+        found.append(doubtful("images.black", **at, share=station.black, where=where))
     if station.blur > BLUR_STILL_MEASURED:
-        texts.append(
-            f"The edges are blurred over {station.blur:.1f} px. Focus on the legs, close the"
-            " aperture, and wait until the machine stands still."
-        )
+        found.append(doubtful("images.blurred", **at, blur=station.blur))
     if station.recognised and station.legs < FEW_LEGS * n_legs:
-        texts.append(
-            f"Only {station.legs:.1f} of {n_legs} legs are found in a photograph on average."
-            " Move the camera back or aside, so that it sees the legs one beside the other."
-        )
-    return [doubtful(f"{station.name}: {t}", station.name) for t in texts]
+        found.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
+    return found
 
 
 def board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
     """What is doubtful about the board in a station's photographs; number : from 0."""
-    name = session.stations[number].name
-    bad: list[str] = []
+    station = session.stations[number]
+    at = {"subject": station.name, "station": station.name}
+    found: list[Finding] = []
     if check.rms > POOR_CORNERS:
-        bad.append(
-            f"The board's corners lie {check.rms:.2g} px off their places, rms; a flat board, a"
-            " sharp photograph and the right camera file leave a tenth of a pixel."
-        )
+        found.append(doubtful("board.corners_off", **at, rms=check.rms))
     if check.unseen:
-        bad.append(
-            f"{check.unseen.capitalize()} of the board's corners is in no photograph: does the"
-            " board have as many squares as its file says?"
-        )
-    found = [doubtful(f"{name}: {text}", name) for text in bad]
-    photographs = len(session.stations[number].photographs)
-    if session.board_body == "base" and check.found == 1 and photographs > 1:
-        alone = (
-            f"{name}: Only one photograph shows the board on the base, so nobody can tell whether"
-            " it, or the camera, stood still."
-        )
-        found.append(note(alone, name))
+        found.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
+    if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
+        found.append(note("board.seen_once", **at))
     return found
 
 
@@ -133,21 +110,12 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
         return findings
     crowded = [joint for joint in joints if joint.used < LITTLE_USED]
     if crowded:
-        findings.append(
-            note(
-                f"{listed([joint.name for joint in crowded])} used little of the range (down to"
-                f" {min(joint.used for joint in crowded):.0%}): readings near both ends of it"
-                " halve the standard deviations of the offsets.",
-            )
-        )
+        names = [joint.name for joint in crowded]
+        least = min(joint.used for joint in crowded)
+        findings.append(note("readings.crowded", listed(names), columns=names, share=least))
     count = len(session.configurations)
     if count < FEW_CONFIGURATIONS:
-        findings.append(
-            note(
-                f"There are only {count} configurations: standard deviations will be large and"
-                " mistakes hard to notice. 15 or more are usual.",
-            )
-        )
+        findings.append(note("configurations.too_few", number=count))
     return findings + _poses_of_many_names(session)
 
 
@@ -160,39 +128,29 @@ def _poses_of_many_names(session: Session) -> list[Finding]:
     alike = [
         session.configurations[k] for k in np.flatnonzero(owner == first[np.argmax(names > 1)])
     ]
-    others = ", and so on" if np.sum(names > 1) > 1 else ""
-    told = [
-        f"{len(owner)} configurations are of {len(first)} poses: the readings of"
-        f" {listed(alike)} are equal within their noise{others}. --holdout and --regions leave"
-        " those of a pose out together."
-    ]
+    facts: dict[str, Any] = {
+        "number": len(owner),
+        "poses": len(first),
+        "names": alike,
+        "others": ", and so on" if np.sum(names > 1) > 1 else "",
+    }
     again = {
         station.entry or station.name
         for station in session.stations
         if len({owner[photo.configuration] for photo in station.photographs})
         < len({photo.configuration for photo in station.photographs})
     }
-    if session.stations:  # a tracker's table has one row a configuration
-        told.append(
-            "Where the machine moved away between them and came back, all is well. Where it stood"
-            " still, tell that it is one pose:"
-        )
-    if again:
-        entry = min(again)
-        pattern = session.document["stations"][entry]["images"]
-        if "{repeat}" not in pattern:
-            pattern = pattern.replace("{configuration}", "{configuration}_{repeat}")
-        files = [pattern.format(configuration=alike[0], repeat=k) for k in (1, 2)]
-        told.append(
-            f"at {listed(sorted(again))} name its photographs {' and '.join(files)}, with"
-            f" images: {pattern}, and keep one of its rows in joints.csv."
-        )
-    elif session.stations:
-        told.append(
-            f"its photographs bear one name at all stations, such as {alike[0]}, and it has one row"
-            " in joints.csv."
-        )
-    return [note(" ".join(told))]
+    if not session.stations:  # a tracker's table has one row a configuration
+        return [note("configurations.equal_rows", **facts)]
+    if not again:
+        return [note("configurations.equal_names", **facts, name=alike[0])]
+    entry = min(again)
+    pattern = session.document["stations"][entry]["images"]
+    if "{repeat}" not in pattern:
+        pattern = pattern.replace("{configuration}", "{configuration}_{repeat}")
+    files = [pattern.format(configuration=alike[0], repeat=k) for k in (1, 2)]
+    facts |= {"stations": sorted(again), "files": files, "pattern": pattern}
+    return [note("configurations.equal_at_stations", **facts)]
 
 
 def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome:
@@ -230,7 +188,7 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         f" {found.configurations} configurations, {photographs} photographs"
         if found.machine
         else "",
-        verdict=Verdict(code == 0, headlines[2 if refused else code], advice=found.advice),
+        verdict=Verdict(code == 0, headlines[2 if refused else code], found.advice),
         stamp=("Ready", "Doubtful", "Not yet")[2 if refused else code],
         level=Level.WRONG if code == 2 else Level.DOUBTFUL,
         figures=(forecast_figure(found.forecast),) if found.forecast else (),

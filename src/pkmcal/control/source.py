@@ -14,6 +14,7 @@ from pkmcal.control.seen import seen_machine
 from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.outcome.finding import doubtful
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.placement import default_stations
 from pkmcal.simulation.truth import stream, true_machine
@@ -66,9 +67,7 @@ def _of_calibration(
     """
     place = _station(saved, source, station, eye)
     eye = source.cameras[place.name] if eye is None else eye
-    refused = () if saved.verdict.usable else (
-        f"The calibration itself should not be used: {saved.verdict.headline}",
-    )  # fmt: skip
+    refused = doubtful("servo.refused_calibration", source.origin, headline=saved.verdict.headline)
     origin = (
         f"The calibrated machine (folder {source.origin}), seen by the camera of {place.name};"
         " every run has its own errors, drawn from the calibration's covariance."
@@ -82,7 +81,7 @@ def _of_calibration(
         legs=legs,
         origin=origin,
         station=place.name,
-        warnings=refused,
+        findings=() if saved.verdict.usable else (refused,),
     )
 
 

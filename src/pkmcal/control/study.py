@@ -35,6 +35,7 @@ from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose, register, 
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
+from pkmcal.outcome.finding import Finding
 from pkmcal.simulation.placement import draw_configurations
 
 HAND_POSITION = 0.03
@@ -161,7 +162,7 @@ class Plan:
 class Plant:
     """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
     from 0 of those seen, all with tubes unless given. origin : a sentence, for people. station :
-    the camera's, None for a drawing. warnings : what people should know.
+    the camera's, None for a drawing. findings : what people should know.
     """
 
     machine: Machine
@@ -172,7 +173,7 @@ class Plant:
     legs: tuple[int, ...] | None = None
     origin: str = ""
     station: str | None = None
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def seen(self) -> SeenMachine:
         """The true machine before the camera."""

@@ -27,7 +27,7 @@ from pkmcal.export.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TUR
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, platform_carriers
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, note
 
 BODY_COLOURS = {
     "base": "0.35 0.35 0.38 1",
@@ -49,9 +49,9 @@ NOT_WEIGHED = "NOT KNOWN: masses and inertias, since photographs weigh nothing"
 """How the conventions begin that say what a format makes of it."""
 
 
-def without_masses(so: str) -> Finding:
-    """That links have no masses; so : what follows for the format, from its first comma on."""
-    return Finding(Level.NOTE, f"Links have no masses, since photographs weigh nothing{so}")
+def without_masses(form: str) -> Finding:
+    """That links have no masses, and what follows for a format."""
+    return note("export.no_masses", format=form)
 
 
 @dataclass(frozen=True)

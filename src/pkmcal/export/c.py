@@ -31,7 +31,7 @@ from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import cross, dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, note
 
 C_SOURCE_FOLDER = Path(__file__).parent / "c_source"
 C_HEADER_FILE, C_SOURCE_FILE, C_SELFTEST_FILE = (
@@ -127,21 +127,13 @@ class CSource(Exporter):
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How to run the self-test, and what is not in the source."""
-        out = [
-            Finding(
-                Level.NOTE,
-                "Compile the self-test on the controller, after every export: it prints PASS and"
-                f" what it tested: {source.identity}.",
-            )
-        ]
+        out = [note("export.c_selftest", identity=source.identity)]
         passive = np.flatnonzero(~source.machine.layout.closing) + 1
         if passive.size:
-            names = ", ".join(map(str, passive))
-            out.append(Finding(Level.NOTE, f"Passive legs ({names}) are not in the source."))
+            out.append(note("export.c_passive_legs", legs=", ".join(map(str, passive))))
         if _coupled(source.machine):
             shared = "motor" if source.machine.layout.shares_motors else "bar"
-            text = f"Several rods share a {shared}: the source has no pkmcal_inverse_jacobian."
-            out.append(Finding(Level.NOTE, text))
+            out.append(note("export.c_no_jacobian", shared=shared))
         return tuple(out)
 
 

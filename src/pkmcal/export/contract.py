@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.calibration.source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.files import check_own_folder, closest, write_folder
-from pkmcal.outcome import Finding
+from pkmcal.outcome.finding import Finding
 from pkmcal.wording import listed
 
 

@@ -32,7 +32,7 @@ from pkmcal.export.limbs import (
 )
 from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, doubtful, note
 
 STEPS_FROM_HOME = 8
 """Steps from home to a pose of the grid."""
@@ -268,13 +268,18 @@ class Fit:
         return self.rate * self.delta.ends[self.order] + self.zero
 
     @property
-    def sentence(self) -> str:
-        """How well the settings follow the machine; rounded up, so that it holds."""
-        largest = math.ceil(self.largest * 1e3) / 1e3
-        return (
-            f"{self.delta.program}'s model follows this machine with the tool off by"
-            f" {largest:.3f} mm at most, {self.rms:.3f} mm root mean square."
-        )
+    def following(self) -> Finding:
+        """How well the settings follow the machine, a warning where it is not well; rounded up, so
+        that it holds.
+        """
+        facts = {
+            "program": self.delta.program,
+            "largest": math.ceil(self.largest * 1e3) / 1e3,
+            "rms": self.rms,
+        }
+        if self.largest <= UNWARNED_TOOL_ERROR:
+            return note("export.follows", **facts)
+        return doubtful("export.follows_badly", **facts, kind=self.kind)
 
     def motors(self, points: Array, near: Array) -> Array:
         """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame; of an arm's two the
@@ -510,7 +515,7 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
         *([correcting] if factors else []),
         f"The firmware's frame: p_firmware = firmware_from_base p_base, mm. {tip}",
         *rows,
-        f"{fit.sentence} Compared over {len(delta.poses)} poses of the workspace.",
+        f"{fit.following.text} Compared over {len(delta.poses)} poses of the workspace.",
     ]
 
 
@@ -620,27 +625,5 @@ def redo(source: MachineSource) -> tuple[Finding, ...]:
     """What a firmware has to measure again once it has these values; nothing of a drawing."""
     if not source.calibrated:
         return ()
-    home = "the tool's tip and the bed are not in these values: set the Z offset, level the bed"
-    if source.bed is not None:
-        home = "its Z is 0 on the bed that was felt, to the probe's error: check the first layer"
-    radius = workspace_radius(source)
-    keep = (
-        "Keep the printer's own print radius"
-        if radius is None
-        else f"The print radius stays {radius} mm"
-    )
-    text = (
-        f"{keep}. Then home: {home}. Measure the bed's mesh anew: the"
-        " old one belongs to the old values."
-    )
-    return (Finding(Level.NOTE, text),)
-
-
-def follows(fit: Fit) -> Finding:
-    """The note on how well, a doubt where it is not well."""
-    text = fit.sentence
-    if fit.largest > UNWARNED_TOOL_ERROR:
-        cause = "towers that are not parallel" if fit.kind == "linear" else "tilted arms"
-        text += f" It has no values for {cause} and the like; --to c has them all."
-        return Finding(Level.DOUBTFUL, text)
-    return Finding(Level.NOTE, text)
+    bed = "unknown" if source.bed is None else "probed"
+    return (note("export.redo", radius=workspace_radius(source), bed=bed),)

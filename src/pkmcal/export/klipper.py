@@ -29,25 +29,19 @@ from pkmcal.export.delta import (
     firmware_length,
     firmware_tool_difference,
     fit_of,
-    follows,
     proportional_switches,
     readings_elsewhere,
     redo,
     switch_values,
     workspace_radius,
 )
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, note
 
 FILE = "pkmcal_printer.cfg"
 PROGRAM = "Klipper"
 KLIPPER_LINEAR_FREEDOMS = Freedoms((210.0, 330.0, 90.0))
 KLIPPER_ROTARY_FREEDOMS = Freedoms((30.0, 150.0, 270.0), heights=False)
 KLIPPER_STEPPERS = "abc"
-SAVED_MARK_ADVICE = (
-    "Below SAVE_CONFIG's header keep the mark '#*# ' before each line: where one is without it,"
-    " Klipper drops all that was saved."
-)
-"""klippy/configfile.py, _find_autosave_data."""
 NO_KLIPPER_PRINT_RADIUS = (
     "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
     " stands; then write the former delta_radius there."
@@ -71,7 +65,7 @@ class Klipper(Exporter):
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
         lines = about(source, fit, KLIPPER_STEPPERS, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
-        lines.append(SAVED_MARK_ADVICE)
+        lines.append(note("export.klipper_saved").text)
         lines.append(end_switches(fit))
         if fit.kind == "linear":
             names = [f"stepper_{s}.position_endstop" for s in KLIPPER_STEPPERS]
@@ -121,7 +115,7 @@ class Klipper(Exporter):
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        return (follows(_fit(source)), Finding(Level.NOTE, SAVED_MARK_ADVICE), *redo(source))
+        return (_fit(source).following, note("export.klipper_saved"), *redo(source))
 
 
 def _tower_endstops(fit: Fit) -> Array:

@@ -44,7 +44,6 @@ from pkmcal.export.delta import (
     firmware_length,
     firmware_tool_difference,
     fit_of,
-    follows,
     scales_of,
 )
 from pkmcal.export.limbs import Limbs, rod_limbs
@@ -61,7 +60,7 @@ from pkmcal.export.linuxcnc_module import (
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import Machine
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, note
 
 LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE = "pkmcal_kinematics.hal", "pkmcal_kinematics.ini"
 PROGRAM = "LinuxCNC"
@@ -261,13 +260,12 @@ class LinuxCnc(Exporter):
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How to use the files, and how well the pins follow the machine."""
         kind = _kind(source)
-        home = "Homing is set for absolute encoders; the INI file says what home switches need."
-        use = "source the HAL file after genhexkins is loaded"
+        if isinstance(kind, Fit):
+            return (kind.following, note("export.linuxcnc_homing"))
         if kind is None:
-            use = f"build the module by {MODULE_BUILD_COMMAND}, and load it by loadrt {MODULE_NAME}"
-        copy = f"Copy the INI file's sections into the machine's own INI file, and {use}. {home}"
-        first = follows(kind) if isinstance(kind, Fit) else Finding(Level.NOTE, copy)
-        return (first, Finding(Level.NOTE, home)) if isinstance(kind, Fit) else (first,)
+            build = {"command": MODULE_BUILD_COMMAND, "module": MODULE_NAME}
+            return (note("export.linuxcnc_module", **build),)
+        return (note("export.linuxcnc_genhexkins"),)
 
 
 # Machines of no module of LinuxCNC's

@@ -16,7 +16,7 @@ from pkmcal.export.home import HomeState
 from pkmcal.export.markup import comment, comment_text, document, file_name, numbers_text
 from pkmcal.export.mujoco_read import read_mujoco
 from pkmcal.geometry.rigid import quaternion
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, note
 
 MUJOCO_TIME_STEP = "0.001"
 """s; the loops' time constant is twice that, the shortest that MuJoCo allows."""
@@ -58,11 +58,7 @@ class MujocoExporter(Exporter):
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """What the model does not know."""
         del source
-        text = (
-            "Masses, inertias, damping and gains in the model are placeholders: it is for "
-            "kinematics. Gravity and contacts are off."
-        )
-        return (Finding(Level.NOTE, text),)
+        return (note("export.mujoco_placeholders"),)
 
 
 def _mjcf(source: MachineSource) -> str:

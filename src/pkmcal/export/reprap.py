@@ -31,14 +31,13 @@ from pkmcal.export.delta import (
     firmware_length,
     firmware_tool_difference,
     fit_of,
-    follows,
     proportional_switches,
     readings_elsewhere,
     redo,
     switch_values,
     workspace_radius,
 )
-from pkmcal.outcome import Finding
+from pkmcal.outcome.finding import Finding
 
 FILE = "pkmcal_delta.g"
 PROGRAM = "RepRapFirmware"
@@ -107,7 +106,7 @@ class RepRap(Exporter):
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        return (follows(_fit(source)), *redo(source))
+        return (_fit(source).following, *redo(source))
 
 
 def _radius(source: MachineSource) -> list[float]:

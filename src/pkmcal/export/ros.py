@@ -21,7 +21,7 @@ from pkmcal.cameras.files import foreign_text, load_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact
 from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.wording import listed
 
 ROS_LAUNCH_FILE = "static_transforms.launch.yaml"
@@ -78,16 +78,11 @@ class Ros(Exporter):
         lost = [s for s in source.T_base_camera if s not in source.cameras]
         out: list[Finding] = []
         if lost:
-            text = (
-                f"No camera_info for {listed(lost)}: the camera file was not found. Name the"
-                " session with --session; trackers have none."
-            )
-            out.append(Finding(Level.DOUBTFUL, text))
+            out.append(doubtful("export.ros_no_camera_file", listed(lost), stations=lost))
         mirrors = [s for s, camera in source.cameras.items() if camera.model == MIRROR_CAMERA_MODEL]
         if mirrors:
-            text = f"No camera_info for {listed(mirrors)}: ROS has no model for mirrors."
-            out.append(Finding(Level.DOUBTFUL, text))
-        out.append(Finding(Level.NOTE, f"Start it with: ros2 launch ./{ROS_LAUNCH_FILE}"))
+            out.append(doubtful("export.ros_mirrors", listed(mirrors), stations=mirrors))
+        out.append(note("export.ros_launch", ROS_LAUNCH_FILE))
         return tuple(out)
 
 

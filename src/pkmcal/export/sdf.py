@@ -27,7 +27,7 @@ from pkmcal.export.home import SAME_HINGE_DIFFERENCE
 from pkmcal.export.markup import comment, document, file_name, numbers_text
 from pkmcal.export.sdf_read import SDF_MODEL_FRAME, SDF_NAMESPACE, read_sdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, doubtful
 
 SDF_VERSION, SDF_MIMIC_VERSION = "1.7", "1.11"
 """The lowest that has what a model uses, since readers refuse what is newer than they are: 1.7 is
@@ -68,14 +68,8 @@ class SdfExporter(Exporter):
         """What the model does not know, and what its readers may not do."""
         del source
         return (
-            Finding(
-                Level.DOUBTFUL,
-                "The loops are joints, as SDF has them; a program that reads SDF may leave them"
-                " open or refuse them.",
-            ),
-            without_masses(
-                ", and SDF takes 1 kg for each: the model is for kinematics. Gravity is off."
-            ),
+            doubtful("export.sdf_loops"),
+            without_masses("sdf"),
         )
 
 

@@ -27,7 +27,7 @@ from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.markup import comment, document, file_name, numbers_text
 from pkmcal.export.urdf_read import read_urdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw, rotation
-from pkmcal.outcome import Finding, Level
+from pkmcal.outcome.finding import Finding, doubtful
 
 JOINT_LIMIT_ROD_LENGTHS = 2.0
 """Rods' mean lengths about home, of limits that URDF demands and nobody knows."""
@@ -84,12 +84,8 @@ class UrdfExporter(Exporter):
         """What the tree does not hold."""
         tree, loops = _file_names(source)
         return (
-            Finding(
-                Level.DOUBTFUL,
-                f"A URDF is a tree: {tree} holds every leg at the base alone. What closes"
-                f" the machine stands in {loops}, for programs that take loops beside a URDF.",
-            ),
-            without_masses(": for kinematics and pictures, not for a simulator."),
+            doubtful("export.urdf_tree", tree, loops=loops),
+            without_masses("urdf"),
         )
 
 

@@ -1,8 +1,9 @@
-"""Is the result to be used? In words, with reasons, warnings and advice."""
+"""The verdict on an estimate: may it be used, with reasons, warnings and advice as findings."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,8 @@ from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
 from pkmcal.solver.search import Stop
-from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -61,10 +62,13 @@ POOR_MODEL_POSE_SCALE = 1.3
 
 @dataclass(frozen=True)
 class RicherModel:
-    """Another model of the mechanism file, and by how many times their noise poses fit it."""
+    """Another model of the mechanism file, and by how many times their noise poses fit it; infinite
+    where there is no estimate, and failure says why.
+    """
 
     name: str
     scale: float
+    failure: str = ""
 
 
 def judge(
@@ -75,42 +79,44 @@ def judge(
     *,
     richer: tuple[RicherModel, ...] = (),
     explained: bool = False,
-    doubts: tuple[str, ...] = (),
-    cautions: tuple[str, ...] = (),
-    hints: tuple[str, ...] = (),
+    others: Sequence[Finding] = (),
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
 
-    findings : what the data tell of the machine.
+    findings : what the data determine of the machine, and what they leave open.
     richer : models of the machine that were tried because this one is too poor for the poses.
     explained : whether the model discrepancy surely explains why heights scatter; the standard
     deviations then contain it.
-    doubts : further reasons against it, cautions : further warnings, hints : further advice, found
-    in the session.
+    others : findings of any level about the session.
     """
     bed = findings.bed
     large, small = ((), ()) if bed else _left_open(estimate, findings)
-    if bed:
-        left = _bed_unknown(bed)
-        hints = (*_not_by_heights(bed, findings), *hints)
-    else:
-        left = [f"{s.text} {s.advice}" for s in large]
-        left = left or _platform_unknown(estimate, findings.by_drawing)
-    against = [] if explained else _poses_against(estimate, richer)
-    reasons = tuple(_reasons(estimate, method, left) + against) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
-    matter = tuple(s for s in small if s.matters)
+    matter = [s for s in small if s.matters]
     if matter:
         least = WORTH_SAYING * platform_sigma(estimate)
-        matter = tuple(s for s in matter if s.moves_platform > least)
-    warnings = (
+        matter = [s for s in matter if s.moves_platform > least]
+    undetermined = [_undetermined(s, Level.WRONG) for s in large]
+    if bed:
+        undetermined = list(_bed_unknown(bed))
+    elif not large:
+        undetermined = list(_platform_unknown(estimate, findings.by_drawing))
+    every = (
+        *_estimate_misfit(estimate, method),
+        *undetermined,
+        *_singular(estimate),
+        *_readings_misfit(estimate),
+        *(() if explained else _poses_misfit(estimate, richer)),
         *_warnings(observation, estimate),
-        *(() if explained else _poses_doubted(estimate, richer)),
         *(_touch_unnoticed(bed) if bed else ()),
-        *cautions,
-        *(f"{s.text} {s.advice}" for s in matter),
+        *_few_configurations(estimate),
+        *(_not_by_heights(bed, findings) if bed else ()),
+        *others,
+        *(_undetermined(s, Level.DOUBTFUL) for s in matter),
+        *_harmless(small),
     )
-    if reasons:
+    usable = not any(one.level is Level.WRONG for one in every)
+    if not usable:
         headline = "This calibration should not be used."
     elif bed:
         headline = (
@@ -120,8 +126,21 @@ def judge(
         )
     else:
         headline = _headline(observation, estimate)
-    return Verdict(
-        not reasons, headline, reasons, warnings, (*_advice(estimate), *hints, *_harmless(small))
+    return Verdict(usable, headline, every)
+
+
+def _undetermined(sentence: Sentence, level: Level) -> Finding:
+    """A motion of the machine that the data leave open."""
+    return finding(
+        "machine.undetermined",
+        level,
+        ", ".join(sentence.parameters),
+        parameters=sentence.parameters,
+        dimensions=sentence.dimensions,
+        tool_shift=sentence.moves_platform,
+        weak=sentence.weak,
+        what=sentence.text,
+        advice=sentence.advice,
     )
 
 
@@ -158,108 +177,78 @@ def no_gain(sigma: float, by_nominal: float) -> bool:
     return not sigma <= NOMINAL_ERROR_LEFT * by_nominal
 
 
-def _platform_unknown(estimate: Estimate, by_nominal: float) -> list[str]:
+def _platform_unknown(estimate: Estimate, by_nominal: float) -> Iterator[Finding]:
     """Why measurements of the platform are of no use, if they are not."""
     sigma = platform_sigma(estimate)
-    if not no_gain(sigma, by_nominal):
-        return []
-    return [
-        f"The platform's joints are known to {sigma * 1e3:.2g} mm at given readings, and by the"
-        f" drawing's tolerances alone to {by_nominal * 1e3:.2g} mm: that is no gain. Measure more"
-        " configurations, from further places, or with less noise.",
-    ]
+    if no_gain(sigma, by_nominal):
+        yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_nominal)
 
 
-def _bed_unknown(bed: Bed) -> list[str]:
+def _bed_unknown(bed: Bed) -> Iterator[Finding]:
     """Why heights are of no use, if they are not."""
-    if not no_gain(bed.sigma, bed.by_drawing):
-        return []
-    return [
-        f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
-        f" the drawing's tolerances alone to {bed.by_drawing * 1e3:.2g} mm: that is no gain. Probe"
-        " more points, spread to the edge of the bed, or with a probe that repeats better.",
-    ]
+    if no_gain(bed.sigma, bed.by_drawing):
+        yield wrong("bed.no_gain", sigma=bed.sigma, nominal_sigma=bed.by_drawing)
 
 
-def _touch_unnoticed(bed: Bed) -> list[str]:
-    """What one wrong height could do that nothing shows, where that is much: no deviation holds it,
-    for nobody knows how wrong a crumb is.
+def _touch_unnoticed(bed: Bed) -> Iterator[Finding]:
+    """The effect of one wrong height that nothing shows, where it is large: no deviation contains
+    it, for nobody knows how wrong a crumb is.
     """
-    if bed.unnoticed is not None and not no_gain(bed.unnoticed, bed.by_drawing):
-        return []
-    bends = "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
-    more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
-    return [
-        f"So few heights, {bed.touches}, do not show a wrong one: a crumb under the probe could"
-        f" bend the bed {bends} unnoticed, and the drawing's tolerances alone bend it by"
-        f" {bed.by_drawing * 1e3:.2g} mm. Probe these again and compare, or {more} more places,"
-        " spread to the edge of the bed.",
-    ]
+    if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing):
+        yield doubtful(
+            "bed.height_unnoticed",
+            touches=bed.touches,
+            shift=bed.unnoticed,
+            nominal_sigma=bed.by_drawing,
+            more=max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2),
+        )
 
 
-def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
-    """What heights leave to the drawing, in figures, and the largest cause in words."""
-    told = [
-        f"Heights do not tell x and y: these are known to {bed.sideways * 1e3:.2g} mm, and sizes to"
-        f" {bed.size:.2%}, by the drawing's tolerances. Measure distances on a printed part"
-        " (distances in session.yaml), or a board on the tool (observe: board), where dimensions"
-        " matter."
-    ]
+def _not_by_heights(bed: Bed, findings: Findings) -> Iterator[Finding]:
+    """What heights leave to the nominal model, in figures, and its largest cause."""
+    yield note("bed.sideways", sigma=bed.sideways, size_sigma=bed.size)
     matter = [s for s in (*findings.unidentified, *findings.weak) if s.matters]
     if matter:
         first = max(matter, key=lambda s: s.moves_platform)
-        more = f" ({len(matter) - 1} more in the report)" if len(matter) > 1 else ""
-        told.append(f"{first.text}{more}")
-    return told
+        yield note(
+            "bed.undetermined",
+            ", ".join(first.parameters),
+            what=first.text,
+            parameters=first.parameters,
+            tool_shift=first.moves_platform,
+            more=len(matter) - 1 or None,
+        )
 
 
-def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
-    out: list[str] = []
-    lost = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
-    if estimate.statistics.noise_scale > TOO_NOISY and method != "bundle":
-        out.append(
-            f"The {method} method leaves the edges {estimate.statistics.noise_scale:.0f} times"
-            " further off than their noise; it is here for comparison. Use the joint method,"
-            " bundle, which is the default."
-        )
-    elif estimate.statistics.noise_scale > TOO_NOISY:
-        out.append(
-            f"The edges disagree with the machine {estimate.statistics.noise_scale:.1f} times more"
-            " than their noise: something that the model leaves out moves them (lens, bending,"
-            " play, photographs under wrong names)."
-        )
-    if lost > TOO_MANY_LOST:
-        out.append(
-            f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
-            " can be trusted to be right."
-        )
-    if estimate.statistics.dof <= 0:
-        out.append(
-            "As many unknowns were estimated as there are measurements, the drawing's tolerances"
-            " counted: nothing is left over that could show a wrong one. Measure more"
-            " configurations."
-        )
-    if estimate.statistics.stopped == Stop.STEPS.value:
-        out.append(
-            f"The search for the best values had not settled after {estimate.statistics.steps}"
-            " steps, so these are not the best: check that the drawing's tolerances fit the"
-            " machine, or measure more configurations."
-        )
+def _estimate_misfit(estimate: Estimate, method: str) -> Iterator[Finding]:
+    """Edges that the model does not explain, and an estimate that is none."""
+    s = estimate.statistics
+    rejected = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
+    if s.noise_scale > TOO_NOISY and method != "bundle":
+        yield wrong("estimate.method_misfit", method=method, scale=s.noise_scale)
+    elif s.noise_scale > TOO_NOISY:
+        yield wrong("edges.misfit", scale=s.noise_scale)
+    if rejected > TOO_MANY_LOST:
+        yield wrong("edges.rejected_share", share=rejected, limit=TOO_MANY_LOST)
+    if s.dof <= 0:
+        yield wrong("estimate.no_redundancy", dof=s.dof)
+    if s.stopped == Stop.STEPS.value:
+        yield wrong("estimate.not_converged", steps=s.steps)
     if method == "linear":
-        out.append(_base_alone(estimate))
-    out.extend(undecided)
-    out.extend(_singular(estimate))
+        yield _base_alone(estimate)
+
+
+def _readings_misfit(estimate: Estimate) -> Iterator[Finding]:
+    """Readings that the images contradict."""
     bad = np.abs(estimate.joint_residuals) > 6.0
     if np.mean(bad) > 0.02:
-        leg = int(np.argmax(bad.sum(axis=0))) + 1
-        out.append(
-            f"The readings of joint {leg} and others do not fit the photographs"
-            f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
+        joint = int(np.argmax(bad.sum(axis=0))) + 1
+        yield wrong(
+            "readings.misfit", f"joint {joint}", joint=joint, number=int(bad.sum()), of=bad.size
         )
-    return out
 
 
-def _base_alone(estimate: Estimate) -> str:
+def _base_alone(estimate: Estimate) -> Finding:
     """How far [B]'s linear method goes: the base, by the edges and by the drawing, and no further.
 
     By the edges alone is what the drawing was to them taken out: in units of the drawing's
@@ -279,69 +268,38 @@ def _base_alone(estimate: Estimate) -> str:
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
     by_edges = v / np.maximum(1 - v, EXACT_SHARE)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
-    edges, drawing_, both = (
-        f"{np.sqrt(x / len(before)) * 1e3:.2g} mm"
-        for x in (alone, np.trace(before), np.trace(together))
+    edges, nominal, both = (
+        float(np.sqrt(x / len(before))) for x in (alone, np.trace(before), np.trace(together))
     )
-    return (
-        f"The linear method tells of the base alone: its joints are known to {both} (by the edges"
-        f" alone to {edges}, by the drawing alone to {drawing_}). The platform's joints and the"
-        " legs' lengths stay as drawn. Use the joint method, bundle, which is the default."
-    )
+    return wrong("estimate.base_only", sigma=both, edges_sigma=edges, nominal_sigma=nominal)
 
 
-def _poses_against(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[str]:
-    """Poses that the model does not explain, or that do not agree among themselves."""
-    out: list[str] = []
-    scale = estimate.statistics.pose_scale
-    if scale > TOO_NOISY:
-        out.append(
-            f"The measured poses disagree with the model {scale:.1f} times more than their noise:"
-            f" it leaves out what moves them.{_better(richer)}"
-        )
-    lost = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
-    if lost > TOO_MANY_LOST:
-        out.append(
-            f"{lost:.0%} of the measured poses do not fit the rest; below {TOO_MANY_LOST:.0%} the"
-            " majority can be trusted to be right."
-        )
-    return out
-
-
-def _poses_doubted(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[str]:
-    """Poses that scatter more than they should, short of a reason against the result."""
+def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterator[Finding]:
+    """Poses that the model does not explain, that do not agree among themselves, or that scatter
+    more than they should; with the least rich of the richer models that fit alike.
+    """
     s = estimate.statistics
+    best = min((model.scale for model in richer), default=np.inf)
+    fits = next((model for model in richer if model.scale < 1.1 * best), None)
+    better = {"model": fits and fits.name, "model_scale": fits and fits.scale}
+    if s.pose_scale > TOO_NOISY:
+        yield wrong("poses.misfit", scale=s.pose_scale, **better)
+    share = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
+    if share > TOO_MANY_LOST:
+        yield wrong("poses.rejected_share", share=share, limit=TOO_MANY_LOST)
     # the scale of n numbers that are noise has the standard deviation 1 / sqrt(2 n)
     chance = 1 + 4 / np.sqrt(2 * max(s.dof_poses, 1.0))
-    if not max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= TOO_NOISY:
-        return []
-    return [
-        f"The measured poses disagree with the model {s.pose_scale:.1f} times more than their"
-        f" noise; all standard deviations are enlarged by as much.{_better(richer)}"
-    ]
+    if max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= TOO_NOISY:
+        yield doubtful("poses.scatter", scale=s.pose_scale, **better)
 
 
-def _better(richer: tuple[RicherModel, ...]) -> str:
-    """The richer model that fits, as a further sentence; the least rich of those that fit alike."""
-    if not richer:
-        return ""
-    best = min(richer, key=lambda model: model.scale)
-    alike = [model for model in richer if model.scale < 1.1 * best.scale]
-    return f" With --model {alike[0].name} they fit {alike[0].scale:.2f} times their noise."
-
-
-def _singular(estimate: Estimate) -> list[str]:
+def _singular(estimate: Estimate) -> Iterator[Finding]:
     """Where most poses are singular, small errors move the platform far and nothing is linear."""
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
-    if weak.mean() < MOSTLY_SINGULAR_SHARE:
-        return []
-    return [
-        f"The machine is near a singular pose in {int(weak.sum())} of {weak.size} configurations:"
-        " there its readings hardly say where the platform is, and these deviations cannot be"
-        " trusted. Photograph it in other poses, or check the drawing."
-    ]
+    if weak.mean() >= MOSTLY_SINGULAR_SHARE:
+        yield wrong("configurations.singular", number=int(weak.sum()), of=weak.size)
 
 
 def _left_open(
@@ -366,15 +324,17 @@ def _left_open(
     return large, tuple(s for s in open_ if s not in large)
 
 
-def _harmless(sentences: tuple[Sentence, ...]) -> list[str]:
+def _harmless(sentences: tuple[Sentence, ...]) -> Iterator[Finding]:
     """One line about what is open and does no harm; the report has the sentences."""
-    harmless = sum(not s.matters for s in sentences)
-    if not harmless:
-        return []
-    first = sentences[[s.matters for s in sentences].index(False)].text
-    what = re.split(r"\.(?=\s|$)", first)[0]  # not at the point of a number
-    more = f" ({harmless - 1} more in the report)" if harmless > 1 else ""
-    return [f"Open, without effect on the platform: {what[0].lower()}{what[1:]}{more}."]
+    harmless = [s for s in sentences if not s.matters]
+    if harmless:
+        what = re.split(r"\.(?=\s|$)", harmless[0].text)[0]  # not at the point of a number
+        yield note(
+            "machine.undetermined_harmless",
+            ", ".join(harmless[0].parameters),
+            what=f"{what[0].lower()}{what[1:]}",
+            more=len(harmless) - 1 or None,
+        )
 
 
 def _undecided(estimate: Estimate) -> list[str]:
@@ -385,37 +345,27 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
 
 
-def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
-    out: list[str] = []
+def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]:
+    """Values far from the nominal model, and what enlarges their deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
     far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
     if far:
-        out.append(
-            f"{listed(far, 4)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
-            f" {FAR_FROM_NOMINAL:.0f} tolerances (up to {change.max():.0f}): check the drawing"
-            f" and its frame."
+        yield doubtful(
+            "machine.far_from_nominal",
+            ", ".join(far),
+            parameters=far,
+            tolerances=FAR_FROM_NOMINAL,
+            most=float(change.max()),
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
-    out.extend(
-        f"Leg {leg + 1} was seen in few photographs; its values lean on the readings."
-        for leg in np.flatnonzero(seen < 0.3 * np.median(seen))
-    )
+    for leg in np.flatnonzero(seen < 0.3 * np.median(seen)).tolist():
+        yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
     if estimate.statistics.noise_scale > 1.5:
-        out.append(
-            f"The edges scatter {estimate.statistics.noise_scale:.1f} times more than their"
-            " profiles promise; their deviations, and with them all others, are enlarged."
-        )
+        yield doubtful("edges.scatter", scale=estimate.statistics.noise_scale)
     shading = estimate.edge_noise.shading if observation.edges.leg.size else np.zeros(1)
     if shading.min() > POLISHED_SHADING:
-        out.append(
-            f"Light moves single edges of every tube by {shading.min():.2f} px or more, as on"
-            " polished metal. What it does to a leg in all photographs alike no residual shows;"
-            " errors of such sessions were as large as their deviations, of some a third larger."
-            " What helps: a further place, softer light, a white sheet behind the machine, chalk on"
-            " the tubes."
-        )
-    return out
+        yield doubtful("edges.polished", value=float(shading.min()))
 
 
 def _from_drawing(machine: Machine) -> Array:
@@ -430,11 +380,7 @@ def _from_drawing(machine: Machine) -> Array:
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
 
 
-def _advice(estimate: Estimate) -> list[str]:
+def _few_configurations(estimate: Estimate) -> Iterator[Finding]:
     used = int(np.sum(estimate.configurations))
     if used < 10 and not only_heights(estimate):
-        return [
-            f"Only {used} configurations were used. Standard deviations fall with the square root"
-            " of their number; extreme leg lengths help most."
-        ]
-    return []
+        yield note("configurations.few", number=used)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from pkmcal.identify.change import MachineChange, machine_change
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
-from pkmcal.wording import amount, brief, capital, count, listed, number
+from pkmcal.outcome.finding import Finding, note, wrong
+from pkmcal.wording import amount, brief, count, listed, number
 
 DIFFERENCE_FORMAT = 1
 DIFFERENCE_ALPHA = 0.01
@@ -106,7 +107,7 @@ class MachineDifference:
         return json_value(
             {
                 "pkmcal_diff": DIFFERENCE_FORMAT,
-                "verdict": asdict(self.verdict),
+                "verdict": self.verdict.document(),
                 "changed": self.changed,
                 "a": sides[0],
                 "b": sides[1],
@@ -309,7 +310,7 @@ UNMODELLED_CHANGES_TEXT = (
 def _judged(d: MachineDifference) -> MachineDifference:
     """With its verdict."""
     refused = [
-        f"{side.name} was refused when it was made: {' '.join(side.saved.verdict.reasons)}"
+        wrong("difference.refused", side.name, reasons=" ".join(side.saved.verdict.reasons))
         for side in (d.a, d.b)
         if side.saved is not None and not side.saved.verdict.usable
     ]
@@ -329,25 +330,17 @@ def _judged(d: MachineDifference) -> MachineDifference:
     named = [_named(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
     left = len(d.significant) - len(named)
     if named and left > 0:
-        named.append(f"{count(left, 'more number')}.")
+        named.append(wrong("difference.more", number=left))
     if d.changed and not named:
-        named.append(
-            f"No number by itself, but all together: χ² {number(d.found.chi2, 0)} for"
-            f" {d.found.dof} degrees of freedom."
-        )
-    advice: tuple[str, ...] = ()
-    if d.changed and d.a.saved and d.b.saved and d.shared == int(d.a.saved.used.sum()):
-        advice = (
-            "Both are of the same photographs: what differs is what was found in them, which the"
-            f" random search (seeds {d.a.saved.seed} and {d.b.saved.seed}) or the settings decide."
-            " Where that matters, more photographs are needed.",
-        )
-    elif d.changed and d.a.saved and d.b.saved:
-        advice = (
-            "If nothing was done to the machine in between, something that the model leaves out"
-            " differs between the two: see pkmcal validate of each on the other's session.",
-        )
-    verdict = Verdict(not d.changed and not refused, headline, (*refused, *named), advice=advice)
+        named.append(wrong("difference.together", chi2=d.found.chi2, dof=d.found.dof))
+    advice: list[Finding] = []
+    if d.changed and d.a.saved and d.b.saved:
+        if d.shared == int(d.a.saved.used.sum()):
+            seeds = d.a.saved.seed, d.b.saved.seed
+            advice = [note("difference.same_images", seed_a=seeds[0], seed_b=seeds[1])]
+        else:
+            advice = [note("difference.unmodelled")]
+    verdict = Verdict(not d.changed and not refused, headline, (*refused, *named, *advice))
     return replace(d, verdict=verdict)
 
 
@@ -367,10 +360,18 @@ def _of_tool(d: MachineDifference) -> str:
     )
 
 
-def _named(d: MachineDifference, k: int) -> str:
-    """A parameter's change in a sentence."""
+def _named(d: MachineDifference, k: int) -> Finding:
+    """A parameter's change."""
     table = d.a.machine.parameters
-    return f"{capital(table.in_words(table.names[k]))} by {change_text(d, k)}."
+    name = table.names[k]
+    return wrong(
+        "difference.parameter",
+        name,
+        parameter=table.in_words(name),
+        value=float(d.found.change[k]),
+        sigma=float(d.found.sigma[k]),
+        change=change_text(d, k),
+    )
 
 
 def change_text(d: MachineDifference, k: int) -> str:

@@ -28,6 +28,7 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
 
@@ -67,7 +68,7 @@ class Validation:
         names = self.session.configurations
         found = {
             "pkmcal_validation": VALIDATION_FORMAT,
-            "verdict": asdict(self.verdict),
+            "verdict": self.verdict.document(),
             "new_data": self.judged.document(names) if self.judged else None,
             "known_configurations": [*compress(names, self.known)],
             "repeated_configurations": [*compress(names, self.repeated)],
@@ -118,22 +119,25 @@ def validate_calibration(
         found = predict(saved.machine, data, estimate.state)
         if not regions:
             check_new(known, found.seen, *NOT_INDEPENDENT)
-        judged = None
+        judged, failed = None, tuple[Finding, ...]()
         repeated = ~known & repeated_rows(saved, session)
         new = np.flatnonzero(found.seen & ~known)
         if new.size:
             try:
                 by_drawing = predict(drawing, data, estimate.state)
-            except PkmcalError:  # so far off that its poses are not found
+            except PkmcalError as error:  # so far off that its poses are not found
                 by_drawing = None
+                why = str(error).rstrip(".")
+                failed = (note("validation.nominal_fails", why=why),)
             judged = compare_with_drawing(drawing, saved.covariance, data, found, by_drawing, new)
 
         told("Holding out regions", 0.9)
         held_out = by_regions(drawing, data, estimate, regions) if regions else ()
+        verdict = validation_verdict(judged, held_out, saved.machine, data, repeated)
         return Validation(
             calibration=saved,
             session=session,
-            verdict=validation_verdict(judged, held_out, saved.machine, data, repeated),
+            verdict=replace(verdict, findings=(*verdict.findings, *failed)),
             judged=judged,
             known=known,
             repeated=repeated,

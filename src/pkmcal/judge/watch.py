@@ -77,7 +77,7 @@ class Watch:
         return json_value(
             {
                 "pkmcal_watch": WATCH_FORMAT,
-                "verdict": asdict(self.verdict),
+                "verdict": self.verdict.document(),
                 **self.judged.document(self.calibration.machine),
                 "configurations": [*compress(names, self.seen)],
                 "known_configurations": [*compress(names, self.known)],

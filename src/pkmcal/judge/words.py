@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from pkmcal.judge.holdouts import HoldOut
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.wording import (
     SHOWN_UNITS,
     amount,
@@ -92,17 +94,11 @@ def validation_verdict(
     headline = _validation_headline(gain, before, after, unit, where)
     warnings = _regions(holdouts, unit)
     if judged and again:
-        those = "1 is at a pose" if again == 1 else f"{again} are at poses"
-        warnings.insert(
-            0,
-            f"Of {count(len(judged.rows), 'configuration')} {those} that the calibration used,"
-            " photographed anew: what is wrong there was wrong then, so they say little of other"
-            " poses. Photograph poses that it did not see.",
-        )
+        warnings.insert(0, doubtful("validation.same_poses", number=again, of=len(judged.rows)))
     if judged and gain.better:
         warnings += _hardly_seen(judged, units)
     noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
-    return Verdict(not reasons, headline, tuple(reasons), tuple(warnings), noise)
+    return Verdict(not reasons, headline, (*reasons, *warnings, *noise))
 
 
 def _validation_headline(
@@ -134,21 +130,17 @@ def against(new: Array, old: Array, unit: str) -> str:
     return f"{amount(finite_rms(new), unit)} against {amount(finite_rms(old), unit)}"
 
 
-def _not_better(gain: Ratio) -> list[str]:
+def _not_better(gain: Ratio) -> list[Finding]:
     if gain.better:
         return []
+    facts = {"value": gain.value, "low": gain.low, "high": gain.high}
     if gain.high < 1:
-        return [
-            "The calibration made the machine worse: use the drawing, and look for mixed-up files,"
-            " a machine that was changed, or a camera's calibration that is not its own."
-        ]
-    return [
-        f"On these data it may be {factor(gain.low)} to {factor(gain.high)} times as good as the"
-        " drawing (95 %): too few configurations, or too much noise in them, to tell."
-    ]
+        return [wrong("validation.worse", **facts)]
+    words = {"low_words": factor(gain.low), "high_words": factor(gain.high)}
+    return [wrong("validation.not_better", **facts, **words)]
 
 
-def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[str]:
+def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
     """Residuals that the deviations do not promise: the first group's that has such."""
     for group in groups:
         if not group.promise.usual:
@@ -158,54 +150,48 @@ def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[str
     return []
 
 
-def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> str:
-    said = ""
-    if len(set(units)) == 1:
-        found = finite_rms(group.figures(group.calibrated).joint_rms)
-        promised = finite_rms(group.promise.joint_rms)
-        said = f" ({amount(found, units[0])}, promised {amount(promised, units[0])})"
-    return (
-        f"The residuals are {factor(group.promise.factor)} times larger than the calibration's"
-        f" deviations and the photographs' noise promise{said}; chance does not explain that."
-        " The machine has changed since, or something that the model leaves out moves it."
+def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+    one = len(set(units)) == 1
+    return wrong(
+        "validation.residuals_too_large",
+        value=group.promise.factor,
+        times=factor(group.promise.factor),
+        rms=finite_rms(group.figures(group.calibrated).joint_rms) if one else None,
+        promised=finite_rms(group.promise.joint_rms) if one else None,
+        unit=units[0],
     )
 
 
-def _hardly_seen(group: BesideDrawing, units: tuple[str, ...]) -> list[str]:
+def _hardly_seen(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
     """Where plain root mean squares contradict the verdict, which weighs what was seen better."""
     by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
     worse = by_calibrated.joint_rms > by_drawing.joint_rms
     if not worse.any() and by_calibrated.position <= by_drawing.position:
         return []
-    told = ""
+    joint = int(np.argmax(np.where(worse, by_calibrated.joint_rms, -np.inf)))
+    promised = float(group.promise.joint_rms[joint])
+    facts: dict[str, Any] = {}
     if worse.any():
-        joint = int(np.argmax(np.where(worse, by_calibrated.joint_rms, -np.inf)))
-        promised = amount(float(group.promise.joint_rms[joint]), units[joint])
-        told = f" (joint {joint + 1}: to {promised})"
-    return [
-        f"Some directions are seen so badly in these photographs{told} that single rows of the"
-        " table show their noise rather than the machine, the calibrated one's above the"
-        " drawing's; the comparison above weighs every direction by how well it is seen."
-        " Photographs from a second place see what one place does not."
-    ]
+        facts = {"joint": joint + 1, "sigma": promised, "unit": units[joint]}
+    return [doubtful("validation.hardly_seen", **facts)]
 
 
-def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> str:
+def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
-    off = amount(abs(float(test.common[worst])), units[worst])
-    sigma = amount(float(test.common_sigma[worst]), units[worst])
-    more = "more" if test.common[worst] > 0 else "less"
-    return (
-        f"In all configurations alike, joint {worst + 1} reads {off} (±{sigma}) {more} than"
-        " predicted, which the calibration's deviations do not explain: its homing, its length or a"
-        " joint has changed since, or the calibration is wrong by as much."
+    return wrong(
+        "validation.joint_offset",
+        f"joint {worst + 1}",
+        joint=worst + 1,
+        value=float(test.common[worst]),
+        sigma=float(test.common_sigma[worst]),
+        unit=units[worst],
     )
 
 
 def _noise(
     after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """That what is left of configurations ``rows`` is noise, and what would lessen it."""
     if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
         return ()
@@ -216,38 +202,32 @@ def _noise(
         seen[one.configuration, one.station] = True
     stations = int(seen[rows].any(axis=0).sum())
     once = int(np.sum(seen[rows].sum(axis=1) == 1))
+    facts = {"noise": floor, "unit": unit, "stations": stations, "number": once, "of": len(rows)}
     if stations == 1:
-        do = "Several stations that see the same configurations would tell"
-    elif once:
-        those = "Each" if once == len(rows) else f"{once} of {len(rows)}"
-        do = (
-            f"{those} of these configurations {'is' if those == 'Each' else 'are'} seen from one of"
-            f" the {stations} stations only: photographs of the same ones from several would tell"
-        )
-    else:
-        do = (
-            f"All are seen from several of the {stations} stations already: photographs from nearer"
-            " or with more pixels would tell"
-        )
-    return (
-        f"What is left is mostly the photographs' own noise, {amount(floor, unit)}: the machine may"
-        f" be better still. {do}.",
-    )
+        return (note("validation.noise_one_station", **facts),)
+    if once == len(rows):
+        return (note("validation.noise_each_once", **facts),)
+    if once:
+        return (note("validation.noise_some_once", **facts),)
+    return (note("validation.noise_several", **facts),)
 
 
-def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:
+def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
     """Regions in which a calibration of the rest is poor."""
-    out: list[str] = []
+    out: list[Finding] = []
     for item in holdouts:
         off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
-        if off < POOR_REGION_FACTOR * usual:
-            continue
-        how = f": {amount(off, unit)} against {amount(usual, unit)}" if unit else ""
-        out.append(
-            f"Extrapolation is poor where the platform is {item.region.name}"
-            f" ({count(len(item.left_out.rows), 'configuration')}, left out){how}. Photograph"
-            " configurations there before the machine works there."
-        )
+        if off >= POOR_REGION_FACTOR * usual:
+            out.append(
+                doubtful(
+                    "validation.extrapolation",
+                    item.region.name,
+                    number=len(item.left_out.rows),
+                    rms=off,
+                    rms_used=usual,
+                    unit=unit,
+                )
+            )
     return out
 
 
@@ -286,9 +266,7 @@ def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
         return Verdict(
             False,
             "These data are too few to tell whether the machine is still as calibrated.",
-            _blind(blind),
-            warnings,
-            ("Photograph more configurations, with legs near both ends of their ranges.",),
+            (*_blind(blind), *warnings, note("watch.more_configurations")),
         )
     new = int(np.sum(around.seen & ~around.known))
     headline = (
@@ -296,8 +274,8 @@ def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
         f" {_would_have(judged)}."
     )
     silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
-    advice = f"Of {_of(silent)}, which has no reading, only the joints are tested."
-    return Verdict(True, headline, (), warnings, (advice,) if silent else ())
+    advice = [note("watch.no_reading", _of(silent), legs=_of(silent))] if silent else []
+    return Verdict(True, headline, (*warnings, *advice))
 
 
 def is_blind(leg: LegTest) -> bool:
@@ -382,11 +360,12 @@ def _place(change: Change) -> str:
     return f" by {' and '.join(out)}" if out else ""
 
 
-def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -> Verdict:
+def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[Finding, ...]) -> Verdict:
     names = around.names
     findings = judged.findings
     if not findings:
-        return Verdict(False, "The machine is not as calibrated.", (_unnamed(judged),), warnings)
+        headline = "The machine is not as calibrated."
+        return Verdict(False, headline, (_unnamed(judged), *warnings))
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
@@ -397,11 +376,9 @@ def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
     reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
     if judged.left.dof and judged.left.chance < CHANCE_LEFT_UNEXPLAINED:
-        reasons.append(
-            "That does not explain all: what is left of the machine's test is more than noise"
-            f" (χ² {judged.left.chi2:.0f} for {count(judged.left.dof, 'degree')} of freedom)."
-        )
-    return Verdict(False, headline, tuple(reasons), warnings, _next(findings))
+        left = {"chi2": judged.left.chi2, "dof": judged.left.dof, "chance": judged.left.chance}
+        reasons.append(wrong("watch.unexplained", **left))
+    return Verdict(False, headline, (*reasons, *warnings, _next(findings)))
 
 
 def _changes_headline(findings: Sequence[Explanation]) -> str:
@@ -415,66 +392,49 @@ def _changes_headline(findings: Sequence[Explanation]) -> str:
     return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
 
 
-def _reason(finding: Explanation, place: int, names: Names) -> str:
+def _reason(found: Explanation, place: int, names: Names) -> Finding:
     """One finding: what, how much, as after what, and what it may be instead."""
-    begin = "Most likely it is" if place == 0 else "Besides,"
-    text = f"{begin} {said(finding.suspect, names)}{_cause_in_words(finding.suspect)}."
-    if not finding.others:
-        return text
-    named_others = [said(o, names, short=True) for o in finding.others[:MOST_OTHERS]]
-    more = len(finding.others) - len(named_others)
-    tail = f"; or {count(more, 'other cause')}" if more else ""
-    return f"{text} These data cannot tell that from {'; or '.join(named_others)}{tail}."
-
-
-def _cause_in_words(suspect: Suspect) -> str:
-    """What such a change usually comes from."""
-    cause = suspect.cause
-    if cause.part == "zero":
-        return ", as after a slipped coupling or encoder, or a homing switch that moved"
-    if cause.part == "lead":
-        return ", as with another screw, belt or encoder"
-    if cause.part in ("base", "platform") and len(cause.legs) > 1:
-        return ", as with a mount that both share"
+    cause, change = found.suspect.cause, found.suspect.change
+    alternatives = [said(other, names, short=True) for other in found.others[:MOST_OTHERS]]
+    if more := len(found.others) - len(alternatives):
+        alternatives.append(count(more, "other cause"))
+    facts: dict[str, Any] = {
+        "place": "first" if place == 0 else "further",
+        "part": cause.part,
+        "legs": [leg + 1 for leg in cause.legs],
+        "value": change.value,
+        "sigma": change.sigma,
+        "what": said(found.suspect, names),
+        "others": "; or ".join(alternatives) or None,
+    }
+    subject = named(cause.legs) if cause.legs else ""
     if cause.part in ("base", "platform"):
-        return ", as with a joint that came loose or was exchanged"
+        return wrong("watch.mount" if len(cause.legs) > 1 else "watch.joint", subject, **facts)
     if cause.part == "scale":
-        kelvin = abs(suspect.change.value[0]) / STEEL_EXPANSION
-        way = "warmer" if suspect.change.value[0] > 0 else "colder"
-        return (
-            f"; a steel frame that is {brief(kelvin)} K {way} than at the calibration, with scales"
-            " in the legs that are not, would do that (12 µm/m/K), and so would readings of"
-            " another scale"
-        )
-    return ", as after focusing or with a lens that was touched" if cause.part == "camera" else ""
+        kelvin = brief(abs(change.value[0]) / STEEL_EXPANSION)
+        return wrong("watch.scale", **facts, kelvin=kelvin, way=change.value[0])
+    if cause.part in ("zero", "lead", "camera"):
+        return wrong(f"watch.{cause.part}", subject, **facts)
+    return wrong("watch.part", subject, **facts)
 
 
-def _unnamed(judged: ChangeTests) -> str:
+def _unnamed(judged: ChangeTests) -> Finding:
     """Something changed, and no single cause stands out."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
-        return f"The test of {_of(legs)} fails, but which part of it changed cannot be told."
-    return (
-        f"All legs' numbers together fit the new data badly (χ² {judged.machine.chi2:.0f} for"
-        f" {count(judged.machine.dof, 'degree')} of freedom), but no single leg stands out."
-    )
+        return wrong("watch.leg_test_fails", _of(legs), legs=_of(legs))
+    return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
 
 
-def _next(findings: Sequence[Explanation]) -> tuple[str, ...]:
+def _next(findings: Sequence[Explanation]) -> Finding:
     parts = {f.suspect.cause.part for f in findings}
     if parts == {"camera"}:
-        return ("Calibrate the camera again, or set its focus back, and look once more.",)
+        return note("watch.next_camera")
     if parts == {"scale"}:
-        return (
-            "Look at the machine when it is as warm as at the calibration, and at the scale of its"
-            " readings; if it stays, calibrate again.",
-        )
+        return note("watch.next_scale")
     if any(f.others for f in findings):
-        return (
-            "Look at these parts of the machine; more configurations, and a second station, tell"
-            " such causes apart. Then calibrate again.",
-        )
-    return ("Look at this part of the machine, then calibrate again.",)
+        return note("watch.next_several")
+    return note("watch.next_part")
 
 
 def _would_have(judged: ChangeTests) -> str:
@@ -496,41 +456,31 @@ def found_from(legs: Sequence[LegTest]) -> tuple[str, str]:
     return " to ".join(dict.fromkeys(sizes)), name
 
 
-def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
-    """Why these data are too few, of legs of which they tell too little."""
+def _blind(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
+    """Why these data are too few, of legs about which they say too little."""
     nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
     little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
-    out: list[str] = []
+    out: list[Finding] = []
     if nothing:
-        out.append(f"Of {_of(nothing)} these data tell nothing.")
+        out.append(wrong("watch.leg_blind", _of(nothing), legs=_of(nothing)))
     if little:
-        out.append(
-            f"In {_of(little)} only a change of the reading's zero"
-            f" by {with_unit(*found_from(little))} would be found, which is more than the drawing's"
-            " tolerance."
-        )
+        least = with_unit(*found_from(little))
+        out.append(wrong("watch.leg_weak", _of(little), legs=_of(little), least=least))
     return tuple(out)
 
 
-def _warnings(around: LookedAt) -> tuple[str, ...]:
-    out = [
-        f"The camera {around.names.stations[s.station]} does not stand where the calibration"
-        f" had it: it was moved{_place(s.change)}. Its place was found anew."
-        for s in around.moved
-    ]
+def _warnings(around: LookedAt) -> tuple[Finding, ...]:
+    out: list[Finding] = []
+    for s in around.moved:
+        name = around.names.stations[s.station]
+        facts = {"station": name, "by": _place(s.change), "value": s.change.value}
+        out.append(doubtful("watch.station_moved", name, **facts))
     both = around.known & around.seen
     if both.any():
         names = [*compress(around.configurations, both)]
-        out.append(
-            f"The calibration was made from configuration {listed(names, 4)}: nothing new, and left"
-            " out of the tests."
-        )
+        out.append(doubtful("watch.known_configurations", listed(names, 4), names=names))
     if around.noisier > NOISIER_PHOTOGRAPHS_FACTOR:
-        out.append(
-            f"The edges scatter {around.noisier:.1f} times as much as in the calibration; focus,"
-            " light, a camera that moved between the photographs, or something that bends. The"
-            " tests allow for it, and find less."
-        )
+        out.append(doubtful("watch.noisier", scale=around.noisier))
     return tuple(out)
 
 

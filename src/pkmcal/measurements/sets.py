@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -196,12 +196,12 @@ class Effect:
 class Departure:
     """Something that a session takes for granted and that may be otherwise.
 
-    kind : for programs. of : what departs, by name. says : what the data show and what to do next,
-    from the numbers that fit and their standard deviations (k,). effect : what it does to what was
-    measured; empty for a single reading, see :class:`pkmcal.identify.score.Departures`.
+    code : of its finding. of : what departs, by name. facts : of its finding, from the estimates
+    and their standard deviations (k,). effect : what it does to what was measured; empty
+    for a single reading, see :class:`pkmcal.identify.score.Departures`.
     """
 
-    kind: str
+    code: str
     of: str
-    says: Callable[[Array, Array], tuple[str, str]]
+    facts: Callable[[Array, Array], dict[str, Any]]
     effect: Effect = field(default_factory=Effect)

@@ -122,6 +122,7 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         + " that these photographs show this machine's legs, that each bears the name"
         " of its configuration, and that the drawing is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 20 cm, may help"),
+        code="station.not_recognised",
     )
 
 
@@ -160,6 +161,7 @@ def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> 
                 found="the photographs of each fit the pose of the other",
                 next_step=f"Exchange the poses of {one.name} and {other.name} in session.yaml,"
                 " or their image folders",
+                code="station.exchanged",
             )
     return None
 
@@ -232,7 +234,9 @@ def _likelier(
         return error
     distinct = dict.fromkeys(also)  # and several numberings
     said = f"{error.found}; they fit as well if {' or '.join(distinct)}"
-    return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
+    return InputError(
+        error.what, where=error.where, found=said, next_step=error.next_step, code=error.code
+    )
 
 
 def _replaces(
@@ -357,6 +361,7 @@ def _two_legs(a: int, b: int) -> InputError:
         found="the photographs fit with these two columns exchanged",
         next_step=f"Exchange the columns of legs {a} and {b} in joints.csv, or the two legs in"
         " the drawing",
+        code="readings.exchanged",
     )
 
 
@@ -369,6 +374,7 @@ def _numbering(order: Integers) -> InputError:
         found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
         f" leg 2 those of column {order[1] + 1}, and so on {'round' if rising else 'backwards'}",
         next_step="Give the columns of joints.csv the order of the legs in the drawing",
+        code="readings.numbering_turned" if rising else "readings.numbering_reversed",
     )
 
 
@@ -380,6 +386,7 @@ def _shifted(step: int) -> InputError:
         f" {'before' if step > 0 else 'after'} its own",
         next_step="Look for a row or a photograph that is missing or was taken twice, and name the"
         " photographs by the readings at which they were taken",
+        code="image.shifted",
     )
 
 
@@ -392,6 +399,7 @@ def _misnamed(station: SeenStation, photographs: Integers, fitting: Integers) ->
         where=files[0],
         found="; ".join(f"{f} fits configuration {c}" for f, c in zip(files, fit, strict=True)),
         next_step="Give these photographs, or the rows of joints.csv, the right names",
+        code="image.exchanged",
     )
 
 
@@ -402,6 +410,7 @@ def _mirrored(station: SeenStation) -> InputError:
             where=station.files[0],
             found="the machine is recognised with left and right exchanged",
             next_step="Flip this photograph, or take it again without mirroring",
+            code="image.mirrored",
         )
     return InputError(
         f"the photographs of {station.name} are mirrored",
@@ -409,6 +418,7 @@ def _mirrored(station: SeenStation) -> InputError:
         found="the machine is recognised with left and right exchanged",
         next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
         " the photographs and the camera's calibration alike",
+        code="image.mirrored",
     )
 
 
@@ -419,4 +429,5 @@ def diameters(mechanism: str) -> InputError:
         where=f"{mechanism}, tubes",
         found="the photographs fit with radii half as large",
         next_step="Divide the radii by 2",
+        code="tube.diameter",
     )

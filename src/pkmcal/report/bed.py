@@ -18,7 +18,7 @@ def section(session: Session, errors: tuple[ModelError, ...]) -> Part | None:
     for error in errors:
         if error.sure and error.surface is not None:
             plot = surface_plot(session, error.surface)
-            return Part("bed", "The bed", (uneven_bed(error),), plots=(plot,))
+            return Part("bed", "The bed", (uneven_bed(error).text,), plots=(plot,))
     return None
 
 

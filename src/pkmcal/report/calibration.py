@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
-from pkmcal.outcome import Figure, Outcome, doubtful
+from pkmcal.outcome import Figure, Outcome
 from pkmcal.pages import page
 from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
 from pkmcal.report import (
@@ -66,7 +66,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
         texts=texts_of(c, calibration_document(c, open_, predicted, over, seen)),
         summary={
-            "verdict": asdict(c.verdict),
+            "verdict": c.verdict.document(),
             **(told.summary or {}),
             "session_warnings": c.session.warnings,
             "photographs": c.session.images_taken,
@@ -163,7 +163,7 @@ def report_of(
         partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),
         parts=tuple(part for part in parts if part),
-        findings=tuple(doubtful(text) for text in session.warnings),
+        findings=session.findings,
         summary={"figures": calibration_numbers(observation, estimate, centres, tool)},
     )
 

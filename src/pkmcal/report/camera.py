@@ -66,7 +66,7 @@ def outcome_of(
     return Outcome(
         command="camera",
         title=f"Calibration of a {c.camera.model} camera",
-        verdict=Verdict(True, camera_headline(c), warnings=c.warnings),
+        verdict=Verdict(True, camera_headline(c), c.findings),
         figures=_cards(c),
         parts=(
             Part(

@@ -12,7 +12,8 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
-from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, note
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.pages.plots import (
     COMMON_AXIS_LAYOUT,
     COMMON_PLOT_LAYOUT,
@@ -76,7 +77,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
             usable=True,
             headline=f"These {count(len(found.names), 'configuration')} will tell the tool's"
             f" {_known_to(found.promised)}, standard deviations, mean over the workspace.",
-            advice=(_paying(found), *_carefully(found)),
+            findings=(_paying(found), *_carefully(found)),
         ),
         stamp="Plan",
         figures=(
@@ -102,7 +103,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
             ),
         ),
         parts=tuple(parts),
-        findings=tuple(note(text) for text in found.subject.words),
+        findings=tuple(note("plan.source", text=text) for text in found.subject.words),
         document=plan_document(found),
         texts=texts,
     )
@@ -125,34 +126,24 @@ def _asked(found: MeasurementPlan) -> str:
     return f"{each}, chosen for {INDEX_NAMES[found.index]}; workspace: {found.region}."
 
 
-def _paying(found: MeasurementPlan) -> str:
+def _paying(found: MeasurementPlan) -> Finding:
     """Where more photographs stop paying."""
     last, until = found.promised, found.pays_until
     twice = next(a for a in found.curve if a.count > last.count)
-    more = (
-        f"twice as many would tell the tool's position to {amount(twice.position, 'm')},"
-        f" {1 - twice.position / last.position:.0%} better"
-    )
-    if until is not None:
-        return (
-            f"From {count(until, 'configuration')} a place on, one more betters it by less than"
-            f" {WORTHWHILE_ACCURACY_GAIN:.0%}; {more}."
-        )
-    return (
-        f"All of them pay: each betters the tool by {WORTHWHILE_ACCURACY_GAIN:.0%} at least;"
-        f" {more}."
-    )
+    facts = {
+        "tool_sigma": twice.position,
+        "gain": 1 - twice.position / last.position,
+        "worthwhile": WORTHWHILE_ACCURACY_GAIN,
+    }
+    if until is None:
+        return note("plan.all_pay", **facts)
+    return note("plan.pays_until", number=until, **facts)
 
 
-def _carefully(found: MeasurementPlan) -> tuple[str, ...]:
+def _carefully(found: MeasurementPlan) -> tuple[Finding, ...]:
     """Configurations to which the straight way is blocked."""
     names = [name for name, bad in zip(found.names, found.blocked, strict=True) if bad]
-    if not names:
-        return ()
-    return (
-        f"Go to {listed(names)} by way of home: on the straight way legs would touch, or the"
-        " machine would leave its reach.",
-    )
+    return (note("plan.blocked", listed(names), names=names),) if names else ()
 
 
 def _order(found: MeasurementPlan) -> Part:

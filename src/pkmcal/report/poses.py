@@ -36,7 +36,7 @@ def section(
     if not len(poses):
         return None
     error = errors(poses, estimate)
-    turns = (text for _, text in turning(session, poses, estimate.state.on_platform))
+    turns = (one.text for one in turning(session, poses, estimate.state.on_platform))
     return Part(
         "poses",
         "Board" if session.board else "Measured poses",

@@ -11,7 +11,7 @@ from pkmcal.arrays import Array, Integers, rms
 from pkmcal.control.study import Study, Trials
 from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
-from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict, doubtful
+from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.pages.page import N_COLOURS
 from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_layout
 from pkmcal.wording import brief, number
@@ -116,7 +116,7 @@ def outcome_of(found: Study) -> Outcome:
             Part("legs", "Legs", tables=(choices_table(found),)),
             Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(found),)),
         ),
-        findings=tuple(doubtful(text) for text in found.scene.warnings),
+        findings=found.scene.findings,
         document=document,
         summary={name: value for name, value in document.items() if name != "curves"},
     )
@@ -145,8 +145,9 @@ def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
         "usable": verdict.usable,
         "headline": verdict.headline,
         "reasons": verdict.reasons,
-        "warnings": (*s.scene.warnings, *verdict.warnings),
+        "warnings": (*(one.text for one in s.scene.findings), *verdict.warnings),
         "advice": verdict.advice,
+        "findings": [one.document() for one in verdict.findings],
         "settings": _settings(s),
         "estimates": {o.estimate.name: _outcome_document(o) for o in s.outcomes},
         "stillness": {

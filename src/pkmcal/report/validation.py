@@ -9,7 +9,7 @@ from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
 from pkmcal.judge.words import against, better, factor
-from pkmcal.outcome import Figure, Outcome, Part, Row, Table, doubtful
+from pkmcal.outcome import Figure, Outcome, Part, Row, Table
 from pkmcal.pages import charts
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
@@ -55,7 +55,7 @@ def outcome_of(v: Validation) -> Outcome:
         stamp="Confirmed" if v.verdict.usable else "Not confirmed",
         figures=_cards(v.judged, v) if v.judged else (),
         parts=tuple(part for part in parts if part),
-        findings=tuple(doubtful(text) for text in v.session.warnings),
+        findings=v.session.findings,
         document=v.document(),
     )
 

@@ -8,7 +8,7 @@ from pkmcal.identify.score import Score
 from pkmcal.judge.changes import DETECTION_POWER, LegTest
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
-from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, doubtful
+from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.pages import charts
 from pkmcal.wording import SHOWN_UNITS, amount, brief, count, listed, named, number
 
@@ -59,7 +59,7 @@ def outcome_of(w: Watch) -> Outcome:
         level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,
         figures=_cards(w),
         parts=tuple(part for part in parts if part),
-        findings=tuple(doubtful(text) for text in w.session.warnings),
+        findings=w.session.findings,
         document=w.document(),
     )
 

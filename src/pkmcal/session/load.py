@@ -47,6 +47,7 @@ from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
 from pkmcal.mechanisms.region import Region
+from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
@@ -110,9 +111,11 @@ class RejectedStation:
     reason: str
 
     @property
-    def sentence(self) -> str:
-        """For people."""
-        return f"{self.label}: left out, for {self.reason}."
+    def finding(self) -> Finding:
+        """The warning about it."""
+        return doubtful(
+            "rejected.station", self.label, station=self.station.name, reason=self.reason
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ class Session:
     board : file that describes the calibration board, where a station observes one.
     board_body : what the board is fixed to, base or platform.
     document : session.yaml with defaults, readings and found photographs written out.
-    warnings : sentences about what is not wrong but should be known.
+    findings : what is not wrong but should be known.
     trackers : what measured without photographs; in numbers of stations they follow these.
     model : the machine's model by its name in the mechanism file, None for the file's own.
     mechanism : where the machine came from, for other models of it.
@@ -142,7 +145,7 @@ class Session:
     stations: tuple[Station, ...]
     board: Path | None
     document: dict[str, Any]
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     board_body: BoardBody = "platform"
     trackers: tuple[PoseTable, ...] = ()
     model: str | None = None
@@ -196,8 +199,13 @@ class Session:
         return replace(
             self.of_stations([k for k in range(len(self.stations)) if k not in reasons]),
             rejected=self.rejected + rejected,
-            warnings=self.warnings + tuple(one.sentence for one in rejected),
+            findings=self.findings + tuple(one.finding for one in rejected),
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings' sentences."""
+        return tuple(one.text for one in self.findings)
 
     def label(self, number: int) -> str:
         """What a station is called in messages: a hand-held one by the file of its image."""
@@ -267,22 +275,22 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
                 no_such(machine.joint_units[0], document.data["joints"]["noise"]),
                 where=document.where("joints", "noise"),
             )
-        warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+        findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
         if measured and not schema.stations and not schema.links():
             _check_redundant(document, machine)
             table, repeated = without_repeats(table, noise)
-            warnings += repeated
+            findings += repeated
     else:
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
-        table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), list[str]()
+        table, findings = CsvTable(schema.joints.file, columns, (), none, ()), list[Finding]()
     board = _board(folder, document, schema)
-    warnings += _of_little_use(document, schema)
+    findings += _of_little_use(document, schema)
     stations = tuple(
         made
         for name, station in schema.cameras.items()
         for made in _stations(folder, document, name, station, table.names, measured)
     )
-    warnings += _turned(folder, stations)
+    findings += _turned(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
         given, keys = station.tracker, ("stations", name, "tracker", "poses")
@@ -301,7 +309,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and (schema.stations or links):
-        warnings += _unphotographed(table, stations, tuple(trackers), links)
+        findings += _unphotographed(table, stations, tuple(trackers), links)
     return Session(
         folder=folder,
         machine=machine,
@@ -311,7 +319,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         stations=stations,
         board=board,
         document=_resolved(folder, schema, table, stations),
-        warnings=tuple(warnings),
+        findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
         trackers=tuple(trackers),
         model=model,
@@ -492,20 +500,18 @@ def _workspace(document: Document, schema: SessionDocument) -> Region | None:
         raise error.located(document.where("workspace")) from None
 
 
-def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
+def _of_little_use(document: Document, schema: SessionDocument) -> list[Finding]:
     """A board that is described, and serves nothing."""
     users = schema.observers("board")
     if schema.board is None:
         return []
     if not users:
-        return [f"{document.where('board')}: no station observes the board."]
+        return [doubtful("session.board_unused", document.where("board"))]
     first = schema.stations[users[0]]
     by_hand = isinstance(first, StationDocument) and first.handheld
     if schema.board.fixed_to == "base" and len(users) == 1 and not by_hand:
-        return [
-            f"{document.where('board')}: only station {users[0]} observes the board on the base;"
-            " it takes two for a board to join them."
-        ]
+        where = document.where("board")
+        return [doubtful("session.board_joins_none", where, station=users[0])]
     return []
 
 
@@ -584,7 +590,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
 
 
-def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
+def _turned(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
     """Photographs that were turned by a quarter after they were taken; raises `InputError` for one
     of another size than its camera.
     """
@@ -605,10 +611,7 @@ def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
             turned.append(label)
     if not turned:
         return []
-    return [
-        f"{turned[0]}: turned by a quarter against its camera file, and turned back"
-        f" ({len(turned)} such photographs)."
-    ]
+    return [doubtful("session.turned_by_quarter", turned[0], number=len(turned))]
 
 
 def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
@@ -700,7 +703,7 @@ def _unphotographed(
     stations: tuple[Station, ...],
     trackers: tuple[PoseTable, ...],
     links: tuple[LinkSet, ...],
-) -> list[str]:
+) -> list[Finding]:
     taken = {photo.configuration for station in stations for photo in station.photographs}
     taken |= {int(k) for tracker in trackers for k in tracker.configuration}
     taken |= {int(k) for one in links for k in one.configuration.ravel()}
@@ -717,9 +720,14 @@ def _unphotographed(
     if not missing:
         return []
     return [
-        f"{table.label}: no station has {'measured' if trackers or links else 'a photograph of'}"
-        f" configuration {listed(missing)}"
-        f" ({len(missing)} of {len(table.names)}); their readings are not used."
+        doubtful(
+            "session.unmeasured",
+            table.label,
+            names=missing,
+            number=len(missing),
+            of=len(table.names),
+            by="trackers" if trackers or links else "cameras",
+        )
     ]
 
 

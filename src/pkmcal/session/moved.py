@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -30,14 +31,17 @@ def movement_departures(
     for k in np.unique(moments).tolist():
         before, after = (configurations[int(used[k + d])] for d in (-1, 0))
 
-        def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:
-            return (
-                f"The {what} of {name} stood elsewhere after configuration {b}{how_far(value)}",
-                f"Make two stations of it, one up to {b} and one from {a} on",
-            )
+        def facts(value: Array, _s: Array, b: str = before, a: str = after) -> dict[str, Any]:
+            return {
+                "what": what, "station": name, "before": b, "after": a, "moved": how_far(value),
+                **{
+                    key: float(np.linalg.norm(part)) if np.isfinite(part).all() else None
+                    for key, part in (("turn", value[:3]), ("shift", value[3:]))
+                },
+            }  # fmt: skip
 
         effect = Effect(station=station, since=int(used[k]))
-        yield Departure("station moved", name, says, effect)
+        yield Departure("station.moved", name, facts, effect)
 
 
 def how_far(change: Array) -> str:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from math import pi
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Departure, Effect
-from pkmcal.wording import SHOWN_UNITS, amount, listed, number, ratio_in_per_cent
+from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.wording import SHOWN_UNITS, listed, number
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.
@@ -37,7 +39,9 @@ _UNITS = {
 }
 
 
-def check_readings(table: CsvTable, ranges: Array, noise: float, units: Sequence[str]) -> list[str]:
+def check_readings(
+    table: CsvTable, ranges: Array, noise: float, units: Sequence[str]
+) -> list[Finding]:
     """Raise `InputError` for readings that cannot be this machine's; return warnings.
 
     ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
@@ -77,6 +81,7 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
             found=" ".join(table.columns),
             expected=" ".join(f"leg{number}" for number in sorted(order)),
             next_step="Sort the columns, names and readings together",
+            code="readings.order",
         )
 
 
@@ -95,6 +100,7 @@ def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
                 found=f"{table.values[0, column]:g}",
                 expected=f"{expected}, between {low:g} and {high:g}",
                 next_step=next_step,
+                code="readings.units",
             )
 
 
@@ -114,6 +120,7 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
         found=f"{table.values[row, column]:g}",
         expected=f"{low:g} to {high:g}, where all of them lie with the other sign",
         next_step="Turn the sign of this column round, or the axis and range in the mechanism file",
+        code="readings.sign",
     )
 
 
@@ -157,10 +164,11 @@ def _shifted(
         f" {most} {name} added",
         next_step="Add the readings' constant to these columns, as far as you know it, or put it"
         " into the mechanism file's offsets: what is left of it is calibrated",
+        code="readings.zero",
     )
 
 
-def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
+def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
     far = np.argwhere(~_inside(table.values, ranges))
     if len(far):
         row, column = far[0]
@@ -174,6 +182,7 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
             found=f"{table.values[row, column]:g}",
             expected=f"{low:g} to {high:g}, the range in the mechanism file",
             next_step=f"{more}Correct the reading{way}, or the mechanism's range",
+            code="readings.outside_range",
         )
     near = np.argwhere(~_inside(table.values, ranges, margin=0.0))
     if not len(near):
@@ -181,8 +190,14 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
     row, column = near[0]
     low, high = ranges[column]
     return [
-        f"{table.where(row, column)}: the reading {table.values[row, column]:g} is slightly outside"
-        f" the range {low:g} to {high:g} of the mechanism file ({len(near)} such readings)."
+        doubtful(
+            "readings.outside_range",
+            table.where(row, column),
+            value=float(table.values[row, column]),
+            low=float(low),
+            high=float(high),
+            number=len(near),
+        )
     ]
 
 
@@ -205,6 +220,7 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
         expected="readings that follow the motor",
         next_step="Look at the encoder, its cable and the program that logs it. If this motor was"
         " really held, something else is wrong",
+        code="readings.frozen",
     )
 
 
@@ -226,45 +242,35 @@ def reading_departures(
 
         def scale(
             value: Array, sigma: Array, name: str = name, own: float = float(present[m])
-        ) -> tuple[str, str]:
-            factor = 1 + own * value[0]
-            return (
-                f"The readings of {name} have another scale: true ones are"
-                f" {ratio_in_per_cent(factor - 1, sigma[0])}"
-                f" {'larger' if factor > 1 else 'smaller'}",
-                f"Multiply this column of joints.csv by {factor:.5f} if the encoder's counts"
-                " or the screw's lead agree, or correct it in the controller",
-            )
+        ) -> dict[str, Any]:
+            change = own * value[0]
+            return {"column": name, "value": change, "sigma": sigma[0], "factor": 1 + change}
 
-        def play(value: Array, _s: Array, name: str = name, unit: str = unit) -> tuple[str, str]:
-            return (
-                f"The readings of {name} have a play of {amount(abs(value[0]), unit)}: they differ"
-                " by the way from which the motor came",
-                "Come to every configuration from the same side, or take the play out",
-            )
+        def play(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
+            return {"column": name, "value": value[0], "sigma": sigma[0], "unit": unit}
 
         by_scale, by_way = ((x * one)[..., None] for x in (joints, way))
-        scales.append(Departure("reading scale", name, scale, Effect(readings=by_scale)))
-        plays.append(Departure("backlash", name, play, Effect(readings=by_way)))
+        scales.append(Departure("readings.scale", name, scale, Effect(readings=by_scale)))
+        plays.append(Departure("readings.play", name, play, Effect(readings=by_way)))
     return scales, plays
 
 
 def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
     """A single reading that is wrong."""
 
-    def says(value: Array, sigma: Array) -> tuple[str, str]:
-        return (
-            f"The reading of {column} in configuration {configuration} is off: what was seen tells"
-            f" {amount(abs(value[0]), unit)} {'more' if value[0] > 0 else 'less'}, to"
-            f" {amount(sigma[0], unit)}",
-            "Look it up where readings are logged, and look at its photograph: whether it bears the"
-            " right name, and the edges found lie on the legs; or leave the configuration out",
-        )
+    def facts(value: Array, sigma: Array) -> dict[str, Any]:
+        return {
+            "column": column,
+            "configuration": configuration,
+            "value": value[0],
+            "sigma": sigma[0],
+            "unit": unit,
+        }
 
-    return Departure("reading", f"{column}, {configuration}", says)
+    return Departure("readings.single", f"{column}, {configuration}", facts)
 
 
-def _check_movement(table: CsvTable, noise: float) -> list[str]:
+def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
     still = unmoved_readings(table.values, noise)
     if still.all():
         raise InputError(
@@ -273,14 +279,12 @@ def _check_movement(table: CsvTable, noise: float) -> list[str]:
             found=f"differences of {np.ptp(table.values, axis=0).max():g} at most",
             expected=f"much more than joints.noise, {noise:g}",
             next_step="Check that the readings are the right ones and the noise is not too large",
+            code="readings.unmoved",
         )
     if not still.any():
         return []
     names = [name for name, alike in zip(table.columns, still, strict=True) if alike]
-    return [
-        f"{table.label}: {listed(names)} never moves by more than its noise; what depends on"
-        " that movement cannot be told apart."
-    ]
+    return [doubtful("readings.unmoved", table.label, columns=names)]
 
 
 def same_pose(joints: Array, noise: float) -> Integers:
@@ -300,7 +304,7 @@ def same_pose(joints: Array, noise: float) -> Integers:
     return owner
 
 
-def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]:
+def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Finding]]:
     """The table with rows of one pose made one, at their mean, and a sentence about them.
 
     For readings that are calibrated by themselves. What the model leaves out, a belt that sags or a
@@ -319,11 +323,8 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]
         values=total / np.bincount(group)[:, None],
         lines=tuple(table.lines[row] for row in first),
     )
-    return merged, [
-        f"{table.label}: its {len(group)} rows are of {len(first)} poses, whose readings differ by"
-        f" more than {_ALIKE:g} times joints.noise; each pose counts once, by the mean of its rows,"
-        " for what the model leaves out is the same in all of them."
-    ]
+    rows = {"number": len(group), "poses": len(first), "apart": _ALIKE}
+    return merged, [doubtful("readings.repeated_poses", table.label, **rows)]
 
 
 def _inside(values: Array, ranges: Array, margin: float = _MARGIN) -> np.ndarray:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pkmcal.files import read_yaml
-from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome import Check, Figure, Level, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome.finding import finding, note, wrong
 from pkmcal.studies.engine import StudyProgress, StudyResult
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key, StudySetting
@@ -50,11 +51,9 @@ def reproduce_paper(paper: str, options: Options) -> Outcome:
     found: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
     if found.verdict.usable or options.runs >= Options.runs:
         return found
-    advice = (
-        f"{options.runs} runs are few, and what is expected leaves room for twice their Monte-Carlo"
-        f" error only: simulate {Options.runs} or more.",
-    )
-    return replace(found, verdict=replace(found.verdict, advice=advice))
+    few = note("study.few_runs", runs=options.runs, usual=Options.runs)
+    verdict = replace(found.verdict, findings=(*found.verdict.findings, few))
+    return replace(found, verdict=verdict)
 
 
 class ShownNumber(float):
@@ -130,7 +129,11 @@ class Words:
     ) -> Outcome:
         """The outcome. remarks : names of those that hold. numbers : all, for programs."""
         passed = all(check.passed for check in checks)
-        failed = tuple(check.sentence for check in checks if not check.passed)
+        failed = tuple(
+            wrong("study.missed", check.what, found=check.found, expected=check.expected)
+            for check in checks
+            if not check.passed
+        )
         headline, cited = self.say(self.document["headline"]), self.document["cited"]
         if failed:  # what the words call reproduced may be what is missed
             headline = (
@@ -144,7 +147,7 @@ class Words:
             title=self.document["title"],
             kicker=f"reproduction of paper {self.letter.upper()}",
             subject=cited,
-            verdict=Verdict(passed, headline, reasons=failed),
+            verdict=Verdict(passed, headline, failed),
             stamp=("Reproduced in part" if open_ else "Reproduced") if passed else "Not reproduced",
             partial=bool(open_),
             figures=tuple(
@@ -157,8 +160,13 @@ class Words:
             ),
             parts=(*parts, Part("checks", "Expectations", checks=tuple(checks))),
             findings=tuple(
-                Finding(Level.DOUBTFUL if text in open_ else Level.NOTE, text)
-                for text in said.values()
+                finding(
+                    "study.remark",
+                    Level.DOUBTFUL if text in open_ else Level.NOTE,
+                    name,
+                    text=text,
+                )
+                for name, text in said.items()
             ),
             document={
                 "paper": self.letter,

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict, note
+from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.engine import StudyResult
@@ -70,7 +71,7 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
         verdict=Verdict(
             usable=not bad and not failing,
             headline=_headline(study, gains, bad),
-            reasons=tuple(_reason(cell) for cell in bad) + tuple(map(_failing, failing)),
+            findings=(*map(_reason, bad), *map(_failing, failing)),
         ),
         stamp="Deviations hold" if not bad and not failing else "Look closer",
         figures=_cards(study),
@@ -83,7 +84,7 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
                 text=PAPER_STUDY_METHOD_TEXT if paper else STUDY_METHOD_TEXT,
             ),
         ),
-        findings=tuple(note(text) for text in study.subject.warnings),
+        findings=study.subject.findings,
         closing=f"{count(study.runs * len(study.found), 'run')} in {seconds}.",
         document=study_document(study),
         texts={table: runs_bytes(study, table)},
@@ -126,18 +127,21 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     )
 
 
-def _reason(cell: CellFindings) -> str:
-    where = f"{in_words(cell.values)}: " if cell.values else ""
-    tool, own = 100 * cell.covered_tool.value, 100 * cell.covered.value
-    return (
-        f"{where}95 % intervals hold {own:.1f} % of the parameters and {tool:.1f} % of the tool's"
-        f" poses; {100 * (PROMISED_COVERAGE - COVERAGE_TOLERANCE):.0f} % is the least."
+def _reason(cell: CellFindings) -> Finding:
+    where = in_words(cell.values) if cell.values else ""
+    return wrong(
+        "study.coverage",
+        where,
+        of=where or None,
+        percent=100 * cell.covered.value,
+        tool_percent=100 * cell.covered_tool.value,
+        least=100 * (PROMISED_COVERAGE - COVERAGE_TOLERANCE),
     )
 
 
-def _failing(cell: CellFindings) -> str:
-    where = f"{in_words(cell.values)}: " if cell.values else ""
-    return f"{where}{100 * cell.failed.value:.0f} % of the calibrations fail or do not converge."
+def _failing(cell: CellFindings) -> Finding:
+    where = in_words(cell.values) if cell.values else ""
+    return wrong("study.fails", where, of=where or None, percent=100 * cell.failed.value)
 
 
 def _name(name: str) -> str:
@@ -366,7 +370,7 @@ def study_document(study: SweepResult) -> dict[str, Any]:
             }
             for g in study.gains
         ],
-        "warnings": list(study.subject.warnings),
+        "warnings": [one.text for one in study.subject.findings],
     }  # fmt: skip
 
 

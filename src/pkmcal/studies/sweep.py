@@ -23,6 +23,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
+from pkmcal.outcome.finding import Finding, note
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.placement import check_drawable
@@ -87,11 +88,11 @@ PAPER_NAMES_VARIED: Mapping[str, Varied] = {
 
 @dataclass(frozen=True)
 class StudySubject:
-    """What is studied: a design, or [A] 4.3. name : in words. warnings : what to know of it."""
+    """What is studied: a design, or [A] 4.3. name : in words. findings : what to know of it."""
 
     name: str
     design: Design | JointByAxes
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def names(self) -> Mapping[str, Varied]:
@@ -150,13 +151,13 @@ def _of_session(session: Session) -> StudySubject:
             next_step="Study the machine itself: pkmcal study with its mechanism file",
         )
     on_base = session.board is not None and session.board_body == "base"
-    warnings: list[str] = []
+    findings: list[Finding] = []
     if on_base:
-        warnings.append("The board on the base is left out: what it adds is not simulated.")
+        findings.append(note("study.without_board"))
     if session.trackers:
-        warnings.append("Trackers are left out: only what cameras see is simulated.")
+        findings.append(note("study.without_trackers"))
     if session.workspace is not None:
-        warnings.append("The tool's errors are told over the whole reach, not over its workspace.")
+        findings.append(note("study.whole_reach"))
     words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
     if any(own != words[0] for own in words) or not words[0]:
         raise InputError(
@@ -167,11 +168,11 @@ def _of_session(session: Session) -> StudySubject:
     places = [station.T_camera_base for station in session.stations]
     known = [place for place in places if place is not None]
     if len(known) < len(places):
-        warnings.append("Stations without a pose stand where a camera sees the machine well.")
+        findings.append(note("study.chosen_stations"))
     seen = [{p.configuration for p in station.photographs} for station in session.stations]
     usual = Design.configurations
     if not any(seen):
-        warnings.append(f"There are no photographs yet: {usual} are taken from each place.")
+        findings.append(note("study.no_images", number=usual))
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
@@ -186,7 +187,7 @@ def _of_session(session: Session) -> StudySubject:
         shared=len(seen) > 1 and any(seen) and all(own == seen[0] for own in seen),
         reading_noise=session.joint_noise,
     )
-    return StudySubject(f"the session {session.folder}", design, tuple(warnings))
+    return StudySubject(f"the session {session.folder}", design, tuple(findings))
 
 
 def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:

@@ -18,6 +18,7 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import csv_text, entries, read_text, staged_folder
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
+from pkmcal.outcome.finding import Finding, doubtful
 
 SeenChoice = Literal["legs", "board", "both", "readings"]
 SEEN_CHOICES: tuple[SeenChoice, ...] = ("legs", "board", "both", "readings")
@@ -199,10 +200,10 @@ def _session(text: str, hexapod: bool, turns: bool, seen: SeenChoice, places: in
     return text[:start] + first + "".join(moved) + rest + board
 
 
-def untouched_files(folder: Path | str) -> tuple[str, ...]:
-    """Sentences about the files of a session that are still as `write_session` left them."""
+def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
+    """Warnings about the files of a session that are still as `write_session` left them."""
     return tuple(
-        f"{name} is still the example of pkmcal new: {what}."
+        doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
         if _untouched(Path(folder) / name, name)
     )

@@ -7,12 +7,10 @@ tables and figures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any, Literal
 
-from pkmcal.errors import PkmcalError
+from pkmcal.outcome.finding import Finding, Level
 
 FigureSource = Literal["paper", "prototype", "ours"]
 
@@ -21,69 +19,57 @@ FigureSource = Literal["paper", "prototype", "ours"]
 class Verdict:
     """What a person should know first.
 
-    usable : whether the result may be loaded into a controller.
-    headline : one sentence. reasons : why not usable. warnings : what to look at. advice : what
-    would make it better.
+    usable : whether the result may be loaded into a controller. headline : one sentence.
+    findings : reasons against the result, warnings, and advice, by their level.
     """
 
     usable: bool
     headline: str
-    reasons: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why not usable, in sentences."""
+        return self._texts(Level.WRONG)
 
-class Level(StrEnum):
-    """How bad a finding is."""
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to look at, in sentences."""
+        return self._texts(Level.DOUBTFUL)
 
-    WRONG = "wrong"
-    DOUBTFUL = "doubtful"
-    NOTE = "note"
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What would make it better, in sentences."""
+        return self._texts(Level.NOTE)
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Of the findings."""
+        return tuple(one.code for one in self.findings)
+
+    def of(self, code: str) -> tuple[Finding, ...]:
+        """The findings of a code, or of an area as ``readings``."""
+        return tuple(
+            one for one in self.findings if one.code == code or one.code.startswith(f"{code}.")
+        )
+
+    def document(self) -> dict[str, Any]:
+        """For programs: sentences, and the findings with their codes and facts."""
+        return {
+            "usable": self.usable,
+            "headline": self.headline,
+            "reasons": self.reasons,
+            "warnings": self.warnings,
+            "advice": self.advice,
+            "findings": [one.document() for one in self.findings],
+        }
+
+    def _texts(self, level: Level) -> tuple[str, ...]:
+        return tuple(one.text for one in self.findings if one.level is level)
 
 
 Mark = Literal["good"] | Level
 """What to think of something: that all is well, or how bad it is."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing found, as a sentence; station : where it is one's. error : that it tells of."""
-
-    level: Level
-    text: str
-    station: str | None = None
-    error: PkmcalError | None = None
-
-    def document(self) -> dict[str, Any]:
-        """For programs; of an error what every error tells."""
-        told = {"level": self.level.value, "text": self.text, "station": self.station}
-        return told if self.error is None else {**told, **_parts_of(self.error)}
-
-
-def first_error(findings: Sequence[Finding]) -> dict[str, Any]:
-    """What a command's JSON tells of an error, of the first among findings; nothing without one."""
-    errors = (finding.error for finding in findings if finding.error is not None)
-    return next((_parts_of(error) for error in errors), {})
-
-
-def _parts_of(error: PkmcalError) -> dict[str, Any]:
-    """All but the exit code, which is the command's."""
-    return {name: value for name, value in error.as_dict().items() if name != "exit_code"}
-
-
-def wrong(error: PkmcalError, station: str | None = None) -> Finding:
-    """An error as a finding."""
-    return Finding(Level.WRONG, str(error), station, error)
-
-
-def doubtful(text: str, station: str | None = None) -> Finding:
-    """What costs accuracy."""
-    return Finding(Level.DOUBTFUL, text, station)
-
-
-def note(text: str, station: str | None = None) -> Finding:
-    """What is worth knowing."""
-    return Finding(Level.NOTE, text, station)
 
 
 @dataclass(frozen=True)
