@@ -9,7 +9,7 @@ import pytest
 
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.model_errors import UNEVEN_BED, sentences
+from pkmcal.calibration.model_errors import UNEVEN_BED
 from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.saved import load
 from pkmcal.calibration.source import load_source
@@ -77,7 +77,7 @@ def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
     assert (error.code, error.sure) == (UNEVEN_BED, True)
     assert 1e-3 * SIZE / 3 < error.scale < 3e-3 * SIZE
     assert 1e-3 * LENGTH / 3 < error.length < 3e-3 * LENGTH
-    assert sentences(found.model_errors)[0] in found.verdict.warnings
+    assert f"discrepancy.{UNEVEN_BED}" in found.verdict.codes
 
 
 def test_deviations_contain_the_unevenness(uneven):
@@ -109,7 +109,8 @@ def test_check_finds_what_calibrate_finds(uneven):
     _, kit, found = uneven
     findings = check_session(kit).findings
     assert all(one.level is not Level.WRONG for one in findings)
-    assert sentences(found.model_errors)[0] in [one.text for one in findings]
+    (warning,) = found.verdict.of(f"discrepancy.{UNEVEN_BED}")
+    assert warning.text in [one.text for one in findings if one.code == warning.code]
 
 
 def test_a_flat_bed_is_flat(tmp_path):
@@ -123,11 +124,11 @@ def test_a_wrong_motor_is_named_where_it_explains_more_than_an_uneven_bed(tmp_pa
     kit = kit_of(tmp_path, scale=(1.0, 1.0, 1.03))
     found = calibrate_session(kit)
     (violation,) = found.departures
-    assert (violation.kind, violation.of) == ("reading scale", "stepper_c")
+    assert (violation.code, violation.of) == ("readings.scale", "stepper_c")
     assert abs(violation.value[0] - 0.03) < 4 * violation.sigma[0]
     assert violation.against
     assert not found.verdict.usable
-    assert violation.sentence in [one.text for one in check_session(kit).findings]
+    assert violation.finding.text in [one.text for one in check_session(kit).findings]
 
 
 # ------------------------------------------------------------------ what is not determined
@@ -142,7 +143,7 @@ def dropped(tmp_path_factory):
 
 def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
     (violation,) = dropped.departures
-    assert violation.kind == "station moved"
+    assert violation.code == "station.moved"
     rx, ry, turn, x, y, z = violation.value
     assert np.isnan([turn, x, y]).all()
     assert np.isinf(violation.sigma[2:5]).all()
@@ -151,7 +152,7 @@ def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
     assert violation.score.dof == 3
     document = json_value(violation.document())
     assert document["value"][2:5] == document["sigma"][2:5] == [None] * 3
-    assert "as far as these data determine it" in violation.sentence
+    assert violation.finding.facts["shift"] is violation.finding.facts["turn"] is None
 
 
 def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
