@@ -74,8 +74,12 @@ def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary) / folder.name
         shutil.copytree(folder, copy, ignore=shutil.ignore_patterns(TRUTH))
-        found = calibrate.calibrate_session(copy, seed=seed)
-    session, measurements, estimate = found.session, found.measurements, found.estimate
+        calibration = calibrate.calibrate_session(copy, seed=seed)
+    session, measurements, estimate = (
+        calibration.session,
+        calibration.measurements,
+        calibration.estimate,
+    )
     truth = read_truth(folder, session.machine)
     if isinstance(truth, str):
         raise SystemExit(f"{folder.name}: {truth}")
@@ -89,14 +93,14 @@ def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
     turn = (edges.basis.mT @ (edges.normal - normal)[..., None])[..., 0]
     line = lines(measurements)[1]
     rng = np.random.default_rng(seed)
-    out = [tool_error(found, estimate, truth)]
+    out = [tool_error(calibration, estimate, truth)]
     for share in (1.0, 0.5):
         errors = []
         for _ in range(draws):
             sign = rng.choice([-1.0, 1.0], size=line.max() + 1)[line]
-            moved = edges_at(edges, normal, share * sign[:, None] * turn)
-            again = bundle(session.machine, replace(measurements, edges=moved), estimate.state)
-            errors.append(tool_error(found, again, truth))
+            shifted = edges_at(edges, normal, share * sign[:, None] * turn)
+            again = bundle(session.machine, replace(measurements, edges=shifted), estimate.state)
+            errors.append(tool_error(calibration, again, truth))
         out.append(rms(np.array(errors)))
     return tuple(1e3 * error for error in out)
 
@@ -110,8 +114,8 @@ def main() -> None:
     options = parser.parse_args()
     print(f"{'tool, mm':24} calibrated  other signs  half the errors")
     for folder in options.folders:
-        found = allowed(folder.resolve(), options.draws, options.seed)
-        print(f"{folder.name:24} {found[0]:10.3f} {found[1]:12.3f} {found[2]:16.3f}", flush=True)
+        value = allowed(folder.resolve(), options.draws, options.seed)
+        print(f"{folder.name:24} {value[0]:10.3f} {value[1]:12.3f} {value[2]:16.3f}", flush=True)
 
 
 if __name__ == "__main__":

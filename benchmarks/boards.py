@@ -17,7 +17,7 @@ from pkmcal.arrays import THREADS
 from pkmcal.boards.board import load_board
 from pkmcal.boards.poses import detect_in
 from pkmcal.observe.images import Pictures
-from pkmcal.session.photographs import photograph_header
+from pkmcal.session.image_files import photograph_header
 
 ROUNDS = 5
 
@@ -30,15 +30,15 @@ def main() -> int:
     images = Pictures(paths, photograph_header(paths[0]), names)  # none is kept decoded
     detect_in(images[:1], board, names[:1])  # what is imported at first use
     walls, processors = list[float](), list[float]()
-    found = 0
+    count = 0
     for _ in range(ROUNDS):
         wall, processor = time.perf_counter(), time.process_time()
-        found = sum(detection.found for detection in detect_in(images, board, names))
+        count = sum(detection.success for detection in detect_in(images, board, names))
         walls.append(time.perf_counter() - wall)
         processors.append(time.process_time() - processor)
     n = len(paths)
     sys.stdout.write(
-        f"{found} of {n} found; {n / min(walls):.0f} a second,"
+        f"{count} of {n} found; {n / min(walls):.0f} a second,"
         f" {1e3 * min(processors) / n:.1f} ms of processor each:"
         f" {n * THREADS / min(processors):.0f} a second on {THREADS}"
         f" free processors\n"

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_SOURCE_FILE, CSource, c_array
 from pkmcal.export.samples import samples
@@ -135,13 +135,15 @@ def sizes(name: str, folder: Path, prefix: str, flags: list[str]) -> str:
     subprocess.run(build, cwd=folder, check=True)
     command = [f"{prefix}size", "-A", str(Path(C_SOURCE_FILE).with_suffix(".o"))]
     done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
-    found = {
+    results = {
         line.split()[0]: int(line.split()[1])
         for line in done.stdout.splitlines()
         if line.startswith(".")
     }
-    code = sum(size for section, size in found.items() if section.startswith(".text"))
-    data = sum(size for section, size in found.items() if section.startswith((".data", ".rodata")))
+    code = sum(size for section, size in results.items() if section.startswith(".text"))
+    data = sum(
+        size for section, size in results.items() if section.startswith((".data", ".rodata"))
+    )
     frames = [
         int(line.split("\t")[1])
         for line in next(folder.glob("*.su")).read_text().splitlines()

@@ -29,9 +29,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from solver import most_megabytes
 
 import pkmcal
-from pkmcal.calibration.outvoted import outvoted
+from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
@@ -67,14 +67,14 @@ def of_edges(count: int) -> Iterator[Step]:
     def estimated() -> None:
         made["estimate"] = bundle(machine, measurements, begin)
 
-    def told() -> None:
-        _, info = as_ended(measurements, made["estimate"])
+    def report() -> None:
+        _, info = linearize_at_solution(measurements, made["estimate"])
         identifiability(info, made["estimate"].machine)
 
     yield "edges: assemble", assembled
     yield "edges: solve", solved
     yield "edges: joint estimate, robust", estimated
-    yield "edges: what the data tell", told
+    yield "edges: what the data tell", report
 
 
 def of_table(count: int) -> Iterator[Step]:
@@ -90,13 +90,13 @@ def of_table(count: int) -> Iterator[Step]:
         def calibrated() -> None:
             made["result"] = pkmcal.calibrate(made["session"])
 
-        def told() -> None:
+        def report() -> None:
             result = made["result"]
-            list(outvoted(result.session, result.measurements, result.estimate))
+            list(outlier_explanations(result.session, result.measurements, result.estimate))
 
         yield "table: load", loaded
         yield "table: calibrate", calibrated
-        yield "table: of it, what was outvoted", told
+        yield "table: of it, what was outvoted", report
         yield "table: report and files", lambda: made["result"].save(out)
         yield "table: read back", lambda: pkmcal.load_result(out)
 
@@ -106,13 +106,13 @@ KINDS: dict[str, Callable[[int], Iterator[Step]]] = {"edges": of_edges, "table":
 
 def measured(kind: str, count: int) -> dict[str, float]:
     """Processor seconds of each step, and the greatest memory in MB, of this process."""
-    found: dict[str, float] = {}
+    results: dict[str, float] = {}
     for name, work in KINDS[kind](count):
         begin = time.process_time()
         work()
-        found[name] = time.process_time() - begin
-    found[f"{kind}: MB"] = most_megabytes()
-    return found
+        results[name] = time.process_time() - begin
+    results[f"{kind}: MB"] = most_megabytes()
+    return results
 
 
 def main() -> int:

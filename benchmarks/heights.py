@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import printers
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.contract import make_export
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
@@ -63,20 +63,20 @@ class Truth:
 
 def drawn(rng: np.random.Generator, of_a_kit: bool) -> Truth:
     """A random printer."""
-    says = printers.Settings()
-    rods = np.array(says.rod) + 0.3 * rng.normal() + 0.1 * rng.normal(size=3)
+    describe = printers.Settings()
+    rods = np.array(describe.rod) + 0.3 * rng.normal() + 0.1 * rng.normal(size=3)
     off = 0.5 * rng.normal(size=3)
     built = replace(
-        says,
-        radius=says.radius + 0.5 * rng.normal(),
-        angle=tuple(np.array(says.angle) + 0.2 * rng.normal(size=3)),
+        describe,
+        radius=describe.radius + 0.5 * rng.normal(),
+        angle=tuple(np.array(describe.angle) + 0.2 * rng.normal(size=3)),
         rod=tuple(rods),
     )
     rise = np.sqrt(np.square(built.rod) - built.radius**2)
-    right = replace(built, endstop=tuple(says.homed + off - rise))
+    right = replace(built, endstop=tuple(describe.homed + off - rise))
     lean = np.deg2rad(0.1) * rng.normal(size=(3, 2)) if of_a_kit else None
     scale = tuple(1 + 3e-4 * rng.normal(size=3)) if of_a_kit else (1.0, 1.0, 1.0)
-    return Truth(says, right, printers.machine(built, lean, scale, tuple(off)))
+    return Truth(describe, right, printers.machine(built, lean, scale, tuple(off)))
 
 
 def position(settings: printers.Settings, carriages: Array) -> Array:
@@ -99,14 +99,16 @@ def position(settings: printers.Settings, carriages: Array) -> Array:
     return one + x[:, None] * ex + y[:, None] * ey + z[:, None] * np.cross(ex, ey)
 
 
-def by_klipper(says: printers.Settings, readings: Array) -> printers.Settings:
+def by_klipper(describe: printers.Settings, readings: Array) -> printers.Settings:
     """Klipper's values from carriages (n, 3) mm, by what its firmware says, on the bed."""
-    travel = says.homed - readings
-    at = dict(zip(NAMES, (says.radius, *says.angle[:2], *says.endstop), strict=True))
+    travel = describe.homed - readings
+    at = dict(zip(NAMES, (describe.radius, *describe.angle[:2], *describe.endstop), strict=True))
 
     def settings(values: dict[str, float]) -> printers.Settings:
         x = [values[name] for name in NAMES]
-        return replace(says, radius=x[0], angle=(x[1], x[2], says.angle[2]), endstop=tuple(x[3:]))
+        return replace(
+            describe, radius=x[0], angle=(x[1], x[2], describe.angle[2]), endstop=tuple(x[3:])
+        )
 
     def error(values: dict[str, float]) -> float:
         tried = settings(values)
@@ -121,8 +123,8 @@ def by_klipper(says: printers.Settings, readings: Array) -> printers.Settings:
         for name in NAMES:
             for sign in (1, -1):
                 trial = {**at, name: at[name] + sign * step[name]}
-                if (found := error(trial)) < best:
-                    at, best = trial, found
+                if (value := error(trial)) < best:
+                    at, best = trial, value
                     step[name] *= GROW
                     break
             else:
@@ -131,7 +133,7 @@ def by_klipper(says: printers.Settings, readings: Array) -> printers.Settings:
 
 
 def calibrated(
-    says: printers.Settings,
+    describe: printers.Settings,
     readings: Array,
     noise: float | None = None,
     tolerance: str = "",
@@ -144,7 +146,7 @@ def calibrated(
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        (folder / "printer.cfg").write_text(printers.printer_cfg(says, readings))
+        (folder / "printer.cfg").write_text(printers.printer_cfg(describe, readings))
         write_printer_session(folder / "kit", folder / "printer.cfg")
         text = (folder / "kit" / "session.yaml").read_text()
         if noise is not None:
@@ -159,10 +161,10 @@ def calibrated(
         return calibrate_session(folder / "kit")
 
 
-def exported(found: Calibration) -> printers.Settings:
+def exported(calibration: Calibration) -> printers.Settings:
     """What is exported for the firmware."""
-    bed = found.findings.bed
-    source = MachineSource(found.machine, bed=bed.z if bed else None)
+    bed = calibration.findings.bed
+    source = MachineSource(calibration.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")
     each = {
@@ -182,10 +184,10 @@ def moved(
     """
     k = np.arange(400)
     r, a = radius * np.sqrt((k + 0.5) / len(k)), k * np.pi * (3 - np.sqrt(5)) + 0.3
-    told = np.column_stack([r * np.cos(a), r * np.sin(a), 0 * r])
-    travel = pasted.homed - pasted.carriages(told)
+    values = np.column_stack([r * np.cos(a), r * np.sin(a), 0 * r])
+    travel = pasted.homed - pasted.carriages(values)
     there = 1e3 * truth.machine.forward(1e-3 * (truth.says.homed - travel))[:, :3, 3]
-    plane = np.column_stack([told[:, :2], np.ones(len(k))])
+    plane = np.column_stack([values[:, :2], np.ones(len(k))])
     flat = there[:, 2] - plane @ np.linalg.lstsq(plane, there[:, 2], rcond=None)[0]
     slopes = np.linalg.lstsq(plane, there[:, :2], rcond=None)[0][:2]
     rms = [1e3 * float(np.sqrt(np.mean(np.square(z)))) for z in (there[:, 2], flat)]
@@ -228,38 +230,38 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
     of the touches is too high.
     """
     rows: dict[str, list[tuple[float, ...]]] = {"before": [], "Klipper": [], "pkmcal": []}
-    told: list[tuple[float, ...]] = []
+    values: list[tuple[float, ...]] = []
     for seed in range(count):
         rng = np.random.default_rng([seed, int(of_a_kit)])
         truth = drawn(rng, of_a_kit)
         readings = printers.felt(truth.machine, printers.bed(n, RADIUS), noise, rng)
         readings[n // 2] += wrong
-        readings = truth.says.homed - printers.STEP * np.round(
-            (truth.says.homed - readings) / printers.STEP
+        readings = truth.sentence.homed - printers.STEP * np.round(
+            (truth.sentence.homed - readings) / printers.STEP
         )
         told_tolerance = KIT if of_a_kit else IDEAL
-        calibration = calibrated(truth.says, readings, noise, told_tolerance)
+        calibration = calibrated(truth.sentence, readings, noise, told_tolerance)
         ours, usable = exported(calibration), calibration.verdict.usable
         bed = calibration.findings.bed
         pasted = {
-            "before": truth.says,
-            "Klipper": by_klipper(truth.says, readings),
+            "before": truth.sentence,
+            "Klipper": by_klipper(truth.sentence, readings),
             "pkmcal": ours,
         }
         for name, settings in pasted.items():
             rows[name].append((*moved(truth, settings), *errors(truth, settings)))
         # a deviation is stated for the disc that was probed, no wider
         _, flat, size = moved(truth, ours, 1e3 * bed.radius)
-        told.append((flat / (1e6 * bed.sigma), size / bed.size, usable))
-    for name, found in rows.items():
+        values.append((flat / (1e6 * bed.sigma), size / bed.size, usable))
+    for name, item in rows.items():
         if name == "before" and n != NUMBERS[0]:
             continue
-        x = np.array(found)
+        x = np.array(item)
         r = root(x)
         cells = [r[0], r[1], np.median(x[:, 1]), x[:, 1].max(), 1e3 * r[2], *r[3:]]
         title = f"{n:3d} points, {1e3 * noise:2.0f} um, {name:10}"
         print(title + "".join(f"{c:9.2f}" for c in cells))
-    t = np.array(told)
+    t = np.array(values)
     inside = np.mean(np.abs(t[:, 1]) < 1.96)
     print(
         f"    error over stated deviation: flat {root(t[:, 0]):.2f}, size {root(t[:, 1]):.2f}"

@@ -33,8 +33,8 @@ def drawn(machine: Machine, count: int) -> tuple[np.ndarray, np.ndarray]:
     around = home[:, None] + [-0.03, 0.03]
     low, high = np.where(np.isfinite(ranges), ranges, around).T
     readings = np.random.default_rng(0).uniform(low, high, (count, machine.n_joints))
-    found = machine.forward_result(readings)
-    return readings[found.converged], found.T_base_platform[found.converged]
+    fk = machine.forward_result(readings)
+    return readings[fk.converged], fk.T_base_platform[fk.converged]
 
 
 def best(work: Callable[[], object], repeats: int, calls: int = 1) -> tuple[float, float]:

@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.cameras import Camera
 from pkmcal.control.loop import VisualServo
-from pkmcal.control.seen import true_edges
+from pkmcal.control.machine_view import true_edges
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulation.demo import camera_of_size
@@ -53,9 +53,9 @@ def allocated(call: Callable[[], object]) -> tuple[float, float]:
     peak = tracemalloc.get_traced_memory()[1] - before
     for _ in range(100):
         call()
-    left = tracemalloc.get_traced_memory()[0] - before
+    remainder = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
-    return peak / 1024, left / 1024
+    return peak / 1024, remainder / 1024
 
 
 def shown(name: str, call: Callable[[], object], calls: int) -> None:
@@ -63,8 +63,8 @@ def shown(name: str, call: Callable[[], object], calls: int) -> None:
     call()
     first = 1e3 * (time.thread_time() - begin)
     own, wall = timed(call, calls)
-    peak, left = allocated(call)
-    columns = (*np.quantile(own, [0, 0.5, 0.99, 1]), np.median(wall), first, peak, left)
+    peak, remainder = allocated(call)
+    columns = (*np.quantile(own, [0, 0.5, 0.99, 1]), np.median(wall), first, peak, remainder)
     print(f"{name:34}" + "".join(f"{value:9.2f}" for value in columns))
 
 
@@ -88,7 +88,7 @@ def main() -> None:
     print(f"{f'{calls} calls, ms of one core':34}" + "".join(f"{head:>9}" for head in heads))
     for law in ("edges", "directions"):
         servo = VisualServo(machine, camera, T, goal, law=law, start=pose)
-        edges = true_edges(servo.seen, pose)
+        edges = true_edges(servo.view, pose)
         shown(f"{law}: from edges", partial(servo.step_edges, edges, readings), calls)
         less = edges.copy()
         less[1] = np.nan

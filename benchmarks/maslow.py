@@ -50,9 +50,9 @@ def runs_of(path: Path) -> list[np.ndarray]:
     for line in path.read_text(encoding="utf-8").splitlines():
         if re.match(r"\s*Run\b", line):
             runs.append([])
-        found = dict(re.findall(r"(\w+):\s*([\d.]+)", line))
-        if set(BELTS) <= set(found):
-            runs[-1].append([1e-3 * float(found[belt]) for belt in BELTS])
+        actual_names = dict(re.findall(r"(\w+):\s*([\d.]+)", line))
+        if set(BELTS) <= set(actual_names):
+            runs[-1].append([1e-3 * float(actual_names[belt]) for belt in BELTS])
     return [np.array(run) for run in runs if run]
 
 
@@ -99,17 +99,17 @@ def main() -> None:
     parser.add_argument("--every-row", action="store_true")
     args = parser.parse_args()
     noise = APART if args.every_row else args.noise
-    values, sigmas, left, ahead = [], [], [], []
+    values, sigmas, residual, ahead = [], [], [], []
     for number, lengths in enumerate(runs_of(args.file), start=1):
-        found = calibrated(lengths, args.model, noise)
-        value, sigma = anchors(found)
+        result = calibrated(lengths, args.model, noise)
+        value, sigma = anchors(result)
         values.append(value)
         sigmas.append(sigma)
-        used = found.session.joints
-        scale = found.estimate.statistics.reading_scale
-        rest = residuals(found, used)
+        used = result.session.joints
+        scale = result.estimate.statistics.reading_scale
+        rest = residuals(result, used)
         if not args.every_row:  # the rows' poses are the same in all runs
-            left.append(rest)
+            residual.append(rest)
             poses = np.arange(len(used))
             for fold in range(5):
                 others = calibrated(used[poses % 5 != fold], args.model, noise)
@@ -125,10 +125,10 @@ def main() -> None:
     sigma = np.sqrt(np.mean(np.square(sigmas), axis=0))
     print(f"\n{'mm':8}{'spread':>8}{'sigma':>8}{'ratio':>8}{'again':>8}")
     again = np.full(len(sigma), np.nan)
-    if left:
-        common = np.mean(left, axis=0)
-        differ = np.mean((np.array(left) - common) ** 2) * len(left) / (len(left) - 1)
-        again = sigma * np.sqrt(differ / np.mean(np.square(left)))
+    if residual:
+        common = np.mean(residual, axis=0)
+        differ = np.mean((np.array(residual) - common) ** 2) * len(residual) / (len(residual) - 1)
+        again = sigma * np.sqrt(differ / np.mean(np.square(residual)))
     for name, *row in zip(
         ("br.x", "tr.x", "tr.y", "tl.x", "tl.y"), spread, sigma, again, strict=True
     ):

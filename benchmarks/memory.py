@@ -137,8 +137,8 @@ def repeated(base: Path, folder: Path, configurations: int, noise: float = 3e-6)
     shutil.copytree(
         base, stage, ignore=shutil.ignore_patterns("images", "truth.json", "joints.csv")
     )
-    said = (base / "session.yaml").read_text(encoding="utf-8")
-    stated, changes = re.subn(r"noise: [-+.e0-9]+", f"noise: {noise:.1e}", said)
+    words = (base / "session.yaml").read_text(encoding="utf-8")
+    stated, changes = re.subn(r"noise: [-+.e0-9]+", f"noise: {noise:.1e}", words)
     if changes != 1:
         raise SystemExit("session.yaml of the simulated session states its noise in another way")
     (stage / "session.yaml").write_text(stated, encoding="utf-8")

@@ -39,7 +39,7 @@ def main() -> None:
     print(f"{args.runs} sessions, {args.stations} x {args.configurations} photographs")
     print("true, stated (um)   told  factor   tool (mm)  stated    z")
     for true_noise, stated in (CASES[k] for k in args.cases):
-        told, factors, off, sigma, z = [], [], [], [], []
+        rows, factors, off, sigma, z = [], [], [], [], []
         for seed in range(args.runs):
             settings = Settings(stations=args.stations, configurations=args.configurations)
             truth = draw_truth(drawing, (camera,) * args.stations, settings, seed)
@@ -52,20 +52,23 @@ def main() -> None:
                 edges, joints, stated, args.stations, np.zeros(args.stations, dtype=int)
             )
             rough = np.stack([place.T_camera_base() for place in truth.rough])
-            found = bundle(drawing, given, start_state(drawing, given, rough))
-            by = platform_by_parameters(found.machine, found.state.T_base_platform)
-            error = by @ (found.machine.values - truth.machine.values)
-            covariance = by @ found.covariance @ by.T
-            factors.append(found.statistics.reading_scale)
-            told.append(factors[-1] != 1)
+            fit = bundle(drawing, given, start_state(drawing, given, rough))
+            by = platform_by_parameters(fit.machine, fit.state.T_base_platform)
+            error = by @ (fit.machine.values - truth.machine.values)
+            covariance = by @ fit.covariance @ by.T
+            factors.append(fit.statistics.reading_scale)
+            rows.append(factors[-1] != 1)
             off.append(error @ error)
             sigma.append(np.trace(covariance))
             values, vectors = np.linalg.eigh(covariance)
-            known = values > 1e-8 * values[-1]
-            z.append(np.sum((vectors.T @ error)[known] ** 2 / values[known]) / known.sum())
+            above_limit = values > 1e-8 * values[-1]
+            z.append(
+                np.sum((vectors.T @ error)[above_limit] ** 2 / values[above_limit])
+                / above_limit.sum()
+            )
         off, sigma, z = (1e3 * np.sqrt(np.mean(x)) for x in (off, sigma, z))
         print(
-            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {np.mean(told):5.0%}"
+            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {np.mean(rows):5.0%}"
             f" {np.median(factors):8.3g}"
             f"  {off:8.4f} {sigma:8.4f} {z / 1e3:6.2f}",
             flush=True,

@@ -43,16 +43,16 @@ def subject_of(name: str, stations: int, board: bool) -> Subject:
     """A catalogue machine with a camera of 1280x960."""
     machine = load_mechanism(name)
     cameras = [camera_of_size((1280, 960))] * stations
-    seen = board_for(machine, "platform") if board else None
-    return of_machine(machine, cameras, machine.joint_names, board=seen)
+    in_view = board_for(machine, "platform") if board else None
+    return of_machine(machine, cameras, machine.joint_names, board=in_view)
 
 
-def by_chance(found: MeasurementPlan, rng: np.random.Generator) -> tuple[float, float]:
+def by_chance(plan: MeasurementPlan, rng: np.random.Generator) -> tuple[float, float]:
     """Mean and least deviation, m, of DRAWS choices by chance."""
-    rig, groups = found.subject.rig, tuple((s,) for s in range(len(found.subject.rig.names)))
+    rig, groups = plan.subject.rig, tuple((s,) for s in range(len(plan.subject.rig.names)))
     drawn = configurations(rig.machine, 2 * POOL, rng)
     evenly = [part[len(part) // 2 :] for part in drawn]
-    info = information_of(rig, Candidates.of_all(groups, *evenly), found.work)
+    info = information_of(rig, Candidates.of_all(groups, *evenly), plan.work)
     n = len(evenly[0])
     each = []
     for _ in range(DRAWS):
@@ -65,10 +65,10 @@ def by_chance(found: MeasurementPlan, rng: np.random.Generator) -> tuple[float, 
 
 
 def long_search(
-    found: MeasurementPlan, seconds: float, rng: np.random.Generator
+    plan: MeasurementPlan, seconds: float, rng: np.random.Generator
 ) -> tuple[float, int]:
     """The least deviation, m, that was found, and how many searches were made."""
-    rig, groups = found.subject.rig, tuple((s,) for s in range(len(found.subject.rig.names)))
+    rig, groups = plan.subject.rig, tuple((s,) for s in range(len(plan.subject.rig.names)))
     best, searches, until = np.inf, 0, time.perf_counter() + seconds
     chosen = None
     while time.perf_counter() < until:
@@ -83,10 +83,10 @@ def long_search(
             pool, start = joined(chosen, pool)
         now = pool
         for _ in range(6):
-            info = information_of(rig, pool, found.work)
+            info = information_of(rig, pool, plan.work)
             now = pool.only(np.sort(exchanged(info, start, PLAN_INDICES["tool"](info))))
             pool, start = joined(now, about(rig.machine, now, rng))
-        info = information_of(rig, now, found.work)
+        info = information_of(rig, now, plan.work)
         value = info.tool(info.covariance(info.of(np.arange(len(now.group)))))[0]
         if value < best:
             best, chosen = value, now
@@ -132,18 +132,18 @@ def main() -> None:
         for name, case in CASES.items():
             rng = np.random.default_rng(options.seed + 1)
             begun = time.process_time()
-            found = plan_measurements(subject_of(*case), seed=options.seed)
+            value = plan_measurements(subject_of(*case), seed=options.seed)
             took = time.process_time() - begun
             # as on average for all, so that only the choice differs
-            rig, n = found.subject.rig, len(found.names)
+            rig, n = value.subject.rig, len(value.names)
             numbers = {station: k for k, station in enumerate(rig.names)}
-            group = np.array([numbers[s[0]] for s in found.stations])
+            group = np.array([numbers[s[0]] for s in value.stations])
             groups = tuple((s,) for s in range(len(rig.names)))
-            own = Candidates(groups, group, found.joints, found.T_base_platform)
-            info = information_of(rig, own, found.work)
+            own = Candidates(groups, group, value.joints, value.T_base_platform)
+            info = information_of(rig, own, value.work)
             planned = info.tool(info.covariance(info.of(np.arange(n))))[0]
-            chance, luckiest = by_chance(found, rng)
-            far, searches = long_search(found, 60 * options.long, rng)
+            chance, luckiest = by_chance(value, rng)
+            far, searches = long_search(value, 60 * options.long, rng)
             print(
                 f"{name:28}{planned * 1e3:12.4f}{chance * 1e3:12.4f}{planned / chance:12.3f}"
                 f"{luckiest * 1e3:12.4f}{far * 1e3:12.4f}{planned / far:12.3f}{searches:12d}"

@@ -30,7 +30,7 @@ import yaml
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_measurements
-from pkmcal.calibration.gather import measurements_of, refinement_of
+from pkmcal.calibration.camera_refinement import measurements_of, refinement_of
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.cylinders import contour_point, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation, rotation_vector
@@ -180,8 +180,8 @@ def bow(metres: float) -> Error:
         side = np.cross(u, [0, 0, 1.0])
         side /= np.linalg.norm(side, axis=-1)[..., None]
         angle = rng.uniform(0, 2 * np.pi, s.q.shape[1])[:, None]
-        way = np.cos(angle) * side + np.sin(angle) * np.cross(u, side)
-        d.bend += (metres * way)[:, :, None] * _bow(d)[..., None]
+        direction = np.cos(angle) * side + np.sin(angle) * np.cross(u, side)
+        d.bend += (metres * direction)[:, :, None] * _bow(d)[..., None]
 
     return make
 
@@ -234,8 +234,8 @@ def creeping(metres: float) -> Error:
     """A camera or tracker that sinks and turns slowly."""
 
     def make(s: Scene, d: Deformed, rng: np.random.Generator) -> None:
-        way = rng.standard_normal(6) * np.repeat([metres / 3, metres], 3)
-        d.camera += s.time[:, None] * way
+        direction = rng.standard_normal(6) * np.repeat([metres / 3, metres], 3)
+        d.camera += s.time[:, None] * direction
 
     return make
 
@@ -244,9 +244,9 @@ def lens(stations: range, **factors: float) -> Error:
     """Stations whose true intrinsics are others than their file's, by factors."""
 
     def make(_s: Scene, d: Deformed, rng: np.random.Generator) -> None:
-        way = rng.choice([-1, 1])
+        sense = rng.choice([-1, 1])
         for k in stations:
-            d.lens[k] = {name: 1 + way * (x - 1) for name, x in factors.items()}
+            d.lens[k] = {name: 1 + sense * (x - 1) for name, x in factors.items()}
 
     return make
 
@@ -440,15 +440,15 @@ def write_texts(
 def write_poses(folder: Path, scene: Scene, d: Deformed, T: np.ndarray, rng: Any) -> None:
     """The tracker's table."""
     target = pose(rotation(np.array([0.3, 0.2, 0.4])), np.array([0.03, 0.02, -0.04]))
-    seen = perturb(T @ d.base @ scene.poses @ target, d.camera)
-    noise = np.repeat(TRACKER_NOISE[::-1], 3) * rng.standard_normal((len(seen), 6))
+    in_view = perturb(T @ d.base @ scene.poses @ target, d.camera)
+    noise = np.repeat(TRACKER_NOISE[::-1], 3) * rng.standard_normal((len(in_view), 6))
     # noise of the target about itself, not about the tracker
-    middle = seen[:, :3, 3].copy()
-    seen = perturb(seen, noise)
-    seen[:, :3, 3] = middle + noise[:, 3:]
-    turn = rotation_vector(seen[:, :3, :3])
+    middle = in_view[:, :3, 3].copy()
+    in_view = perturb(in_view, noise)
+    in_view[:, :3, 3] = middle + noise[:, 3:]
+    turn = rotation_vector(in_view[:, :3, :3])
     rows = [["configuration", "x", "y", "z", "rx", "ry", "rz"]]
-    for k, (x, r) in enumerate(zip(seen[:, :3, 3].tolist(), turn.tolist(), strict=True)):
+    for k, (x, r) in enumerate(zip(in_view[:, :3, 3].tolist(), turn.tolist(), strict=True)):
         rows.append([f"{k:04d}", *map(repr, x), *map(repr, r)])
     with (folder / "poses.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
@@ -480,14 +480,14 @@ def judged(result: Any, scene: Scene) -> Outcome:
     error = result.tool_error(scene.poses)
     off = tool_error(
         scene.machine, result.machine, error.parameters, scene.poses, scene.q,
-        legs_seen=result.estimate.edge_weights.size > 0,
+        legs_observed=result.estimate.edge_weights.size > 0,
     )  # fmt: skip
     sigma = float(np.sqrt(np.nanmean(error.position**2)))
     z = float(np.sqrt(np.nanmean(off.off_position**2))) / sigma
     v = result.verdict
-    said = tuple(f"{one.code}: {one.text}" for one in v.findings if one.level is not Level.NOTE)
+    text = tuple(f"{one.code}: {one.text}" for one in v.findings if one.level is not Level.NOTE)
     what = "refused" if not v.usable else "warned" if v.warnings else "silent"
-    return Outcome(what, z, sigma, said)
+    return Outcome(what, z, sigma, text)
 
 
 def outcome(error: str, observer: str, seed: int) -> Outcome:
@@ -524,24 +524,24 @@ def main() -> None:
             for observer in observers:
                 if options.observer not in (None, observer):
                     continue
-                found = list(
+                value = list(
                     pool.map(outcome, *zip(*[(error, observer, k) for k in seeds], strict=True))
                 )
-                count = [sum(x.what == w for x in found) for w in ("refused", "warned", "silent")]
+                count = [sum(x.what == w for x in value) for w in ("refused", "warned", "silent")]
                 beyond = [
-                    sum(x.what == w and x.z > FAR for x in found) for w in ("warned", "silent")
+                    sum(x.what == w and x.z > FAR for x in value) for w in ("warned", "silent")
                 ]
                 far += beyond[1]
-                z = np.array([x.z for x in found if x.what != "refused"])
+                z = np.array([x.z for x in value if x.what != "refused"])
                 middle, worst = (np.median(z), z.max()) if z.size else (np.nan, np.nan)
-                sigma = np.nanmedian([x.sigma for x in found] + [np.nan]) * 1e3
+                sigma = np.nanmedian([x.sigma for x in value] + [np.nan]) * 1e3
                 numbers = "".join(f"{k:11}" for k in (*count, *beyond))
                 print(f"{error + ', ' + observer:36}{numbers}{middle:11.2f}{worst:11.2f}"
                       f"{sigma:11.4f}", flush=True)  # fmt: skip
                 if options.list:
-                    for k, x in zip(seeds, found, strict=True):
-                        said = " | ".join(x.findings)[:400]
-                        print(f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {said}")
+                    for k, x in zip(seeds, value, strict=True):
+                        text = " | ".join(x.findings)[:400]
+                        print(f"    {k}: {x.what} {x.z:.2f} {x.sigma * 1e3:.4f} {text}")
     print(f"silent beyond {FAR:g}: {far}; {time.perf_counter() - begin:.0f} s")
 
 

@@ -48,25 +48,25 @@ def drawn(rng: np.random.Generator, error: str, *, uneven: bool) -> tuple[Truth,
     """A printer with one kind of error, or all, and the size (mm) of its bed."""
     radius = rng.uniform(90, 140)
     rod = radius * rng.uniform(2.0, 2.4)
-    says = printers.Settings(
+    describe = printers.Settings(
         round(radius, 2), rod=(round(rod, 2),) * 3, endstop=(round(1.2 * rod, 2),) * 3
     )
     wrong = {name: float(error in (name, "all")) for name in ERRORS}  # switches always are
     ends = SWITCH_ERROR * (rng.normal(size=3) if uneven else np.full(3, rng.normal()))
     built = replace(
-        says,
-        radius=says.radius + wrong["radius"] * RADIUS_ERROR * rng.normal(),
-        angle=tuple(np.array(says.angle) + wrong["towers"] * TOWER_ERROR * rng.normal(size=3)),
+        describe,
+        radius=describe.radius + wrong["radius"] * RADIUS_ERROR * rng.normal(),
+        angle=tuple(np.array(describe.angle) + wrong["towers"] * TOWER_ERROR * rng.normal(size=3)),
         rod=tuple(
-            np.array(says.rod)
+            np.array(describe.rod)
             + wrong["rods"] * (ROD_ERROR * rng.normal() + OWN_ROD_ERROR * rng.normal(size=3))
         ),
     )
     right = replace(
         built,
-        endstop=tuple(says.homed + ends - np.sqrt(np.square(built.rod) - built.radius**2)),
+        endstop=tuple(describe.homed + ends - np.sqrt(np.square(built.rod) - built.radius**2)),
     )
-    return Truth(says, right, printers.machine(built, endstops=tuple(ends))), 0.8 * radius
+    return Truth(describe, right, printers.machine(built, endstops=tuple(ends))), 0.8 * radius
 
 
 def places(n: int, reach: float, turn: float) -> Array:
@@ -85,17 +85,17 @@ def tower_radius(centres: Array) -> tuple[float, Array]:
     by = np.zeros((3, 2))
     total = 0.0
     for one, other in ((0, 1), (1, 2), (2, 0)):
-        way = centres[one] - centres[other]
-        apart = float(np.linalg.norm(way))
+        direction = centres[one] - centres[other]
+        apart = float(np.linalg.norm(direction))
         total += apart
-        by[one] += way / apart
-        by[other] -= way / apart
+        by[one] += direction / apart
+        by[other] -= direction / apart
     return total / 3 / np.sqrt(3), by / 3 / np.sqrt(3)
 
 
-def radius_deviations(truth: Truth, found: Calibration) -> float:
+def radius_deviations(truth: Truth, calibration: Calibration) -> float:
     """Error of the radius in its standard deviations."""
-    machine = found.machine
+    machine = calibration.machine
     table = machine.parameters
     radius, by = tower_radius(machine.base_centers()[:, :2])
     row = np.zeros(len(table))
@@ -103,7 +103,7 @@ def radius_deviations(truth: Truth, found: Calibration) -> float:
         for axis, name in enumerate("xy"):
             row[table.index(f"legs[{leg + 1}].base.center.{name}")] = by[leg, axis]
     true = tower_radius(truth.machine.base_centers()[:, :2])[0]
-    return (radius - true) / float(np.sqrt(row @ found.estimate.covariance @ row))
+    return (radius - true) / float(np.sqrt(row @ calibration.estimate.covariance @ row))
 
 
 def judged(
@@ -118,14 +118,14 @@ def judged(
     )
     readings[int(rng.integers(n))] += wrong
     try:
-        found = calibrated(truth.says, readings, centre_tolerance=tolerance)
+        value = calibrated(truth.sentence, readings, centre_tolerance=tolerance)
     except PkmcalError as fault:
         return "refused", str(fault)
-    bed = found.findings.bed
-    if not found.verdict.usable or bed is None:
-        return "refused", " ".join(found.verdict.reasons)
-    bent = moved(truth, exported(found), 1e3 * bed.radius)[1]
-    flat, radius = bent / (1e6 * bed.sigma), radius_deviations(truth, found)
+    bed = value.findings.bed
+    if not value.verdict.usable or bed is None:
+        return "refused", " ".join(value.verdict.reasons)
+    bent = moved(truth, exported(value), 1e3 * bed.radius)[1]
+    flat, radius = bent / (1e6 * bed.sigma), radius_deviations(truth, value)
     good = flat <= MOST_DEVIATIONS and abs(radius) <= MOST_DEVIATIONS
     return (
         "right" if good else "wrong",
@@ -148,12 +148,12 @@ def main() -> None:
             for number, error in enumerate(ERRORS):
                 for uneven in (False, True):
                     rng = np.random.default_rng([seed, n, number, int(uneven)])
-                    as_found, figures = judged(
+                    stated_edge_noise, figures = judged(
                         rng, n, error, uneven, options.tolerance, options.wrong_height
                     )
-                    of_points[as_found] += 1
+                    of_points[stated_edge_noise] += 1
                     switches = "uneven" if uneven else "even"
-                    print(f"{n:3d} points, {error:8} {switches:6} {as_found:7} {figures}")
+                    print(f"{n:3d} points, {error:8} {switches:6} {stated_edge_noise:7} {figures}")
             print(f"{n:3d} points: {dict(of_points)}", flush=True)
             every += of_points
     total = sum(every.values())

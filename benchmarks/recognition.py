@@ -77,11 +77,11 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
     turned about their line of sight.
     """
     from pkmcal.calibration.calibrate import calibrate_session
-    from pkmcal.calibration.recognise import (
+    from pkmcal.calibration.localization import (
         boards_of,
         check_observable,
+        localize_stations,
         read_photographs,
-        station_poses,
     )
     from pkmcal.errors import PkmcalError
     from pkmcal.session.load import load_session
@@ -94,35 +94,35 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         photographs = read_photographs(session)
         boards = boards_of(session, photographs)
         begin = time.process_time()  # of the search alone, where it comes to that
-        found = station_poses(session, photographs, boards, np.random.default_rng(seed))
+        values = localize_stations(session, photographs, boards, np.random.default_rng(seed))
     except PkmcalError as error:
         return Outcome("refused", str(error), time.process_time() - begin, error.code)
     seconds = time.process_time() - begin
     true = load_truth(folder, session.machine).T_camera_base
     if upside_down:
         true = np.diag([-1.0, -1.0, 1.0, 1.0]) @ true
-    right, said = _near(found, true)
+    right, text = _near(values, true)
     if not right:
         try:
             end = calibrate_session(session, seed=seed).estimate.state.T_camera_base
         except PkmcalError as error:
-            return Outcome("refused", f"{said} at first; {error}", seconds, error.code)
+            return Outcome("refused", f"{text} at first; {error}", seconds, error.code)
         right, after = _near(end, true)
-        said = f"{said}; calibrated, {after}"
-    return Outcome("right" if right else "wrong", said, seconds / len(session.stations))
+        text = f"{text}; calibrated, {after}"
+    return Outcome("right" if right else "wrong", text, seconds / len(session.stations))
 
 
-def _near(found: np.ndarray, true: np.ndarray) -> tuple[bool, str]:
+def _near(values: np.ndarray, true: np.ndarray) -> tuple[bool, str]:
     """Whether cameras T_camera_base (S, 4, 4) stand near where they do in truth, and how far off
     the worst is, in words.
     """
     from pkmcal.geometry.rigid import angle_between, inverse
 
-    at, there = (inverse(T)[:, :3, 3] for T in (found, true))
+    at, there = (inverse(T)[:, :3, 3] for T in (values, true))
     place = np.linalg.norm(at - there, axis=1) / np.linalg.norm(there, axis=1)
-    turn = angle_between(found, true)
-    said = f"{100 * place.max():.1f} % of the distance, {np.degrees(turn.max()):.1f} degrees off"
-    return bool((place < NEAR).all() and (turn < TURNED).all()), said
+    turn = angle_between(values, true)
+    text = f"{100 * place.max():.1f} % of the distance, {np.degrees(turn.max()):.1f} degrees off"
+    return bool((place < NEAR).all() and (turn < TURNED).all()), text
 
 
 def calibrated(folder: Path, seed: int) -> Outcome:
@@ -277,14 +277,14 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
         if no_pose:
             without_poses(copy)
         mistake.make(copy, np.random.default_rng(seed))
-        found = recognised(copy, seed, upside_down=name == "upside down")
-        if mistake.code and found.what != "refused":
-            found = calibrated(copy, seed)
+        value = recognised(copy, seed, upside_down=name == "upside down")
+        if mistake.code and value.what != "refused":
+            value = calibrated(copy, seed)
     if not mistake.code:
-        return found._replace(what="named" if found.what == "right" else found.what)
-    if found.what != "refused":
-        return found._replace(what="not noticed")
-    return found._replace(what="named" if found.code == mistake.code else "refused")
+        return value._replace(what="named" if value.what == "right" else value.what)
+    if value.what != "refused":
+        return value._replace(what="not noticed")
+    return value._replace(what="named" if value.code == mistake.code else "refused")
 
 
 # ------------------------------------------------------------------ told

@@ -132,17 +132,17 @@ def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Sessi
         rng = np.random.default_rng([seed, 1])
         pixels = pixels + CORNER_SIGMA * rng.normal(size=pixels.shape)
         inside = camera.in_image(pixels, margin=2.0)
-        found = []
-        for k, seen in enumerate(inside):
-            ids = np.flatnonzero(seen)
+        results = []
+        for k, in_view in enumerate(inside):
+            ids = np.flatnonzero(in_view)
             sigma = np.full(len(ids), CORNER_SIGMA)
             reason = "" if len(ids) >= 12 else "out of the picture"
-            found.append(
+            results.append(
                 Detection(f"{k:03d}.png", camera.image_size, ids, pixels[k, ids], sigma, reason)
             )
         (folder / "images").mkdir(parents=True)
         grey = cv2.imencode(".png", np.full((960, 1280), 128, dtype=np.uint8))[1].tobytes()
-        for item in found:
+        for item in results:
             (folder / "images" / item.name).write_bytes(grey)
         (folder / "camera.yaml").write_text(yaml_text(camera.document()))
         document = {k: v for k, v in made.document.items() if k != "tolerance"}
@@ -152,7 +152,7 @@ def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Sessi
         }  # fmt: skip
         more = {"stations": {"tripod": station}, "board": "board.yaml"}
         written(folder, drawing, truth.readings, noise, **more)
-        return Session(folder, truth.machine, truth.T_base_platform, truth.joints, tuple(found))
+        return Session(folder, truth.machine, truth.T_base_platform, truth.joints, tuple(results))
 
     return make
 
@@ -173,8 +173,8 @@ def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
         poses, joints = draw_configurations(truth, count, 0.5, rng)
         place = pose(rotation(rng.normal(size=3)), rng.normal(size=3))
         target = pose(rotation(rng.normal(size=3)), 0.03 * rng.normal(size=3))
-        seen = perturb(place @ poses @ target, TRACKER_SIGMA * rng.normal(size=(len(poses), 6)))
-        values = np.concatenate([seen[:, :3, 3], rotation_vector(seen[:, :3, :3])], axis=1)
+        in_view = perturb(place @ poses @ target, TRACKER_SIGMA * rng.normal(size=(len(poses), 6)))
+        values = np.concatenate([in_view[:, :3, 3], rotation_vector(in_view[:, :3, :3])], axis=1)
         columns = ("x", "y", "z", "rx", "ry", "rz")[: 3 if points else 6]
         sigma = {"rotation": TRACKER_SIGMA[0], "position": TRACKER_SIGMA[3]}
         table = {"poses": "poses.csv", "noise": {k: float(v) for k, v in sigma.items()}}
@@ -221,7 +221,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
         from pkmcal.printers.session import write_printer_session
 
         rng = np.random.default_rng(seed)
-        true, says = true_printer(rng), printers.machine(printers.Settings())
+        true, describe = true_printer(rng), printers.machine(printers.Settings())
         line = np.linspace(-90.0, 90.0, ticks)
         grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         inside = np.hypot(*grid.T) <= 90.5
@@ -229,7 +229,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
         noise = int(rng.integers(2**32))
         for _ in range(4):  # to where the firmware believes to be at the grid's points
             readings = printers.felt(true, touched, HEIGHT_SIGMA, np.random.default_rng(noise))
-            points = 1e3 * says.forward(1e-3 * readings)[:, :3, 3]
+            points = 1e3 * describe.forward(1e-3 * readings)[:, :3, 3]
             touched, heights = touched + goal - points[:, :2], points[:, 2]
         rows = np.zeros(len(grid))
         rows[inside] = heights
@@ -238,9 +238,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
         text = "RepRapFirmware height map file v2\n"
         text += "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
         text += f"-90,90.1,-90,90.1,90.5,{spacing:.2f},{spacing:.2f},{ticks},{ticks}\n"
-        text += "".join(
-            ", ".join(cells[k : k + ticks]) + "\n" for k in range(0, len(cells), ticks)
-        )
+        text += "".join(", ".join(cells[k : k + ticks]) + "\n" for k in range(0, len(cells), ticks))
         folder.parent.mkdir(parents=True, exist_ok=True)
         file, probed = folder.parent / "config.g", folder.parent / "heightmap.csv"
         s = printers.Settings()
@@ -280,14 +278,14 @@ def off_by(result: Any, session: Session) -> float:
 
     if session.machine is None:
         return float("nan")
-    legs_seen = result.estimate.edge_weights.size > 0
+    legs_observed = result.estimate.edge_weights.size > 0
     stated = tool_error(
         result.session.machine, result.machine, result.estimate.covariance,
-        session.poses, session.readings, legs_seen=legs_seen,
+        session.poses, session.readings, legs_observed=legs_observed,
     )  # fmt: skip
     off = tool_error(
         session.machine, result.machine, stated.parameters, session.poses, session.readings,
-        legs_seen=legs_seen,
+        legs_observed=legs_observed,
     )  # fmt: skip
     return float(np.sqrt(np.nanmean(off.off_position**2) / np.nanmean(stated.position**2)))
 
@@ -298,18 +296,18 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
 
     from pkmcal import calibrate
     from pkmcal.errors import PkmcalError
-    from pkmcal.identify.bundle import as_ended
+    from pkmcal.identify.bundle import linearize_at_solution
     from pkmcal.identify.kinds import READING_ROWS_KIND
     from pkmcal.identify.noise import noise_shares
 
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         session = KINDS[kind](Path(temporary) / "session", seed)
         corners = session.detections
-        found = patch("pkmcal.boards.stations.detect_in", lambda *_: corners)
+        item = patch("pkmcal.boards.stations.detect_in", lambda *_: corners)
         quiet = patch("pkmcal.boards.stations.check_boards", lambda *_: None)
         begin, none = time.perf_counter(), nullcontext()
         try:
-            with found if corners else none, quiet if corners else none:
+            with item if corners else none, quiet if corners else none:
                 result = calibrate(session.folder)
         except PkmcalError as error:
             seconds = time.perf_counter() - begin
@@ -319,7 +317,7 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
     verdict, statistics = result.verdict, result.estimate.statistics
     findings = {
         "refused": list(verdict.reasons),
-        "departure": [one.finding.text for one in result.departures],
+        "departure": [one.finding.text for one in result.violations],
         "outvoted": [
             one.text
             for code in ("readings.outvoted", "configurations.misnamed")
@@ -332,7 +330,7 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
         "rejected": [f"{lost} of {result.estimate.pose_weights.size} measured poses"] * (lost > 0),
         "other": list(verdict.warnings),
     }
-    _, info = as_ended(result.measurements, result.estimate)
+    _, info = linearize_at_solution(result.measurements, result.estimate)
     low, high = noise_shares(info, READING_ROWS_KIND).interval(INTERVAL_MISS)
     scale = statistics.reading_scale
     return Outcome(
@@ -351,37 +349,37 @@ def main() -> None:
     options = parser.parse_args()
     kinds = [k for k in KINDS if not options.kind or any(word in k for word in options.kind)]
     seeds = range(options.first, options.first + options.sessions)
-    said, every, within, two_ended = [], 0, [], []
+    words, every, within, two_ended = [], 0, [], []
     with tempfile.TemporaryDirectory() as temporary, ProcessPoolExecutor(options.workers) as pool:
         print(f"{'':26}{'n':>4}" + "".join(f"{name:>10}" for name in (*FINDINGS, "any"))
               + f"{'interval':>10}{'two ends':>10}{'z rms':>7}{'worst':>7}{'s':>6}")  # fmt: skip
         for kind in kinds:
             jobs = [(kind, seed, Path(temporary)) for seed in seeds]
-            found = list(pool.map(outcome, *zip(*jobs, strict=True)))
-            hit = [[bool(one.findings.get(name)) for name in FINDINGS] for one in found]
-            shown = np.array(hit)
-            holds = np.array([one.low <= 1 <= one.high for one in found])
-            both = np.array([one.low > 0 and np.isfinite(one.high) for one in found])
-            z = np.array([one.z for one in found])
-            every += int(shown.any(axis=1).sum())
+            results = list(pool.map(outcome, *zip(*jobs, strict=True)))
+            hit = [[bool(one.findings.get(name)) for name in FINDINGS] for one in results]
+            visible = np.array(hit)
+            holds = np.array([one.low <= 1 <= one.high for one in results])
+            both = np.array([one.low > 0 and np.isfinite(one.high) for one in results])
+            z = np.array([one.z for one in results])
+            every += int(visible.any(axis=1).sum())
             within += holds.tolist()
             two_ended += holds[both].tolist()
             z_rms = np.sqrt(np.nanmean(z**2)) if np.isfinite(z).any() else float("nan")
             worst = np.nanmax(z) if np.isfinite(z).any() else float("nan")
-            print(f"{kind:26}{len(found):4d}"
-                  + "".join(f"{n:10d}" for n in (*shown.sum(axis=0), shown.any(axis=1).sum()))
+            print(f"{kind:26}{len(results):4d}"
+                  + "".join(f"{n:10d}" for n in (*visible.sum(axis=0), visible.any(axis=1).sum()))
                   + f"{holds.mean():10.0%}{holds[both].sum():6d}/{both.sum():<3d}"
-                  f"{z_rms:7.2f}{worst:7.2f}{np.mean([one.seconds for one in found]):6.1f}",
+                  f"{z_rms:7.2f}{worst:7.2f}{np.mean([one.seconds for one in results]):6.1f}",
                   flush=True)  # fmt: skip
-            for seed, one in zip(seeds, found, strict=True):
+            for seed, one in zip(seeds, results, strict=True):
                 names = (*FINDINGS, "other") if options.other else FINDINGS
-                said += [f"{kind}, {seed}: {name}: {text}" for name in names
+                words += [f"{kind}, {seed}: {name}: {text}" for name in names
                          for text in one.findings.get(name, ())]  # fmt: skip
     n = len(kinds) * len(seeds)
     print(f"\n{every} of {n} sessions have a finding; intervals hold the truth in"
           f" {np.mean(within):.1%}, those with two ends in {np.mean(two_ended or [np.nan]):.1%}"
           f" of {len(two_ended)}\n")  # fmt: skip
-    print("\n".join(said))
+    print("\n".join(words))
 
 
 if __name__ == "__main__":

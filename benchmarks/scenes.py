@@ -152,10 +152,10 @@ def forward(
     for _ in range(30):
         arm = b @ rot.mT
         leg = arm + t[:, None] - a
-        found = np.linalg.norm(leg, axis=-1)
-        u = leg / found[..., None]
+        values = np.linalg.norm(leg, axis=-1)
+        u = leg / values[..., None]
         by_pose = np.concatenate([np.cross(arm, u), u], axis=-1)
-        step = (np.linalg.pinv(by_pose) @ (length - found)[..., None])[..., 0]
+        step = (np.linalg.pinv(by_pose) @ (length - values)[..., None])[..., 0]
         rot, t = turned(step[:, :3]) @ rot, t + step[:, 3:]
         if np.abs(step).max() < 1e-13:
             break
@@ -179,8 +179,8 @@ def errors_of(
     project = without_frames(a, b)
     error = project @ np.concatenate([part.ravel() for part in off])
     value, vectors = np.linalg.eigh(project @ covariance @ project)
-    known = value > NOTHING * value.max()
-    z = (vectors.T @ error)[known] / np.sqrt(value[known])
+    above_limit = value > NOTHING * value.max()
+    z = (vectors.T @ error)[above_limit] / np.sqrt(value[above_limit])
     true, stated = _tool(a, b, offset, project, covariance, truth, base, platform, seed)
     size = np.sum(true * np.linalg.solve(stated, true[..., None])[..., 0], axis=-1) / 3
     station, turn = (), ()
@@ -195,7 +195,7 @@ def errors_of(
         b=rms(off[1]),
         offset=rms(off[2]),
         nees=float(np.sum(z**2)),
-        dof=int(known.sum()),
+        dof=int(above_limit.sum()),
         worst=float(np.abs(z).max()),
         tool=rms(np.linalg.norm(true, axis=-1)),
         tool_stated=float(np.sqrt(np.trace(stated, axis1=1, axis2=2).mean())),
@@ -231,8 +231,8 @@ def _tool(
     # the true pose in the estimate's frames: x' = base x, X' = platform X
     rot = base[:3, :3] @ rot @ platform[:3, :3].T
     t = moved(base, t) - rot @ platform[:3, 3]
-    found, place = forward(a, b, length - truth.offset + offset, rot, t)
-    arm = b @ found.mT
+    fk, place = forward(a, b, length - truth.offset + offset, rot, t)
+    arm = b @ fk.mT
     leg = arm + place[:, None] - a
     u = leg / np.linalg.norm(leg, axis=-1)[..., None]
     by_pose = np.concatenate([np.cross(arm, u), u], axis=-1)
@@ -240,7 +240,7 @@ def _tool(
     by_all, k = np.zeros((POSES, n, 7 * n)), np.arange(n)
     columns = 3 * k[:, None] + np.arange(3)
     by_all[:, k[:, None], columns] = -u
-    by_all[:, k[:, None], 3 * n + columns] = u @ found
+    by_all[:, k[:, None], 3 * n + columns] = u @ fk
     by_all[:, k, 6 * n + k] = -1
     by = -(np.linalg.pinv(by_pose) @ by_all @ project)[:, 3:]
     return place - t, by @ covariance @ by.mT
@@ -255,13 +255,13 @@ def read_truth(folder: Path, drawing: Any) -> TrueMachine | str:
     if "pkmcal_truth" in data:
         from pkmcal.simulation.truth import load_truth
 
-        told = load_truth(folder, drawing)
-        numbers = numbers_of(told.machine)
+        items = load_truth(folder, drawing)
+        numbers = numbers_of(items.machine)
         if isinstance(numbers, str):
             return numbers
-        seen = told.T_base_platform[told.photographs[:, 1]]
-        values = told.machine.values[numbers]
-        return TrueMachine(*parts_of(values), told.T_camera_base, seen)
+        in_view = items.T_base_platform[items.photographs[:, 1]]
+        values = items.machine.values[numbers]
+        return TrueMachine(*parts_of(values), items.T_camera_base, in_view)
     missing = [key for key in ("A_base", "B_platform", "joint_offsets") if key not in data]
     if missing:
         return f"the truth has no {', '.join(missing)}"
@@ -314,9 +314,9 @@ def spoilt(document: dict[str, Any], error: tuple[float, float], rng: np.random.
             continue
         place, at, up = (np.array(station["pose"][key], float) for key in
                          ("position", "look_at", "up"))  # fmt: skip
-        axis, way = rng.normal(size=(2, 3))
+        axis, direction = rng.normal(size=(2, 3))
         rot = turned(error[1] * axis / np.linalg.norm(axis))
-        there = place + error[0] * way / np.linalg.norm(way)
+        there = place + error[0] * direction / np.linalg.norm(direction)
         pose = {"position": there, "look_at": there + rot @ (at - place), "up": rot @ up}
         station["pose"] = {key: value.round(4).tolist() for key, value in pose.items()}
 
@@ -349,20 +349,20 @@ def run(folder: Path, options: argparse.Namespace) -> Row:
             paths = [p.path for s in session.stations for p in s.photographs]
             row = replace(row, photographs=len(paths))
             with patch.object(calibrate, "time", clock):
-                found = calibrate.calibrate_session(session, seed=options.seed)
+                calibration = calibrate.calibrate_session(session, seed=options.seed)
         except PkmcalError as error:
             return replace(row, refusal=str(error), seconds=time.process_time() - begin)
         seconds = time.process_time() - begin
-        looked = found.timings.get("decode", 0.0) + found.timings["observe"]
+        remeasured = calibration.timings.get("decode", 0.0) + calibration.timings["observe"]
         plain = min(decode_and_canny(paths) for _ in range(3))
-    errors = score(found, folder)
+    errors = score(calibration, folder)
     return replace(
         row,
-        usable=found.verdict.usable,
-        headline=" ".join([found.verdict.headline, *found.verdict.reasons]),
+        usable=calibration.verdict.usable,
+        headline=" ".join([calibration.verdict.headline, *calibration.verdict.reasons]),
         errors=None if isinstance(errors, str) else errors,
         refusal=f"not scored: {errors}" if isinstance(errors, str) else "",
-        observe=looked / plain,
+        observe=remeasured / plain,
         seconds=seconds,
     )
 
@@ -413,9 +413,9 @@ def cells(row: Row) -> list[str]:
     stations = [f"{max(part):.2f}" if part else "–" for part in
                 ([1e3 * x for x in e.station], np.degrees(e.station_turn).tolist())]  # fmt: skip
     sizes = [f"{1e3 * x:.3f}" for x in (e.a, e.b, e.offset, e.tool, e.tool_stated)]
-    told = [f"{e.tool_z:.2f}", f"{e.whitened:.2f}{beyond}", f"{low:.2f}-{high:.2f}"]
+    rows = [f"{e.tool_z:.2f}", f"{e.whitened:.2f}{beyond}", f"{low:.2f}-{high:.2f}"]
     usable = "yes" if row.usable else "no"
-    return [*start, usable, *stations, *sizes, *told, f"{e.worst:.1f}", *times]
+    return [*start, usable, *stations, *sizes, *rows, f"{e.worst:.1f}", *times]
 
 
 def tell(rows: list[Row]) -> None:
@@ -434,8 +434,8 @@ def tell(rows: list[Row]) -> None:
     out.print(table)
     for row in rows:
         if row.refusal or not row.usable:
-            said = row.refusal or row.headline
-            out.print(f"\n{row.name}: {said}", markup=False, soft_wrap=True)
+            text = row.refusal or row.headline
+            out.print(f"\n{row.name}: {text}", markup=False, soft_wrap=True)
     whitened, dof = together(rows)
     if dof:
         low, high = honest(dof, 0.95)
@@ -481,13 +481,13 @@ def main(words: list[str] | None = None) -> None:
     poses.add_argument("--pose-error", nargs=2, type=float, metavar=("M", "DEG"))
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(words)
-    found = [session for folder in options.folders for session in sessions_in(folder.resolve())]
-    unknown = [path for path in found if not (path / TRUTH).exists()]
-    if not found or unknown:
+    results = [session for folder in options.folders for session in sessions_in(folder.resolve())]
+    unknown = [path for path in results if not (path / TRUTH).exists()]
+    if not results or unknown:
         parser.error(f"no session with a {TRUTH} in {unknown or options.folders}")
     rows: list[Row] = []
-    for number, session in enumerate(found, start=1):
-        print(f"{number} of {len(found)}: {session.name}", file=sys.stderr)
+    for number, session in enumerate(results, start=1):
+        print(f"{number} of {len(results)}: {session.name}", file=sys.stderr)
         rows.append(run(session, options))
     if options.json:
         print(json_text(document(rows)), end="")

@@ -80,7 +80,7 @@ class Flat:
         """Rotation vectors and translations added to the start."""
         na = self.problem.unknowns.count
         own = x[na:].reshape(1, self.start.T_base_platform.shape[1], -1)
-        return self.problem.moved(self.start, x[None, :na], own)
+        return self.problem.retract(self.start, x[None, :na], own)
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """All residuals in one vector."""
@@ -136,8 +136,8 @@ def against_scipy(count: int) -> bool:
     ours, our_time, _ = timed(lambda: minimise(problem, start), REPEATS)
     rows = [("pkmcal", our_time, int(ours.steps[0]), float(ours.cost[0]))]
     for name, jac in (("scipy, our Jacobian", flat.jacobian), ("scipy, 2-point", "2-point")):
-        found, seconds, _ = timed(lambda j=jac: least_squares(flat.residuals, x0, j, **options), 1)
-        rows.append((name, seconds, found.nfev, 2 * found.cost))
+        item, seconds, _ = timed(lambda j=jac: least_squares(flat.residuals, x0, j, **options), 1)
+        rows.append((name, seconds, item.nfev, 2 * item.cost))
     say(f"{count} configurations, {len(measurements.edges)} edges, {x0.size} unknowns")
     for name, seconds, n, cost in rows:
         say(f"{name:22s}{seconds:9.3f} s{n:6d} steps  cost {cost:.6f}  x {seconds / our_time:.1f}")
@@ -207,20 +207,20 @@ def ceres() -> Path | None:
 
 def against_ceres(program: Path, count: int) -> bool:
     """Print the comparison; False where costs differ."""
-    found: dict[str, dict[str, float]] = {}
+    results: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dump"
         dump(count, path)
         for _ in range(REPEATS):
             for name, *options in CERES:
                 words = [str(program), str(path), *options, str(REPEATS if count < MANY else 1)]
-                _kept(found, name, words, {})
+                _kept(results, name, words, {})
             for name, what in OURS:
                 words = [sys.executable, __file__, "--one", what, str(count)]
-                _kept(found, name, words, {})
-    ours, best = found["pkmcal"], min(found[name]["cpu"] for name, *_ in CERES)
+                _kept(results, name, words, {})
+    ours, best = results["pkmcal"], min(results[name]["cpu"] for name, *_ in CERES)
     same = True
-    for name, m in found.items():
+    for name, m in results.items():
         off = m["answer"] / ours["answer"] - 1
         same &= abs(off) < AS_LOW
         say(
@@ -231,14 +231,14 @@ def against_ceres(program: Path, count: int) -> bool:
 
 
 def _kept(
-    found: dict[str, dict[str, float]], name: str, words: list[str], environment: dict[str, str]
+    results: dict[str, dict[str, float]], name: str, words: list[str], environment: dict[str, str]
 ) -> None:
     """The best of what a command measured so far, kept under a name."""
     done = subprocess.run(
         words, env={**os.environ, **environment}, capture_output=True, text=True, check=True
     )
-    now, before = json.loads(done.stdout), found.get(name, {})
-    found[name] = {key: min(x, before.get(key, np.inf)) for key, x in now.items()}
+    now, before = json.loads(done.stdout), results.get(name, {})
+    results[name] = {key: min(x, before.get(key, np.inf)) for key, x in now.items()}
 
 
 def measured(what: str, count: int) -> dict[str, float]:
@@ -254,18 +254,18 @@ def measured(what: str, count: int) -> dict[str, float]:
             def work() -> Any:
                 return minimise(problem, start, tolerance=tolerance)
 
-            def answer(found: Any) -> tuple[float, float]:
-                return found.steps[0], found.cost[0]
+            def answer(value: Any) -> tuple[float, float]:
+                return value.steps[0], value.cost[0]
         else:
 
             def work() -> Any:
                 return bundle(machine, measurements, state)
 
-            def answer(found: Any) -> tuple[float, float]:
-                return found.statistics.steps, float(np.sum(np.diag(found.covariance)))
+            def answer(value: Any) -> tuple[float, float]:
+                return value.statistics.steps, float(np.sum(np.diag(value.covariance)))
 
-    found, cpu, wall = timed(work, REPEATS if count < MANY else 1)
-    steps, value = answer(found)
+    result, cpu, wall = timed(work, REPEATS if count < MANY else 1)
+    steps, value = answer(result)
     return {
         "cpu": cpu / per,
         "wall": wall / per,
@@ -285,8 +285,8 @@ def study(runs: int) -> tuple[Callable[[], Any], Callable[[Any], tuple[float, fl
     )
     start = paper_a.Start(paper_a.parameters_of(data.machine, steps), steps.T_camera_base)
 
-    def answer(found: paper_a.Fitted) -> tuple[float, float]:
-        return found.told["steps"].mean(), found.sigma["parameters"].mean()
+    def answer(value: paper_a.Fitted) -> tuple[float, float]:
+        return value.extra["steps"].mean(), value.sigma["parameters"].mean()
 
     return lambda: paper_a.joint_from_readings(data, start), answer, runs
 
@@ -329,15 +329,15 @@ def main() -> int:
     sources += [options.against.resolve()] if options.against else []
     work = [(what, n) for n in options.configurations for what in ("solve", "bundle")]
     for what, count in [*work, ("study", RUNS)]:
-        found = in_turns(what, count, sources)
-        for name, m in zip(("this", "other"), found, strict=False):
+        value = in_turns(what, count, sources)
+        for name, m in zip(("this", "other"), value, strict=False):
             say(
                 f"{what:7s}{count:6d} {name:6s}{m['cpu']:10.4f} s of the processor"
                 f"{m['wall']:10.4f} s{m['steps']:7.2f} steps{m['MB']:7.0f} MB"
             )
-        if len(found) > 1:
-            say(f"{'':20s}x {found[1]['cpu'] / found[0]['cpu']:.2f}")
-            same &= bool(np.isclose(found[0]["answer"], found[1]["answer"], rtol=SAME))
+        if len(value) > 1:
+            say(f"{'':20s}x {value[1]['cpu'] / value[0]['cpu']:.2f}")
+            same &= bool(np.isclose(value[0]["answer"], value[1]["answer"], rtol=SAME))
     return 0 if same else 1
 
 

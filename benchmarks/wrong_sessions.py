@@ -118,9 +118,12 @@ def centre(pixels: float) -> Any:
     """Its centre."""
 
     def change(document: dict[str, Any], rng: np.random.Generator) -> None:
-        way = rng.uniform(0, 2 * np.pi)
+        direction = rng.uniform(0, 2 * np.pi)
         x, y = document["center"]
-        document["center"] = [float(x + pixels * np.cos(way)), float(y + pixels * np.sin(way))]
+        document["center"] = [
+            float(x + pixels * np.cos(direction)),
+            float(y + pixels * np.sin(direction)),
+        ]
 
     return camera(change)
 
@@ -202,11 +205,11 @@ def moved(metres: float, radians: float) -> Any:
         from pkmcal.geometry.rigid import perturb
         from pkmcal.simulation.session import Studio
 
-        seed, seen = int(folder.name.split("-")[1]), folder.name.split("-")[0]
-        truth, cameras, settings, _ = ingredients(seen, seed)
-        way, axis = rng.normal(size=(2, 3))
+        seed, in_view = int(folder.name.split("-")[1]), folder.name.split("-")[0]
+        truth, cameras, settings, _ = ingredients(in_view, seed)
+        direction, axis = rng.normal(size=(2, 3))
         step = np.concatenate(
-            [radians * axis / np.linalg.norm(axis), metres * way / np.linalg.norm(way)]
+            [radians * axis / np.linalg.norm(axis), metres * direction / np.linalg.norm(direction)]
         )
         T = truth.T_camera_base.copy()
         T[0] = perturb(T[0], step)
@@ -278,7 +281,7 @@ FACTS: dict[str, Fact] = {
 }
 
 
-def ingredients(seen: str, seed: int) -> tuple[Any, Any, Any, Any]:
+def ingredients(in_view: str, seed: int) -> tuple[Any, Any, Any, Any]:
     """Truth, cameras, settings and drawing of a session."""
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulation import Settings, board_for, with_forearms
@@ -286,29 +289,29 @@ def ingredients(seen: str, seed: int) -> tuple[Any, Any, Any, Any]:
     from pkmcal.simulation.placement import one_a_station
     from pkmcal.simulation.truth import draw_truth
 
-    stations, count, size = SESSIONS[seen]
-    drawing = with_forearms(load_mechanism("gough-stewart" if seen == "legs" else "h4"))
+    stations, count, size = SESSIONS[in_view]
+    drawing = with_forearms(load_mechanism("gough-stewart" if in_view == "legs" else "h4"))
     lens = camera_of_size(size)
     values = lens.parameters.copy()
     values[4] = DISTORTION
     lens = replace(lens, parameters=values)
     settings = Settings(stations=stations, configurations=count)
-    if seen == "board":
+    if in_view == "board":
         seen_board = board_for(drawing, "platform")
         settings = replace(settings, board=seen_board, board_on="platform", observe=("board",))
     cameras = one_a_station(lens, stations)
     return draw_truth(drawing, cameras, settings, seed), cameras, settings, drawing
 
 
-def simulated(seen: str, seed: int, keep: Path) -> Path:
+def simulated(in_view: str, seed: int, keep: Path) -> Path:
     """The folder of a right session, drawn where it is not there yet."""
     from pkmcal.simulation import simulate_session
 
-    folder = keep / f"{seen}-{seed}"
+    folder = keep / f"{in_view}-{seed}"
     if not folder.exists():
-        _, cameras, settings, drawing = ingredients(seen, seed)
+        _, cameras, settings, drawing = ingredients(in_view, seed)
         simulate_session(folder, drawing, cameras, settings, seed=seed)
-        if seen == "board":  # a print is not exact, as a simulated board says of itself
+        if in_view == "board":  # a print is not exact, as a simulated board says of itself
             edited(folder / "board.yaml", lambda document: document.pop("tolerance"))
     return folder
 
@@ -327,17 +330,17 @@ def off_by(result: Any, folder: Path) -> float:
         error.parameters,
         truth.T_base_platform,
         truth.joints,
-        legs_seen=result.estimate.edge_weights.size > 0,
+        legs_observed=result.estimate.edge_weights.size > 0,
     )
     return float(np.sqrt(np.nanmean(off.off_position**2) / np.nanmean(error.position**2)))
 
 
-def outcome(fact: str, seen: str, seed: int, keep: Path) -> Outcome:
+def outcome(fact: str, in_view: str, seed: int, keep: Path) -> Outcome:
     """One session with a wrong fact."""
     from pkmcal import calibrate
     from pkmcal.errors import PkmcalError
 
-    right = simulated(seen, seed, keep)
+    right = simulated(in_view, seed, keep)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / right.name
         shutil.copytree(right, folder)
@@ -349,12 +352,12 @@ def outcome(fact: str, seen: str, seed: int, keep: Path) -> Outcome:
             what = "named" if error.code in codes else "refused"
             return Outcome(what, float("nan"), f"{error.code}: {error}")
         z, verdict = off_by(result, folder), result.verdict
-    told = " ".join(f"{one.code}: {one.text}" for one in verdict.findings)
+    values = " ".join(f"{one.code}: {one.text}" for one in verdict.findings)
     if not set(codes).isdisjoint(verdict.codes):
-        return Outcome("named", z, told)
+        return Outcome("named", z, values)
     if not verdict.usable:
-        return Outcome("refused", z, told)
-    return Outcome("warned" if verdict.warnings else "silent", z, told)
+        return Outcome("refused", z, values)
+    return Outcome("warned" if verdict.warnings else "silent", z, values)
 
 
 def main() -> None:
@@ -379,22 +382,22 @@ def main() -> None:
         for fact, what in FACTS.items():
             if options.only and not any(word in fact for word in options.only):
                 continue
-            for seen in [kind for kind in what.seen if kind in kinds]:
-                jobs = [(fact, seen, seed, keep) for seed in seeds]
-                found = list(pool.map(outcome, *zip(*jobs, strict=True)))
-                tell(f"{fact}, {seen}", found)
+            for in_view in [kind for kind in what.seen if kind in kinds]:
+                jobs = [(fact, in_view, seed, keep) for seed in seeds]
+                value = list(pool.map(outcome, *zip(*jobs, strict=True)))
+                tell(f"{fact}, {in_view}", value)
                 if options.tell:
-                    for seed, one in zip(seeds, found, strict=True):
+                    for seed, one in zip(seeds, value, strict=True):
                         print(f"    {seed}: {one.what} {one.z:.2f} {one.said}")
     print(f"{time.perf_counter() - begin:.0f} s")
 
 
-def tell(name: str, found: list[Outcome]) -> None:
+def tell(name: str, results: list[Outcome]) -> None:
     """One line."""
-    counts = [sum(one.what == word for one in found) for word in
+    counts = [sum(one.what == word for one in results) for word in
               ("named", "refused", "warned", "silent")]  # fmt: skip
-    far = sum(one.what in ("silent", "warned") and one.z > FAR for one in found)
-    z = np.array([one.z for one in found if one.what in ("silent", "warned", "named")])
+    far = sum(one.what in ("silent", "warned") and one.z > FAR for one in results)
+    z = np.array([one.z for one in results if one.what in ("silent", "warned", "named")])
     z = z[np.isfinite(z)]
     worst, median = (f"{f(z):9.2f}" if z.size else f"{'–':>9}" for f in (np.max, np.median))
     print(f"{name:40}{counts[0]:8}{counts[1]:9}{counts[2]:8}{counts[3]:8}{far:12}{worst}{median}",

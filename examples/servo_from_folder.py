@@ -12,7 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.observe.images import decode

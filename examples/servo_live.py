@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pkmcal.calibration.saved import SavedCalibration, load
+from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
 

@@ -80,8 +80,8 @@ class Automaton:
         if kind is op.CATEGORY:
             text, wide = str(value).rpartition("_")[2], not self.flags & re.ASCII
             name = {"DIGIT": r"\d", "SPACE": r"\s", "WORD": r"\w"}[text]
-            found = re.match(name, sign, 0 if wide else re.ASCII)
-            return bool(found) != ("NOT" in str(value))
+            match = re.match(name, sign, 0 if wide else re.ASCII)
+            return bool(match) != ("NOT" in str(value))
         return False
 
     def _sequence(self, items) -> tuple[int, int]:
@@ -184,12 +184,12 @@ class Automaton:
                 todo += self.empty[s]
         return False
 
-    def _spelling(self, state: int, way) -> list[int]:
+    def _spelling(self, state: int, sense) -> list[int]:
         """States with signs, once for each way there that goes along no arrow twice."""
         out = [state] if self.signs[state] else []
         for after in self.empty[state]:
-            if (state, after) not in way:
-                out += self._spelling(after, (*way, (state, after)))
+            if (state, after) not in sense:
+                out += self._spelling(after, (*sense, (state, after)))
         return out
 
 
@@ -239,11 +239,11 @@ def _twice_around(steps, part, s) -> bool:
         if pair in met:
             continue
         met.add(pair)
-        for a, left in steps[pair[0]]:
+        for a, remainder in steps[pair[0]]:
             for b, right in steps[pair[1]]:
-                if a & b and part[left] == part[s] == part[right]:
-                    forward[pair].add((left, right))
-                    todo.append((left, right))
+                if a & b and part[remainder] == part[s] == part[right]:
+                    forward[pair].add((remainder, right))
+                    todo.append((remainder, right))
     return any(a != b and (s, s) in _reach(forward, (a, b)) for a, b in met)
 
 

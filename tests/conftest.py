@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
 
-from pkmcal.calibration.turns import LOOKS_AGAIN as ALL_LOOKS
+from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.check.checked import SessionCheck
+    from pkmcal.check.results import SessionCheck
 
 Found = TypeVar("Found")
 
@@ -91,13 +91,13 @@ def few_looks(request, monkeypatch):
     there are as many as for everybody.
     """
     if not request.node.get_closest_marker("slow"):
-        monkeypatch.setattr("pkmcal.calibration.turns.LOOKS_AGAIN", 2)
+        monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
 
 
 @pytest.fixture
 def all_looks(few_looks, monkeypatch):
     """As many looks as for everybody."""
-    monkeypatch.setattr("pkmcal.calibration.turns.LOOKS_AGAIN", ALL_LOOKS)
+    monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", ALL_LOOKS)
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ def told_once(folder: Path, find: Callable[..., Found]) -> Told[Found]:
     """What ``find`` gives and tells, by the worker that asks first."""
 
     def make() -> Told[Found]:
-        told: list[tuple[str, float]] = []
-        found = find(progress=lambda text, share: told.append((text, share)))
-        return Told(found, told)
+        progress: list[tuple[str, float]] = []
+        item = find(progress=lambda text, share: progress.append((text, share)))
+        return Told(item, progress)
 
     return made_once(folder, make)
 

@@ -22,24 +22,24 @@ PAIRS = [(0, k) for k in range(1, 13)] + [(k, k + 3) for k in (1, 2, 3, 7, 8, 9)
 """The middle to all others, and across."""
 
 
-def write(folder, true, rng, *, says=None, noise=0.015, places=13, caliper=CALIPER, pairs=None):
+def write(folder, true, rng, *, describe=None, noise=0.015, places=13, caliper=CALIPER, pairs=None):
     """A session of heights and of distances of a true machine, mm; the marks' names.
 
     The part is printed at places by the firmware's own account, so the true marks are elsewhere.
     """
-    says = says or printers.Settings()
+    describe = describe or printers.Settings()
     readings = printers.felt(true, printers.bed(places), noise, rng)
-    (folder / "printer.cfg").write_text(printers.printer_cfg(says, readings))
+    (folder / "printer.cfg").write_text(printers.printer_cfg(describe, readings))
     write_printer_session(folder / "kit", folder / "printer.cfg")
-    add_distances(folder / "kit", true, rng, says, caliper, pairs)
+    add_distances(folder / "kit", true, rng, describe, caliper, pairs)
     return folder / "kit"
 
 
-def add_distances(kit, true, rng, says, caliper=CALIPER, pairs=None):
+def add_distances(kit, true, rng, describe, caliper=CALIPER, pairs=None):
     """Adds marks to joints.csv, distances.csv, and its key to session.yaml."""
     pairs = PAIRS if pairs is None else pairs
     at = marks()
-    carriages = says.carriages(np.column_stack([at, np.full(len(at), 0.2)]))
+    carriages = describe.carriages(np.column_stack([at, np.full(len(at), 0.2)]))
     there = 1e3 * true.forward(1e-3 * carriages)[:, :3, 3]
     text = (kit / "joints.csv").read_text()
     rows = [f"m{k:02d}," + ",".join(repr(float(x)) for x in c) for k, c in enumerate(carriages)]
@@ -55,12 +55,12 @@ def add_distances(kit, true, rng, says, caliper=CALIPER, pairs=None):
     )
 
 
-def stretch(true, found):
+def stretch(true, value):
     """By how much larger than commanded a calibrated machine makes the bed, a share."""
     xy = printers.bed(30)
     T = np.broadcast_to(np.eye(4), (30, 4, 4)).copy()
     T[:, :2, 3] = 1e-3 * xy
-    there = true.forward(found.inverse(T))[:, :2, 3]
+    there = true.forward(value.inverse(T))[:, :2, 3]
     plane = np.column_stack([1e-3 * xy, np.ones(30)])
     slope = np.linalg.lstsq(plane, there, rcond=None)[0]
     return np.trace(slope[:2]) / 2 - 1

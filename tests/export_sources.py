@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.cameras.files import camera_text
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.files import json_text
@@ -30,8 +30,8 @@ def built(name, seed=1, share=0.3):
 def with_scales(machine, tolerance):
     """The same machine with all readings' scales for parameters."""
     document = machine.document
-    told = document.tolerance.model_copy(update={"scale": tolerance})
-    return machine_from_document(document.model_copy(update={"tolerance": told}))
+    values = document.tolerance.model_copy(update={"scale": tolerance})
+    return machine_from_document(document.model_copy(update={"tolerance": values}))
 
 
 def source_of(machine, **more):

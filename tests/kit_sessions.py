@@ -104,18 +104,18 @@ def board_kit(folder, name, seed=0, n=25):
     assert camera.in_image(pixels, margin=10.0).all()
     pixels = pixels + CORNER * rng.normal(size=pixels.shape)
     ids = np.arange(len(board.points))
-    found = tuple(
+    count = tuple(
         Detection(f"{k:03d}.png", camera.image_size, ids, p, np.full(len(ids), CORNER))
         for k, p in enumerate(pixels)
     )
     (folder / "images").mkdir()
     grey = cv2.imencode(".png", np.full((720, 1280), 128, dtype=np.uint8))[1].tobytes()
-    for item in found:
+    for item in count:
         (folder / "images" / item.name).write_bytes(grey)
     station = {"camera": "cameras/webcam.yaml", "images": "images/{configuration}.png",
                "observe": "board"}  # fmt: skip
     _session(kit, {"webcam": station}, T, rng, board="board.yaml")
-    return Kit(name, folder, kit.drawing, kit.truth, found)
+    return Kit(name, folder, kit.drawing, kit.truth, count)
 
 
 def bed(n=7, radius=0.08):
@@ -183,18 +183,18 @@ def _session(kit, stations, T, rng, **more):
     (kit.folder / "session.yaml").write_text(yaml_text(document))
 
 
-def tool(kit, found, n=200):
+def tool(kit, value, n=200):
     """The tool's errors at readings that were not measured."""
     T = places(kit.name, n, np.random.default_rng(99))
     joints, there = kit.truth.inverse(T), T[:, :3, 3]
     before = laid_over(kit.drawing.forward(joints)[:, :3, 3], there)
-    poses = found.machine.forward(joints)
+    poses = value.machine.forward(joints)
     after = laid_over(poses[:, :3, 3], there)
-    by = pose_by_parameters(found.machine, joints, poses)[:, 3:]
-    frames = pose_generators(poses)[:, 3:] @ respecting_motion(found.machine.layout.motion)
+    by = pose_by_parameters(value.machine, joints, poses)[:, 3:]
+    frames = pose_generators(poses)[:, 3:] @ respecting_motion(value.machine.layout.motion)
     by, frames = by.reshape(3 * n, -1), frames.reshape(3 * n, -1)
     by = by - frames @ np.linalg.lstsq(frames, by, rcond=1e-9)[0]
-    variance = np.sum((by @ found.estimate.covariance) * by) / n
+    variance = np.sum((by @ value.estimate.covariance) * by) / n
     return Error(rms(before), rms(after), float(np.sqrt(variance)), rms(after[:, :2]))
 
 
@@ -220,5 +220,5 @@ def flatness(kit, machine, n=300):
     joints = machine.inverse(pose(np.eye(3), t))
     true = kit.truth.forward(joints)[:, :3, 3]
     plane = np.column_stack([true[:, :2], np.ones(n)])
-    left = true[:, 2] - plane @ np.linalg.lstsq(plane, true[:, 2], rcond=None)[0]
-    return float(np.sqrt(np.mean(left**2)))
+    residual = true[:, 2] - plane @ np.linalg.lstsq(plane, true[:, 2], rcond=None)[0]
+    return float(np.sqrt(np.mean(residual**2)))

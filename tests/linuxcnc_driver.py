@@ -36,10 +36,10 @@ def errors_of(channel):
     """Texts of all errors so far."""
     out = []
     while True:
-        found = channel.poll()
-        if not found:
+        value = channel.poll()
+        if not value:
             return out
-        out.append(found[1])
+        out.append(value[1])
 
 
 def still(stat, joints):

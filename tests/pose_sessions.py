@@ -51,23 +51,23 @@ def allowed(machine, poses):
     """The nearest poses that the machine's rods allow."""
     if not machine.layout.n_internal:
         return poses
-    found = kinematics.on_manifold(machine.layout, machine.values, poses)
-    assert found.converged.all()
-    return found.T_base_platform
+    value = kinematics.on_manifold(machine.layout, machine.values, poses)
+    assert value.converged.all()
+    return value.T_base_platform
 
 
 def measured(truth, poses, rng, noise=1.0):
     """The board seen by one camera, and the readings."""
     poses = allowed(truth, poses)
     n = len(poses)
-    seen = T_CAMERA_BASE @ poses @ T_PLATFORM_BOARD
-    seen = perturb(seen, noise * POSE_SIGMA * rng.normal(size=(n, 6)))
+    in_view = T_CAMERA_BASE @ poses @ T_PLATFORM_BOARD
+    in_view = perturb(in_view, noise * POSE_SIGMA * rng.normal(size=(n, 6)))
     joints = truth.inverse(poses)
     assert np.isfinite(joints).all()
     joints = joints + noise * JOINT_NOISE * rng.normal(size=joints.shape)
     none = np.zeros(n, dtype=int)
     whiten = np.broadcast_to(np.diag(1 / POSE_SIGMA), (n, 6, 6))
-    items = PoseSet(none, np.arange(n), none, seen, whiten)
+    items = PoseSet(none, np.arange(n), none, in_view, whiten)
     mounts = (Mount("board", "platform"),)
     data = Measurements(
         EdgeSet.empty(), joints, JOINT_NOISE, 1, none[:1], poses=items, mounts=mounts
@@ -94,10 +94,10 @@ def predicted(machine, T_camera_base, T_platform_board, joints):
     return T_camera_base @ body
 
 
-def errors(truth, found, joints):
+def errors(truth, value, joints):
     """Root mean square of position (m) and orientation (rad) at readings, no frame left open."""
     expected = T_CAMERA_BASE @ truth.forward(joints)
-    off = pose_difference(found, expected)
+    off = pose_difference(value, expected)
     return np.sqrt([np.mean(np.sum(part**2, axis=1)) for part in (off[:, 3:], off[:, :3])])
 
 
@@ -105,8 +105,8 @@ def score(estimate, truth, rng):
     """Position (m) and orientation (rad) errors over the workspace."""
     joints = truth.inverse(allowed(truth, workspace(rng)))
     state = estimate.state
-    found = predicted(estimate.machine, state.T_camera_base[0], state.T_mount[0], joints)
-    return errors(truth, found, joints)
+    value = predicted(estimate.machine, state.T_camera_base[0], state.T_mount[0], joints)
+    return errors(truth, value, joints)
 
 
 def spread(info):
@@ -118,8 +118,8 @@ def spread(info):
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0
     _, s, vt = np.linalg.svd(np.linalg.qr(rows / scale, mode="r"))
-    known = s > 1e-9 * s[0]
-    return vt[known].T / s[known] / scale[:, None]
+    above_limit = s > 1e-9 * s[0]
+    return vt[above_limit].T / s[above_limit] / scale[:, None]
 
 
 def bound(machine, case, estimate, rng, draws=30):
@@ -137,9 +137,9 @@ def bound(machine, case, estimate, rng, draws=30):
     for _ in range(draws):
         # a tenth of an error, so that only its first order counts
         step = 0.1 * half @ rng.normal(size=half.shape[1])
-        off = problem.moved(state, step[None], own)
+        off = problem.retract(state, step[None], own)
         other = machine.with_values(problem.theta(off)[0])
-        found = predicted(other, off.T_camera_base[0], off.T_mount[0], joints)
-        d = pose_difference(found, centre)
+        value = predicted(other, off.T_camera_base[0], off.T_mount[0], joints)
+        d = pose_difference(value, centre)
         squares.append([np.mean(np.sum(p**2, axis=1)) for p in (d[:, 3:], d[:, :3])])
     return 10 * np.sqrt(np.mean(squares, axis=0))

@@ -42,11 +42,11 @@ def rendered(folder: Path, machine, camera, settings: Settings, seed: int = 0) -
     cameras = camera if isinstance(camera, tuple) else (camera,)
     parts = [mechanism_text(machine), *map(camera_text, cameras), repr(settings), str(seed)]
     key = hashlib.sha256("\n".join([_code(), *parts]).encode()).hexdigest()[:24]
-    kept = once(
+    retained = once(
         KEPT / _code() / key,
         lambda part: simulate_session(part, machine, camera, settings, seed=seed),
     )
-    shutil.copytree(kept, folder)
+    shutil.copytree(retained, folder)
     return folder
 
 

@@ -9,8 +9,8 @@ import pytest
 from conftest import run
 from faults import replaced
 from fuzz import bases
-from pkmcal.calibration.saved import load
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.machine_source import load_source
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, read_csv
 

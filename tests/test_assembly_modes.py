@@ -19,9 +19,9 @@ def random_hexapod(seed):
     machine = load_mechanism("gough-stewart")
     rng = np.random.default_rng(seed)
     centres = np.array(["center" in name for name in machine.parameters.names])
-    moved = 0.25 * (seed % 20) / 19 * rng.uniform(-1, 1, centres.sum())
+    shifted = 0.25 * (seed % 20) / 19 * rng.uniform(-1, 1, centres.sum())
     values = machine.values.copy()
-    values[centres] += moved
+    values[centres] += shifted
     machine = machine.with_values(values)
     poses = perturb(
         load_mechanism("gough-stewart").home(),
@@ -46,75 +46,75 @@ def exhaustive(machine, readings, home, seed, starts, monkeypatch):
         return search(machine, readings, home, seed, starts)
 
 
-def assert_same(found, long):
-    assert len(found) == len(long)
+def assert_same(value, long):
+    assert len(value) == len(long)
     for T in long.poses:
-        assert np.abs(found.poses - T).max(axis=(-1, -2)).min() < APART
+        assert np.abs(value.poses - T).max(axis=(-1, -2)).min() < APART
 
 
 @pytest.mark.parametrize("seed", [0, 6, 12, 19])
 def test_modes_of_random_hexapods_are_those_of_a_long_search(seed, monkeypatch):
     machine, T, readings = random_hexapod(seed)
-    found = search(machine, readings, T, seed)
-    assert found.complete
-    assert np.abs(found.poses - T).max(axis=(-1, -2)).min() < APART  # the pose it came from
+    value = search(machine, readings, T, seed)
+    assert value.complete
+    assert np.abs(value.poses - T).max(axis=(-1, -2)).min() < APART  # the pose it came from
     long = exhaustive(machine, readings, T, 1000 + seed, 5000, monkeypatch)
     assert not long.complete
     assert long.starts == 5000
-    assert_same(found, long)
+    assert_same(value, long)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_modes_of_twenty_random_hexapods_against_200000_starts(seed, monkeypatch):
     machine, T, readings = random_hexapod(seed)
-    found = search(machine, readings, T, seed)
-    assert found.complete
-    assert_same(found, exhaustive(machine, readings, T, 1000 + seed, 200_000, monkeypatch))
+    value = search(machine, readings, T, seed)
+    assert value.complete
+    assert_same(value, exhaustive(machine, readings, T, 1000 + seed, 200_000, monkeypatch))
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
 def test_every_mode_closes_the_machine_once(name):
     machine = load_mechanism(name)
     readings = machine.inverse(machine.home())
-    found = machine.assembly_modes_result(readings, np.random.default_rng(0))
-    c = closure(machine.layout, machine.values, readings, found.poses, found.internal)
+    values = machine.assembly_modes_result(readings, np.random.default_rng(0))
+    c = closure(machine.layout, machine.values, readings, values.poses, values.internal)
     assert np.abs(c.rows.value).max() < CONVERGED_CLOSURE_ERROR
     # home is the first, with its own sign
-    np.testing.assert_allclose(found.poses[0], machine.home(), atol=1e-6)
+    np.testing.assert_allclose(values.poses[0], machine.home(), atol=1e-6)
     if machine.layout.overdetermined:  # no determinant tells its assemblies apart
-        assert set(found.sign) == {0}
+        assert set(values.sign) == {0}
     else:
-        assert found.sign[0] == 1
-        assert set(found.sign) <= {-1, 1}
-    assert found.found.sum() == found.closed <= found.starts
-    assert found.found.min() >= assembly_modes.RAREST_MODE_FINDS
+        assert values.sign[0] == 1
+        assert set(values.sign) <= {-1, 1}
+    assert values.mode_numbers.sum() == values.closed <= values.starts
+    assert values.mode_numbers.min() >= assembly_modes.RAREST_MODE_FINDS
     numbers = np.concatenate(
         [
-            found.poses[:, :3].reshape(len(found), -1),
-            np.cos(found.internal),
-            np.sin(found.internal),
+            values.poses[:, :3].reshape(len(values), -1),
+            np.cos(values.internal),
+            np.sin(values.internal),
         ],
         axis=1,
     )
-    gaps = np.abs(numbers[:, None] - numbers[None]).max(axis=-1) + np.eye(len(found))
+    gaps = np.abs(numbers[:, None] - numbers[None]).max(axis=-1) + np.eye(len(values))
     assert gaps.min() > APART
 
 
 def test_mirror_images_have_the_other_sign():
     """A reflection in the base's plane turns the determinant of six rows in space about."""
     machine = hexapod()
-    found = machine.assembly_modes_result(machine.inverse(yawed(20)), np.random.default_rng(1))
+    values = machine.assembly_modes_result(machine.inverse(yawed(20)), np.random.default_rng(1))
     flip = np.diag([1.0, 1.0, -1.0, 1.0])
-    for T, sign in zip(found.poses, found.sign, strict=True):
-        other = int(np.argmin(np.abs(found.poses - flip @ T @ flip).max(axis=(-1, -2))))
-        assert found.sign[other] == -sign
+    for T, sign in zip(values.poses, values.sign, strict=True):
+        other = int(np.argmin(np.abs(values.poses - flip @ T @ flip).max(axis=(-1, -2))))
+        assert values.sign[other] == -sign
 
 
 def test_a_sign_is_that_of_same_assembly():
     machine = hexapod()
-    found = machine.assembly_modes_result(machine.inverse(yawed(20)), np.random.default_rng(2))
-    np.testing.assert_array_equal(machine.same_assembly(found.poses), found.sign > 0)
+    values = machine.assembly_modes_result(machine.inverse(yawed(20)), np.random.default_rng(2))
+    np.testing.assert_array_equal(machine.same_assembly(values.poses), values.sign > 0)
 
 
 def test_what_may_be_missing_shrinks_with_the_starts(monkeypatch):
@@ -122,34 +122,34 @@ def test_what_may_be_missing_shrinks_with_the_starts(monkeypatch):
     machine, T, readings = random_hexapod(3)
     short = search(machine, readings, T, 0)
     long = exhaustive(machine, readings, T, 0, 10_000, monkeypatch)
-    for found in (short, long):
-        assert (1 - found.missing) ** found.closed == pytest.approx(1e-3)
+    for item in (short, long):
+        assert (1 - item.missing) ** item.closed == pytest.approx(1e-3)
     assert long.missing < short.missing / 5
     # and the modes that there are, are met more often than that
-    assert short.found.min() / short.closed > short.missing
+    assert short.mode_numbers.min() / short.closed > short.missing
 
 
 def test_readings_that_close_nothing_have_no_mode():
     machine = hexapod()
-    found = search(machine, np.array([0.4] * 5 + [3.0]), machine.home(), 0, most=5000)
-    assert len(found) == 0
-    assert found.missing == 1.0
-    assert not found.complete
-    assert found.poses.shape == (0, 4, 4)
+    count = search(machine, np.array([0.4] * 5 + [3.0]), machine.home(), 0, most=5000)
+    assert len(count) == 0
+    assert count.missing == 1.0
+    assert not count.complete
+    assert count.poses.shape == (0, 4, 4)
 
 
 def test_the_same_seed_finds_the_same():
     machine, T, readings = random_hexapod(5)
     first, second = (search(machine, readings, T, 7) for _ in range(2))
     np.testing.assert_array_equal(first.poses, second.poses)
-    np.testing.assert_array_equal(first.found, second.found)
+    np.testing.assert_array_equal(first.mode_numbers, second.mode_numbers)
 
 
 def test_modes_of_a_tripod_keep_its_orientation():
     machine = tripod()
-    found = machine.assembly_modes_result(machine.inverse(machine.home()), np.random.default_rng(0))
-    np.testing.assert_array_equal(found.poses[:, :3, :3], np.tile(np.eye(3), (len(found), 1, 1)))
-    assert sorted(found.sign) == [-1, 1]
+    count = machine.assembly_modes_result(machine.inverse(machine.home()), np.random.default_rng(0))
+    np.testing.assert_array_equal(count.poses[:, :3, :3], np.tile(np.eye(3), (len(count), 1, 1)))
+    assert sorted(count.sign) == [-1, 1]
 
 
 def test_more_rods_than_freedoms_have_no_sign():
@@ -160,10 +160,10 @@ def test_more_rods_than_freedoms_have_no_sign():
         "translation", [(foot, (0, 0, 0), rod) for foot in feet], "home: {position: [0, 0, 0.3]}\n"
     )
     readings = machine.inverse(machine.home())
-    found = machine.assembly_modes_result(readings, np.random.default_rng(0))
-    assert len(found) == 2
-    np.testing.assert_array_equal(found.sign, 0)
-    assert machine.same_assembly(found.poses).all()
+    count = machine.assembly_modes_result(readings, np.random.default_rng(0))
+    assert len(count) == 2
+    np.testing.assert_array_equal(count.sign, 0)
+    assert machine.same_assembly(count.poses).all()
 
 
 def test_poses_of_the_workspace_are_among_their_modes():

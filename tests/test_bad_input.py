@@ -38,29 +38,29 @@ def stations(session, change):
 
 def only(session, *names):
     """session.yaml with these stations alone: each of the others is a search more."""
-    stations(session, lambda found: [found.pop(name) for name in [*found] if name not in names])
+    stations(session, lambda item: [item.pop(name) for name in [*item] if name not in names])
 
 
 def photographs(session, station):
     return sorted((session / "images" / station).iterdir())
 
 
-def refused(session, *said):
-    """The sentence of both commands, which holds all of `said`; nothing was written."""
-    sentence = refused_by_calibrate(session, *said)
-    found = run("check", session, "--json")
-    assert found.code == 2
-    assert sentence in [finding["text"] for finding in found.json["findings"]]
+def refused(session, *text):
+    """The sentence of both commands, which holds all of `text`; nothing was written."""
+    sentence = refused_by_calibrate(session, *text)
+    value = run("check", session, "--json")
+    assert value.code == 2
+    assert sentence in [finding["text"] for finding in value.json["findings"]]
     return sentence
 
 
-def refused_by_calibrate(session, *said):
-    """The sentence, which holds all of `said`; nothing was written."""
+def refused_by_calibrate(session, *text):
+    """The sentence, which holds all of `text`; nothing was written."""
     done = run("calibrate", session)
     assert (done.code, done.out) == (2, "")
     sentence = done.err.removeprefix("Error: ").rstrip("\n")
     assert "\n" not in sentence
-    for words in said:
+    for words in text:
         assert words in sentence
     assert not (session / "calibration").exists()
     return sentence
@@ -70,13 +70,13 @@ def refused_by_calibrate(session, *said):
 
 
 def test_no_such_folder(tmp_path):
-    said = refused(tmp_path / "none")
-    assert said == f"{tmp_path / 'none'}: there is no such session folder."
+    text = refused(tmp_path / "none")
+    assert text == f"{tmp_path / 'none'}: there is no such session folder."
 
 
 def test_an_empty_folder(tmp_path):
-    said = refused(tmp_path)
-    assert said == (
+    text = refused(tmp_path)
+    assert text == (
         f"{tmp_path}: the folder holds no session.yaml."
         " Name the session's folder; pkmcal new DIR makes one to fill in."
     )
@@ -189,8 +189,8 @@ def test_a_damaged_photograph_is_told_by_pkmcal_alone(session, capfd):
 def test_a_photograph_cut_short(session):
     path = photographs(session, "station2")[1]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    said = refused(session)
-    assert said == (
+    text = refused(session)
+    assert text == (
         f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG file that"
         " ends early, expected a whole PNG or JPEG file. Copy it again from the camera, or remove"
         " it: an absent photograph is allowed."
@@ -215,14 +215,14 @@ def test_photographs_of_something_else(session):
 
 
 def test_two_stations_swapped(session):
-    def swap(found):
-        first, second = found["station1"], found["station2"]
+    def swap(value):
+        first, second = value["station1"], value["station2"]
         first["pose"], second["pose"] = second["pose"], first["pose"]
 
     stations(session, swap)
     only(session, "station1", "station2")
-    said = refused_by_calibrate(session)
-    assert said == (
+    text = refused_by_calibrate(session)
+    assert text == (
         "session.yaml, stations: stations station1 and station2 are mixed up; found the"
         " photographs of each fit the pose of the other. Exchange the poses of station1 and"
         " station2 in session.yaml, or their image folders."
@@ -232,11 +232,11 @@ def test_two_stations_swapped(session):
 # outputs
 
 
-def unwritten(session, out, *said):
+def unwritten(session, out, *text):
     before = sorted(path for path in session.rglob("*"))
     done = run("calibrate", session, "-o", out)
     assert (done.code, done.out) == (2, "")
-    for words in said:
+    for words in text:
         assert words in done.err
     assert sorted(path for path in session.rglob("*")) == before
 

@@ -25,20 +25,20 @@ def test_many_poses_are_solved_as_one_is(machine):
     readings = machine.inverse(poses)
     hopeless = [3, 17, CONFIGURATIONS_A_CHUNK + 4]
     readings[hopeless, 0] += 50.0
-    found = machine.forward_result(readings, machine.home())
+    fk = machine.forward_result(readings, machine.home())
     converged = np.ones(len(poses), dtype=bool)
     angles = machine.joint_units == ("rad",) * machine.n_joints
     if not angles:  # fifty radians are some other angle
         converged[hopeless] = False
-        np.testing.assert_array_equal(found.converged, converged)
+        np.testing.assert_array_equal(fk.converged, converged)
     ordinary = np.setdiff1d(np.arange(len(poses)), hopeless)
-    np.testing.assert_allclose(found.T_base_platform[ordinary], poses[ordinary], atol=1e-11)
+    np.testing.assert_allclose(fk.T_base_platform[ordinary], poses[ordinary], atol=1e-11)
     alone = machine.forward_result(readings[hopeless[0]], machine.home())
     if not angles:
-        assert np.log10(found.error[hopeless[0]] / alone.error) == pytest.approx(0, abs=0.1)
+        assert np.log10(fk.error[hopeless[0]] / alone.error) == pytest.approx(0, abs=0.1)
     for k in (0, 5):
         one = machine.forward_result(readings[k])
-        np.testing.assert_allclose(found.T_base_platform[k], one.T_base_platform, atol=1e-13)
+        np.testing.assert_allclose(fk.T_base_platform[k], one.T_base_platform, atol=1e-13)
 
 
 def test_rows_in_the_other_order_of_memory_are_the_same(machine):
@@ -70,8 +70,8 @@ def test_one_elimination_for_all_is_the_same_as_one_each(rows, unknowns):
     right = np.concatenate([value, np.zeros((200, unknowns))], axis=1)
     exact = np.stack([np.linalg.lstsq(a, b)[0] for a, b in zip(stacked, right, strict=True)])
     size = np.linalg.norm(exact * np.geomspace(1, 100, unknowns), axis=1).max()
-    for found in (plain, other):
-        error = (found - exact) * np.geomspace(1, 100, unknowns)
+    for item in (plain, other):
+        error = (item - exact) * np.geomspace(1, 100, unknowns)
         assert np.median(np.abs(error)) < 1e-13 * size
         assert np.abs(error).max() < 1e-6 * size
 
@@ -105,6 +105,6 @@ def test_home_is_found_once_and_cannot_be_spoilt():
     first = machine.home()
     first[0, 3] = 9.0
     assert machine.home()[0, 3] != 9.0
-    moved = machine.values.copy()
-    moved[2::7] += 0.01  # other values, another home
-    assert not np.allclose(machine.with_values(moved).home(), machine.home(), atol=1e-6)
+    shifted = machine.values.copy()
+    shifted[2::7] += 0.01  # other values, another home
+    assert not np.allclose(machine.with_values(shifted).home(), machine.home(), atol=1e-6)

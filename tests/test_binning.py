@@ -12,12 +12,12 @@ import yaml
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.refinement import observation_of
 from pkmcal.calibration.results import calibration_document
-from pkmcal.calibration.turns import observation_of
 from pkmcal.observe import legs
+from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.images import binned
 from pkmcal.observe.legs import first_binning, measure, sharp_binning
-from pkmcal.observe.photographs import Photographs
 from pkmcal.observe.profiles import BLURS_TRIED
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
@@ -80,17 +80,22 @@ def test_binned_photographs_give_the_edges_of_small_ones():
 def test_edges_move_with_the_parameters_of_the_whole_camera():
     """Against planes through an edge's two ends, held in the picture, as each parameter changes."""
     p = larger()
-    look = measure(p, machine(), FRONT, poses(), refine_camera=True)
+    station_edges = measure(p, machine(), FRONT, poses(), refine_camera=True)
 
     def normals(camera):
         """Of the planes through each edge's first and last place (N, 3)."""
         first, last = (
-            np.array([look.points[look.point_edge == k][end] for k in range(len(look.edges))])
+            np.array(
+                [
+                    station_edges.points[station_edges.point_edge == k][end]
+                    for k in range(len(station_edges.edges))
+                ]
+            )
             for end in (0, -1)
         )
         n = np.cross(camera.ray(first), camera.ray(last))
         n /= np.linalg.norm(n, axis=1, keepdims=True)
-        return n * np.sign(np.sum(n * look.edges.normal, axis=1, keepdims=True))
+        return n * np.sign(np.sum(n * station_edges.edges.normal, axis=1, keepdims=True))
 
     for k, step in enumerate((1.0, 1.0, 1.0, 1.0, 1e-3)):
         both = [
@@ -98,10 +103,10 @@ def test_edges_move_with_the_parameters_of_the_whole_camera():
             for sign in (1, -1)
         ]
         by = (normals(both[0]) - normals(both[1])) / (2 * step)
-        seen = np.einsum("nij,ni->nj", look.edges.basis, by)
-        size = np.abs(seen).max()
+        in_view = np.einsum("nij,ni->nj", station_edges.edges.basis, by)
+        size = np.abs(in_view).max()
         # planes are fitted to all places, weighted, and not to the ends alone
-        off = np.abs(look.edges.by_intrinsics[..., k] - seen).max(axis=1)
+        off = np.abs(station_edges.edges.by_intrinsics[..., k] - in_view).max(axis=1)
         assert np.median(off) < 0.05 * size
 
 
@@ -122,10 +127,10 @@ def blurred(session):
     return session
 
 
-def away(found, other):
+def away(value, other):
     """Differences of two calibrations' machines, in the deviations of one."""
     sigma = np.sqrt(np.diag(other.estimate.covariance))
-    return np.abs(found.machine.values - other.machine.values)[sigma > 0] / sigma[sigma > 0]
+    return np.abs(value.machine.values - other.machine.values)[sigma > 0] / sigma[sigma > 0]
 
 
 def test_photographs_larger_than_sharp(blurred, calibrated):
@@ -133,24 +138,24 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
     photographs. Edge for edge as they are they lie blurred over three pixels, where hardly one is
     found.
     """
-    found = calibrate_session(blurred)
-    np.testing.assert_array_equal(found.observation.binning, 2)
-    assert found.verdict.usable
-    assert np.sqrt(np.mean(away(found, calibrated) ** 2)) < np.sqrt(2)
+    calibration = calibrate_session(blurred)
+    np.testing.assert_array_equal(calibration.observation.binning, 2)
+    assert calibration.verdict.usable
+    assert np.sqrt(np.mean(away(calibration, calibrated) ** 2)) < np.sqrt(2)
     # what is said of cameras is in pixels of the photographs
-    document = calibration_document(found)
+    document = calibration_document(calibration)
     assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
     shift = document["cameras"][0]["edge_shift"]
-    assert shift == pytest.approx(2 * found.estimate.state.edge_shift[0])
+    assert shift == pytest.approx(2 * calibration.estimate.state.edge_shift[0])
 
 
 def test_stations_of_one_camera_are_binned_alike(calibrated):
     """One that shows no legs, too: the camera's edge shift is in these pixels."""
     c = calibrated
     taken = [Photographs(0, c.session.stations[0].camera, *[np.zeros(0, int)] * 2, [], binning=2)]
-    found = observation_of(c.session, [], Boards(), c.measurements, c.estimate, taken)
+    count = observation_of(c.session, [], Boards(), c.measurements, c.estimate, taken)
     assert len({station.camera_file for station in c.session.stations}) == 1
-    np.testing.assert_array_equal(found.binning, 2)
+    np.testing.assert_array_equal(count.binning, 2)
 
 
 @pytest.mark.parametrize("spread", [1.6, pytest.param(2.4, marks=pytest.mark.slow)])
@@ -161,12 +166,12 @@ def test_photographs_out_of_focus(session, calibrated, spread):
     for path in (session / "images").rglob("*.png"):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(path), cv2.GaussianBlur(image, (0, 0), spread))
-    found = calibrate_session(session)
-    np.testing.assert_array_equal(found.observation.binning, 2)
-    assert found.verdict.usable
-    sigma, sharp = (c.estimate.covariance.diagonal() ** 0.5 for c in (found, calibrated))
+    calibration = calibrate_session(session)
+    np.testing.assert_array_equal(calibration.observation.binning, 2)
+    assert calibration.verdict.usable
+    sigma, sharp = (c.estimate.covariance.diagonal() ** 0.5 for c in (calibration, calibrated))
     assert np.median(sigma[sharp > 0] / sharp[sharp > 0]) > 1.5
-    assert away(calibrated, found).max() < 3
+    assert away(calibrated, calibration).max() < 3
 
 
 @pytest.mark.slow
@@ -174,7 +179,7 @@ def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):
     """Looked at first as if half their pixels were too many; the last looks are at all of them."""
     width = calibrated.session.stations[0].camera.image_size[0]
     monkeypatch.setattr(legs, "USUAL_PICTURE_LENGTH", width // 2)
-    found = calibrate_session(session)
-    np.testing.assert_array_equal(found.observation.binning, 1)
+    calibration = calibrate_session(session)
+    np.testing.assert_array_equal(calibration.observation.binning, 1)
     # looks from elsewhere find some edges a tenth of a pixel beside, as others do
-    assert away(found, calibrated).max() < 1
+    assert away(calibration, calibrated).max() < 1

@@ -36,8 +36,8 @@ def content_of(pdf):
 
 def rectangles(text):
     """(n, 4) x0, y0, x1, y1 in mm from the page's lower left corner."""
-    found = re.findall(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re", text)
-    x, y, w, h = np.array(found, dtype=float).T * POINT
+    values = re.findall(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re", text)
+    x, y, w, h = np.array(values, dtype=float).T * POINT
     return np.stack([x, y, x + w, y + h], axis=-1)
 
 
@@ -60,11 +60,11 @@ def test_the_printed_board_is_found_with_its_points_in_true_size(kind, tmp_path)
     size, text = content_of(pdf)
     image = rasterised(size, rectangles(text))
     cv2.imwrite(str(tmp_path / "page.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
-    (seen,) = detect_boards([tmp_path / "page.png"], board)
-    assert seen.found, seen.reason
-    assert len(seen.ids) == len(board.points)
-    mm = seen.pixels * 25.4 / DPI
-    points = board.points[seen.ids, :2] * 1e3
+    (visible,) = detect_boards([tmp_path / "page.png"], board)
+    assert visible.success, visible.reason
+    assert len(visible.ids) == len(board.points)
+    mm = visible.pixels * 25.4 / DPI
+    points = board.points[visible.ids, :2] * 1e3
     # turned by nothing, enlarged by nothing
     turn, *_ = np.linalg.lstsq(np.c_[points, np.ones(len(points))], mm, rcond=None)
     np.testing.assert_allclose(turn[:2], np.eye(2), atol=2e-4)
@@ -84,8 +84,8 @@ def test_everything_is_on_the_paper_and_the_rulers_are_as_long_as_they_say(paper
         assert np.all(points > 5)
         assert np.all(points < size - 5)
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1)
-    said = float(re.search(r"\((\d+) mm here", text)[1])
-    assert sorted(lengths)[-2:] == pytest.approx([said, said], abs=0.01)
+    words = float(re.search(r"\((\d+) mm here", text)[1])
+    assert sorted(lengths)[-2:] == pytest.approx([words, words], abs=0.01)
     # neither touches the board
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
     inside = (lines > low - 2).all(axis=-1) & (lines < high + 2).all(axis=-1)

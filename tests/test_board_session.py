@@ -15,13 +15,13 @@ from faults import replaced
 from pkmcal.boards.prints import Print
 from pkmcal.boards.stations import find_boards
 from pkmcal.boards.views import Boards, StationBoard
-from pkmcal.calibration.recognise import (
+from pkmcal.calibration.localization import (
     boards_of,
     check_observable,
+    localize_stations,
     platform_poses,
     read_photographs,
     recognise,
-    station_poses,
 )
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -79,8 +79,8 @@ def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, found)
     for number, station in boards.stations.items():
         T_camera_board = truth.T_camera_base[number] @ truth.T_base_board
         camera = session.stations[number].camera
-        there = camera.project(apply(T_camera_board, station.seen.board.points))
-        off = (station.seen.views.pixels - there)[station.seen.poses.weight > 0.5]
+        there = camera.project(apply(T_camera_board, station.views.board.points))
+        off = (station.views.views.pixels - there)[station.views.poses.weight > 0.5]
         assert len(off) > 30
         assert np.sqrt(np.mean(off**2)) < 0.02
         assert np.all(np.abs(off.mean(axis=0)) < 0.005)
@@ -123,11 +123,11 @@ def test_prints_are_what_the_detectors_look_for(fields):
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     dark = printed.dark_at(grid[..., 0].ravel(), grid[..., 1].ravel()).reshape(grid.shape[:2])
     image = cv2.GaussianBlur(np.where(dark, 20, 220).astype(np.uint8), (0, 0), 0.7)
-    seen = detect_board(image, board)
-    assert len(seen.ids) == len(board.points)
-    places = seen.pixels * step + [x[0], y[0]]
+    in_view = detect_board(image, board)
+    assert len(in_view.ids) == len(board.points)
+    places = in_view.pixels * step + [x[0], y[0]]
     # cells are drawn by their pixels' centres, so to half a pixel
-    np.testing.assert_allclose(places, board.points[seen.ids, :2], atol=0.6 * step)
+    np.testing.assert_allclose(places, board.points[in_view.ids, :2], atol=0.6 * step)
 
 
 def test_a_board_is_made_in_proportion_to_the_machine():
@@ -155,7 +155,7 @@ def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, w
     check_observable(session)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    T = station_poses(session, photographs, boards, np.random.default_rng(0))
+    T = localize_stations(session, photographs, boards, np.random.default_rng(0))
     truth = load_truth(rendered, session.machine)
     error = pose_difference(inverse(T), inverse(truth.T_camera_base))
     # as near as the search comes from a pose by hand; the estimate's start need not be nearer
@@ -188,13 +188,13 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     session = load_session(folder)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    T = station_poses(session, photographs, boards, np.random.default_rng(1))
+    T = localize_stations(session, photographs, boards, np.random.default_rng(1))
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     # without the board too: a pose by hand that shows nothing is only where the search begins
     rng = np.random.default_rng(1)
     alone = recognise(session, photographs[1:], platform_poses(session), [rng])
     assert alone.complete
-    off = pose_difference(alone.found[0].T_camera_base, T[1])
+    off = pose_difference(alone.localizations[0].T_camera_base, T[1])
     assert np.rad2deg(np.linalg.norm(off[:3])) < 3
     assert np.linalg.norm(off[3:]) < 0.06
 
@@ -214,9 +214,9 @@ def test_check_reports_the_board(folder, monkeypatch):
         assert station.board.scatter < 0.03
         assert 0.5 < station.board.distance < 3
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked)
-    shown = run("check", folder).out
-    assert "4 of 4" in shown
-    assert "Wander" in shown
+    display = run("check", folder).out
+    assert "4 of 4" in display
+    assert "Wander" in display
     assert json.loads(run("check", folder, "--json").out)["stations"][0]["board"]["found"] == 4
 
 
@@ -285,7 +285,7 @@ def test_one_photograph_of_a_board_is_noted(folder, found):
     """Three of four photographs show grey where the board was; one station is enough to see it."""
     only(folder, "station1")
     board = found[2].stations[0]
-    corners = np.nanmean(board.seen.views.pixels[0], axis=0)
+    corners = np.nanmean(board.views.views.pixels[0], axis=0)
     for path in sorted((folder / "images" / "station1").iterdir())[1:]:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         x, y = (int(v) for v in corners)

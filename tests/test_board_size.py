@@ -10,7 +10,7 @@ import pytest
 
 from pkmcal.boards.board import PRINTED_SIZE_TOLERANCE, board_from_document
 from pkmcal.boards.poses import pose_set
-from pkmcal.calibration.doubts import sizes_told
+from pkmcal.calibration.faults import size_notes
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.geometry.rigid import perturb
@@ -89,8 +89,8 @@ def test_derivatives_by_the_size_are_those_of_the_residuals():
 def test_readings_of_carriages_tell_how_large_the_board_is():
     drawing = load_mechanism("linear-delta")
     _, data = seen_by(drawing, np.random.default_rng(1), 0.003, TOLERANCE)
-    found = estimated(drawing, data)
-    value, sigma = TOLERANCE * found.state.sizes[0], TOLERANCE * found.size_sigma[0]
+    result = estimated(drawing, data)
+    value, sigma = TOLERANCE * result.state.sizes[0], TOLERANCE * result.size_sigma[0]
     assert sigma < 0.3 * TOLERANCE
     assert abs(value - 0.003) < 4 * sigma
 
@@ -107,10 +107,10 @@ def errors_at_the_tool(name, runs, tolerance, assumed):
         true, data = seen_by(drawing, rng, tolerance * rng.standard_normal(), tolerance)
         z = []
         for one in assumed:
-            found = estimated(drawing, replace(data, mounts=(Mount("board", "platform", one),)))
-            covariance = free_of_gauge(found.machine, found.covariance)
-            told = tool_error(true, found.machine, covariance, work, legs_seen=False)
-            z.append(np.sqrt(np.nanmean(told.off_position**2) / np.nanmean(told.position**2)))
+            value = estimated(drawing, replace(data, mounts=(Mount("board", "platform", one),)))
+            covariance = free_of_gauge(value.machine, value.covariance)
+            values = tool_error(true, value.machine, covariance, work, legs_observed=False)
+            z.append(np.sqrt(np.nanmean(values.off_position**2) / np.nanmean(values.position**2)))
         out.append(z)
     return np.array(out)
 
@@ -129,13 +129,13 @@ def test_a_hint_says_what_size_all_else_would_have(size):
     drawing = load_mechanism("h4")
     _, data = seen_by(drawing, np.random.default_rng(1), size, TOLERANCE)
     session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
-    (told,) = sizes_told(session, data, estimated(drawing, data))
+    (information,) = size_notes(session, data, estimated(drawing, data))
     code = "board.size_disagrees" if size else "board.size_by_file"
-    assert (told.code, told.subject) == (code, "board.yaml")
-    assert told.facts["tolerance"] == pytest.approx(0.2)
+    assert (information.code, information.subject) == (code, "board.yaml")
+    assert information.facts["tolerance"] == pytest.approx(0.2)
     if size == 0:
         return
-    value, sigma = told.facts["value"], told.facts["sigma"]
+    value, sigma = information.facts["value"], information.facts["sigma"]
     # the file's own deviation is not in it: what all else tells is off by its own alone
     assert sigma < TOLERANCE * 1.6
     assert abs(value - size) < 3 * sigma

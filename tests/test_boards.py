@@ -100,10 +100,10 @@ def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
         xy = (back[:2, 3] + far[..., None] * direction[..., :2]) * scale + shift - 0.5
     good = np.isfinite(xy).all(axis=-1) & (far > 0)
     place = np.where(good[..., None], xy, -1e4).astype(np.float32)
-    seen = cv2.remap(
+    in_view = cv2.remap(
         printed, place[..., 0], place[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, GREY
     )
-    image = seen.reshape(height, fine, width, fine).mean(axis=(1, 3))
+    image = in_view.reshape(height, fine, width, fine).mean(axis=(1, 3))
     if hide:
         x0, y0, x1, y1 = hide
         image[y0:y1, x0:x1] = 90
@@ -140,15 +140,15 @@ def shot(request, tmp_path):
 def test_corners_are_found_where_they_are(shot):
     """All of them, to a few hundredths of a pixel, and as surely as they say."""
     board, camera, T_camera_board = shot
-    found = detect_board(render(camera, T_camera_board, board), board)
+    value = detect_board(render(camera, T_camera_board, board), board)
     truth = camera.project(apply(T_camera_board, board.points))
-    assert found.found
-    assert not found.mirrored
-    assert set(found.ids) | set(found.weak) == set(range(len(board.points)))
-    assert len(found.ids) >= 0.9 * len(board.points)
-    off = found.pixels - truth[found.ids]
+    assert value.success
+    assert not value.mirrored
+    assert set(value.ids) | set(value.weak) == set(range(len(board.points)))
+    assert len(value.ids) >= 0.9 * len(board.points)
+    off = value.pixels - truth[value.ids]
     assert np.sqrt(np.mean(off**2)) < 0.04
-    assert 0.4 < np.sqrt(np.mean((off / found.sigma[:, None]) ** 2)) < 1.8
+    assert 0.4 < np.sqrt(np.mean((off / value.sigma[:, None]) ** 2)) < 1.8
 
 
 def test_own_corners_beat_opencv(tmp_path):
@@ -157,10 +157,10 @@ def test_own_corners_beat_opencv(tmp_path):
     for k, turn in enumerate(((0.5, 0.0, 0.0), (0.0, 0.6, 0.1), (-0.4, -0.4, 0.3))):
         T_camera_board = view(board, turn, (0.0, 0.0), 0.42)
         image = render(camera, T_camera_board, board, seed=k)
-        found = detect_board(image, board)
-        truth = camera.project(apply(T_camera_board, board.points))[found.ids]
-        own.append(found.pixels - truth)
-        rough = found.pixels.astype(np.float32).reshape(-1, 1, 2).copy()
+        value = detect_board(image, board)
+        truth = camera.project(apply(T_camera_board, board.points))[value.ids]
+        own.append(value.pixels - truth)
+        rough = value.pixels.astype(np.float32).reshape(-1, 1, 2).copy()
         until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
         fine = cv2.cornerSubPix(image, rough, (4, 4), (-1, -1), until)
         other.append(fine.reshape(-1, 2) - truth)
@@ -172,20 +172,20 @@ def test_a_partly_hidden_charuco_board_is_used(tmp_path):
     board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
     T_camera_board = view(board, (0.2, -0.2, 0.0), (0.0, 0.0), 0.42)
     image = render(camera, T_camera_board, board, hide=(0, 0, 190, 360))
-    found = detect_board(image, board)
+    value = detect_board(image, board)
     truth = camera.project(apply(T_camera_board, board.points))
-    assert 15 <= len(found.ids) < 48
-    assert np.all(truth[found.ids, 0] > 185)
-    assert np.abs(found.pixels - truth[found.ids]).max() < 0.2
+    assert 15 <= len(value.ids) < 48
+    assert np.all(truth[value.ids, 0] > 185)
+    assert np.abs(value.pixels - truth[value.ids]).max() < 0.2
 
 
 def test_a_board_out_of_sight_has_a_reason(tmp_path):
     board = board_of(tmp_path, FILES["charuco"])
-    found = detect_board(np.full((360, 480), 90, dtype=np.uint8), board)
-    assert not found.found
-    assert found.reason == "none of the board's markers is recognised"
-    assert found.ids.shape == (0,)
-    assert found.pixels.shape == (0, 2)
+    values = detect_board(np.full((360, 480), 90, dtype=np.uint8), board)
+    assert not values.success
+    assert values.reason == "none of the board's markers is recognised"
+    assert values.ids.shape == (0,)
+    assert values.pixels.shape == (0, 2)
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi])
@@ -198,19 +198,19 @@ def test_colours_tell_which_way_up_a_chessboard_is(tmp_path, turn):
     about = pose(rotation(np.array([0.0, 0.0, turn])), np.zeros(3))
     middle = board.points.mean(axis=0)
     about[:3, 3] = middle - about[:3, :3] @ middle
-    found = detect_board(render(camera, T_camera_board @ about, board), board)
+    value = detect_board(render(camera, T_camera_board @ about, board), board)
     truth = camera.project(apply(T_camera_board @ about, board.points))
-    assert np.abs(found.pixels - truth[found.ids]).max() < 0.3
+    assert np.abs(value.pixels - truth[value.ids]).max() < 0.3
 
 
 def test_mirror_images_are_told(tmp_path):
     board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
     T_camera_board = view(board, (0.2, -0.2, 0.0), (0.0, 0.0), 0.42)
     image = np.ascontiguousarray(render(camera, T_camera_board, board)[:, ::-1])
-    found = detect_board(image, board)
-    assert found.mirrored
-    truth = camera.project(apply(T_camera_board, board.points))[found.ids]
-    np.testing.assert_allclose(found.pixels, [SIZE[0] - 1, 0] + [-1, 1] * truth, atol=0.2)
+    value = detect_board(image, board)
+    assert value.mirrored
+    truth = camera.project(apply(T_camera_board, board.points))[value.ids]
+    np.testing.assert_allclose(value.pixels, [SIZE[0] - 1, 0] + [-1, 1] * truth, atol=0.2)
 
 
 def photographs(folder, board, count=3, size=None, start=0):
@@ -245,9 +245,9 @@ def described(tmp_path, kind, *pairs):
 
 def test_every_photograph_has_a_result(pictures):
     board, paths = pictures["charuco"]
-    found = detect_boards(paths, board)
-    assert [d.name for d in found] == ["p0.png", "p1.png", "p2.png"]
-    assert all(len(d.ids) == 48 for d in found)
+    results = detect_boards(paths, board)
+    assert [d.name for d in results] == ["p0.png", "p1.png", "p2.png"]
+    assert all(len(d.ids) == 48 for d in results)
 
 
 @pytest.mark.parametrize(
@@ -292,18 +292,18 @@ def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
     words = dictionary(board.document["dictionary"])
     turns = (0.3, -0.3, 0.1), (-0.4, 0.2, 0.0)
     images = [render(CAMERAS["fisheye"], view(board, t, (0.0, 0.0), 0.28), board) for t in turns]
-    found = [detect_markers(image, words) for image in images]
-    layout = marker_layout(found)
+    results = [detect_markers(image, words) for image in images]
+    layout = marker_layout(results)
     assert (layout.along, layout.down) == (1, 5)
     assert layout.gap == pytest.approx(0.3, abs=0.03)
     assert layout.first_ids() == [0]
     assert another_grid(layout, board) is None
     right = [  # without the first column: the board may begin with 1, if it is no wider
-        Markers(ids[ids % 5 > 0], corners[ids % 5 > 0]) for ids, corners in found
+        Markers(ids[ids % 5 > 0], corners[ids % 5 > 0]) for ids, corners in results
     ]
     assert marker_layout(right).first_ids() == [1, 0]
     assert another_grid(marker_layout(right), board) is None
-    assert marker_layout([Markers(ids[:2], corners[:2]) for ids, corners in found]) is None
+    assert marker_layout([Markers(ids[:2], corners[:2]) for ids, corners in results]) is None
 
 
 def test_two_boards_mixed(pictures):

@@ -11,7 +11,12 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
-from pkmcal.identify.bundle import as_ended, bundle, machine_told, solve_batch
+from pkmcal.identify.bundle import (
+    bundle,
+    linearize_at_solution,
+    marginalize_to_machine,
+    solve_batch,
+)
 from pkmcal.identify.covariance import (
     Information,
     covariance_by_noise,
@@ -63,7 +68,7 @@ def test_truth_is_recovered_to_rounding(robust):
     scene = replace(scene, edge_shift=np.zeros(1))
     scene = known_radii(scene)
     # edges drawn without shift, since the scene's own shift is now zero
-    found = estimate(
+    value = estimate(
         scene,
         without_noise(rng, scene),
         rng,
@@ -72,11 +77,11 @@ def test_truth_is_recovered_to_rounding(robust):
         scale_noise=False,
     )
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
-    np.testing.assert_allclose(found.state.theta, truth.theta, atol=1e-11)
-    np.testing.assert_allclose(found.state.T_camera_base, truth.T_camera_base, atol=1e-11)
-    np.testing.assert_allclose(found.state.T_base_platform, truth.T_base_platform, atol=1e-11)
-    assert found.statistics.chi2 < 1e-8
-    assert found.statistics.stopped == Stop.CONVERGED.value
+    np.testing.assert_allclose(value.state.theta, truth.theta, atol=1e-11)
+    np.testing.assert_allclose(value.state.T_camera_base, truth.T_camera_base, atol=1e-11)
+    np.testing.assert_allclose(value.state.T_base_platform, truth.T_base_platform, atol=1e-11)
+    assert value.statistics.chi2 < 1e-8
+    assert value.statistics.stopped == Stop.CONVERGED.value
 
 
 def test_uncertainty_is_what_repeats_show():
@@ -84,22 +89,22 @@ def test_uncertainty_is_what_repeats_show():
     together; so are chi2 and the estimated noise scale."""
     rng = np.random.default_rng(1)
     runs = 200
-    scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, seen=0.6)
+    scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, in_view=0.6)
     assembled, truth = scene.batch(rng)
     start = replace(truth, z=0 * truth.z, optics=0 * truth.optics)
     result = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(result.solution.stop) == {Stop.CONVERGED}
-    found = result.solution.state
+    solution = result.solution.state
     whitened, single = [], []
     for run in range(runs):
-        before = state_of(assembled, take(found, np.array([run])), scene.state(run))
+        before = state_of(assembled, take(solution, np.array([run])), scene.state(run))
         shared = result.info.covariance[run]
         c = machine_covariance(assembled.problem, scene.machine, before, shared, ThreeCentres())
-        told = [in_gauge(scene.machine, s, ThreeCentres()) for s in (before, scene.state(run))]
-        stations = pose_difference(told[0].T_camera_base, told[1].T_camera_base)
-        error = np.concatenate([told[0].theta - told[1].theta, stations.ravel()])
-        known = np.diag(c) > 0
-        error, c = error[known], c[np.ix_(known, known)]
+        rows = [in_gauge(scene.machine, s, ThreeCentres()) for s in (before, scene.state(run))]
+        stations = pose_difference(rows[0].T_camera_base, rows[1].T_camera_base)
+        error = np.concatenate([rows[0].theta - rows[1].theta, stations.ravel()])
+        above_limit = np.diag(c) > 0
+        error, c = error[above_limit], c[np.ix_(above_limit, above_limit)]
         scale = np.sqrt(np.diag(c))
         values, vectors = np.linalg.eigh(c / np.outer(scale, scale))
         keep = values > 1e-9  # the frames' second leg holds two combinations of three numbers
@@ -153,8 +158,8 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    found = np.sqrt(np.mean(result.info.problem.data.shading**2))
-    assert found == pytest.approx(sigma, rel=0.1)
+    values = np.sqrt(np.mean(result.info.problem.data.shading**2))
+    assert values == pytest.approx(sigma, rel=0.1)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.covariance)[:, : error.shape[1]]
     assert np.mean(error / variance) == pytest.approx(1, abs=0.15)
@@ -194,8 +199,8 @@ def test_wrong_edges_change_nothing_that_matters(share):
         dirty_data = scene.measurements(np.random.default_rng(100 + seed), wrong=share)
         dirty = estimate(scene, dirty_data, rng)
         sigma = np.sqrt(np.diag(dirty.covariance))
-        known = sigma > 1e-9
-        change = (dirty.state.theta - clean.state.theta)[known] / sigma[known]
+        above_limit = sigma > 1e-9
+        change = (dirty.state.theta - clean.state.theta)[above_limit] / sigma[above_limit]
         assert np.abs(change).max() < 1.5
         wrong = np.any(
             dirty_data.edges.normal
@@ -245,18 +250,18 @@ def test_configurations_that_nobody_photographed():
     full = scene.measurements(rng)
     unseen = np.array([2, 7])
     part = replace(full, edges=full.edges.select(~np.isin(full.edges.configuration, unseen)))
-    found = estimate(scene, part, rng)
-    assert not found.configurations[unseen].any()
-    assert found.configurations.sum() == 8
-    assert not found.joint_residuals[unseen].any()
+    value = estimate(scene, part, rng)
+    assert not value.configurations[unseen].any()
+    assert value.configurations.sum() == 8
+    assert not value.joint_residuals[unseen].any()
     keep = np.setdiff1d(np.arange(10), unseen)
     row = np.searchsorted(keep, part.edges.configuration)
     only = replace(part, joints=part.joints[keep], edges=replace(part.edges, configuration=row))
     same = estimate(scene, only, rng)
     # the starts differ, so the robust weights may stop a hair apart
-    np.testing.assert_allclose(found.state.theta, same.state.theta, atol=1e-7)
-    poses = found.machine.forward(part.joints[unseen])
-    np.testing.assert_allclose(found.state.T_base_platform[unseen], poses, atol=1e-9)
+    np.testing.assert_allclose(value.state.theta, same.state.theta, atol=1e-7)
+    poses = value.machine.forward(part.joints[unseen])
+    np.testing.assert_allclose(value.state.T_base_platform[unseen], poses, atol=1e-9)
 
 
 @pytest.mark.parametrize("edges_left", [0, 1, 4])
@@ -268,12 +273,12 @@ def test_a_station_that_sees_almost_nothing_does_no_harm(edges_left):
     without = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
     keep = keep.copy()
     keep[np.flatnonzero(~keep)[:edges_left]] = True
-    found = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
+    values = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
     sigma = np.sqrt(np.diag(without.covariance))
-    change = (found.state.theta - without.state.theta)[sigma > 1e-9] / sigma[sigma > 1e-9]
+    change = (values.state.theta - without.state.theta)[sigma > 1e-9] / sigma[sigma > 1e-9]
     assert np.abs(change).max() < (0.3 if edges_left else 1e-3)
-    assert np.isfinite(found.covariance).all()
-    width = np.sqrt(np.einsum("sii->si", found.station_covariance)).max(axis=1)
+    assert np.isfinite(values.covariance).all()
+    width = np.sqrt(np.einsum("sii->si", values.station_covariance)).max(axis=1)
     assert width[1] > 1.0  # metres or radians: unknown, and said so
     assert width[[0, 2]].max() < 0.01
 
@@ -281,20 +286,20 @@ def test_a_station_that_sees_almost_nothing_does_no_harm(edges_left):
 def test_result_statistics_add_up():
     rng = np.random.default_rng(8)
     scene = make_scene(rng)
-    found = estimate(scene, scene.measurements(rng), rng)
-    s = found.statistics
+    value = estimate(scene, scene.measurements(rng), rng)
+    s = value.statistics
     assert s.chi2 == pytest.approx(s.chi2_edges + s.chi2_joints + s.chi2_drawing)
     assert s.chi2 / s.dof == pytest.approx(1, abs=0.1)
-    weighted = np.sum(found.edge_weights * np.sum(found.edge_residuals**2, axis=1))
+    weighted = np.sum(value.edge_weights * np.sum(value.edge_residuals**2, axis=1))
     assert weighted == pytest.approx(s.chi2_edges, rel=1e-6)
-    assert np.sum(found.joint_residuals**2) == pytest.approx(s.chi2_joints)
-    readings = found.machine.inverse(found.state.T_base_platform)
+    assert np.sum(value.joint_residuals**2) == pytest.approx(s.chi2_joints)
+    readings = value.machine.inverse(value.state.T_base_platform)
     measured = scene.measurements(np.random.default_rng(8)).joints
     assert np.abs(readings - measured).max() < 5 * JOINT_NOISE * 10
-    held = np.diag(found.covariance) == 0
+    held = np.diag(value.covariance) == 0
     assert held.sum() >= 6
-    assert np.all(found.data_share[~held] <= 1)
-    assert np.median(found.data_share) > 0.9
+    assert np.all(value.data_share[~held] <= 1)
+    assert np.median(value.data_share) > 0.9
 
 
 def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_small():
@@ -324,26 +329,28 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     start = start_state(scene.machine, both, guess(rng, scene.T_camera_base))
     plain = {"robust": False, "scale_noise": False}
     before = bundle(scene.machine, one, start, **plain)
-    told = machine_told(one, before)
+    information = marginalize_to_machine(one, before)
     start = replace(start, theta=before.state.theta)
-    found = bundle(scene.machine, other, start, told=told, **plain)
+    fit = bundle(scene.machine, other, start, marginal_prior=information, **plain)
     together = bundle(scene.machine, all_, start, **plain)
     sigma = np.sqrt(np.diag(together.covariance))
-    known = sigma > 0
-    off = (found.state.theta - together.state.theta)[known] / sigma[known]
+    above_limit = sigma > 0
+    off = (fit.state.theta - together.state.theta)[above_limit] / sigma[above_limit]
     assert np.abs(off).max() < 0.5
     alone = bundle(scene.machine, other, start, **plain)
-    moved = (alone.state.theta - together.state.theta)[known] / sigma[known]
-    assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(moved**2))
-    ratio = np.sqrt(np.diag(found.covariance))[known] / sigma[known]
+    shifted = (alone.state.theta - together.state.theta)[above_limit] / sigma[above_limit]
+    assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(shifted**2))
+    ratio = np.sqrt(np.diag(fit.covariance))[above_limit] / sigma[above_limit]
     np.testing.assert_allclose(ratio, 1, atol=0.05)
     # the drawing is in what is told: without it that still is what was asked for
-    without = bundle(scene.machine, other, start, told=told, use_drawing=False, **plain)
-    np.testing.assert_array_equal(without.state.theta, found.state.theta)
+    without = bundle(
+        scene.machine, other, start, marginal_prior=information, use_drawing=False, **plain
+    )
+    np.testing.assert_array_equal(without.state.theta, fit.state.theta)
     # what moves by less than its deviations is like before; by the drawing alone it was not
-    after = machine_told(all_, together)
+    after = marginalize_to_machine(all_, together)
     assert after.like(after)
-    assert not after.like(replace(told, free=np.zeros_like(told.free)))
+    assert not after.like(replace(information, free=np.zeros_like(information.free)))
 
 
 def test_fixed_and_tied_parameters():
@@ -354,18 +361,18 @@ def test_fixed_and_tied_parameters():
     machine = replace(machine, parameters=table)
     rng = np.random.default_rng(9)
     scene = make_scene(rng, machine=machine)
-    found = estimate(scene, scene.measurements(rng), rng)
+    value = estimate(scene, scene.measurements(rng), rng)
     fixed = table.index("legs[3].length.offset")
-    assert found.state.theta[fixed] == table.drawing[fixed]
-    assert found.covariance[fixed].max() == 0
+    assert value.state.theta[fixed] == table.drawing[fixed]
+    assert value.covariance[fixed].max() == 0
     tied = [table.index(n) for n in radii]
-    change = found.state.theta[tied] - table.drawing[tied]
+    change = value.state.theta[tied] - table.drawing[tied]
     np.testing.assert_allclose(change, change[0], atol=1e-15)
-    np.testing.assert_allclose(np.diag(found.covariance)[tied], found.covariance[tied[0], tied[1]])
+    np.testing.assert_allclose(np.diag(value.covariance)[tied], value.covariance[tied[0], tied[1]])
     truth = in_gauge(machine, scene.state(), ThreeCentres())
-    sigma = np.sqrt(np.diag(found.covariance))
-    known = sigma > 1e-9
-    assert np.abs((found.state.theta - truth.theta)[known] / sigma[known]).max() < 4.5
+    sigma = np.sqrt(np.diag(value.covariance))
+    above_limit = sigma > 1e-9
+    assert np.abs((value.state.theta - truth.theta)[above_limit] / sigma[above_limit]).max() < 4.5
 
 
 def test_full_rank_of_a_good_session():
@@ -373,11 +380,11 @@ def test_full_rank_of_a_good_session():
     scene = make_scene(rng)
     assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
     state = batch_of(scene.machine, assembled, scene.state())
-    found = identifiability(Information(assembled.problem, state), scene.machine)
-    assert found.n_frames == 12
+    value = identifiability(Information(assembled.problem, state), scene.machine)
+    assert value.n_frames == 12
     # the common scale of radii against the edge shift is soft, but nothing is lost
-    assert found.rank == found.n_parameters - 12
-    assert not found.unidentified
+    assert value.rank == value.n_parameters - 12
+    assert not value.unidentified
 
 
 def test_what_cannot_be_identified_is_named():
@@ -389,11 +396,11 @@ def test_what_cannot_be_identified_is_named():
     part = replace(full, edges=full.edges.select(~hidden))
     assembled = assemble(scene.machine, part, ThreeCentres())
     state = batch_of(scene.machine, assembled, scene.state())
-    found = identifiability(Information(assembled.problem, state), scene.machine)
-    assert [d.names for d in found.unidentified] == [("legs[4].tubes[2].radius",)]
+    results = identifiability(Information(assembled.problem, state), scene.machine)
+    assert [d.names for d in results.unidentified] == [("legs[4].tubes[2].radius",)]
     result = estimate(scene, part, rng)
     radius = scene.machine.parameters.index("legs[4].tubes[2].radius")
-    _, info = as_ended(part, result)
+    _, info = linearize_at_solution(part, result)
     assert identifiability(info, result.machine).unidentified[0].names == (
         "legs[4].tubes[2].radius",
     )
@@ -406,11 +413,11 @@ def test_one_configuration_is_singular_and_two_suffice():
     rng = np.random.default_rng(22)
     for configurations, complete in ((1, False), (2, True)):
         machine = exact("gough-stewart")
-        scene = make_scene(rng, configurations=configurations, seen=1.0, machine=machine)
+        scene = make_scene(rng, configurations=configurations, in_view=1.0, machine=machine)
         assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
         state = batch_of(scene.machine, assembled, scene.state())
-        found = identifiability(Information(assembled.problem, state), scene.machine)
-        assert (not found.unidentified) == complete
+        value = identifiability(Information(assembled.problem, state), scene.machine)
+        assert (not value.unidentified) == complete
 
 
 def test_every_configuration_seen_from_one_station_only():
@@ -418,12 +425,12 @@ def test_every_configuration_seen_from_one_station_only():
     scene = make_scene(rng, configurations=24)
     full = scene.measurements(rng)
     keep = full.edges.station == full.edges.configuration % 3
-    found = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
+    value = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
-    sigma = np.sqrt(np.diag(found.covariance))
-    known = sigma > 1e-9
-    assert np.abs((found.state.theta - truth.theta)[known] / sigma[known]).max() < 4.5
-    assert found.statistics.chi2 / found.statistics.dof == pytest.approx(1, abs=0.1)
+    sigma = np.sqrt(np.diag(value.covariance))
+    above_limit = sigma > 1e-9
+    assert np.abs((value.state.theta - truth.theta)[above_limit] / sigma[above_limit]).max() < 4.5
+    assert value.statistics.chi2 / value.statistics.dof == pytest.approx(1, abs=0.1)
 
 
 def test_two_cameras_have_their_own_edge_shift():
@@ -431,10 +438,10 @@ def test_two_cameras_have_their_own_edge_shift():
     scene = make_scene(rng, configurations=20, tolerance=0.3)
     m = scene.measurements(rng)
     m = replace(m, camera_of_station=np.array([0, 1, 0]))
-    found = estimate(scene, m, rng)
-    assert found.state.edge_shift.shape == (2,)
+    value = estimate(scene, m, rng)
+    assert value.state.edge_shift.shape == (2,)
     np.testing.assert_allclose(
-        found.state.edge_shift, scene.edge_shift[0], atol=4 * found.edge_shift_sigma.max()
+        value.state.edge_shift, scene.edge_shift[0], atol=4 * value.edge_shift_sigma.max()
     )
 
 
@@ -469,11 +476,11 @@ def test_results_do_not_depend_on_the_gauge(gauge):
             assert distance_sigma(other, a, b) == pytest.approx(distance_sigma(reference, a, b))
 
 
-def distance_sigma(found, a, b):
+def distance_sigma(value, a, b):
     """Standard deviation of the distance between two centres: the same in every frame."""
-    e = found.state.theta[a] - found.state.theta[b]
+    e = value.state.theta[a] - value.state.theta[b]
     e = e / np.linalg.norm(e)
-    c = found.covariance
+    c = value.covariance
     spread = c[np.ix_(a, a)] + c[np.ix_(b, b)] - c[np.ix_(a, b)] - c[np.ix_(b, a)]
     return np.sqrt(e @ spread @ e)
 
@@ -507,23 +514,23 @@ def test_what_looks_scatter_by_is_in_the_deviations_and_nowhere_else():
     rng = np.random.default_rng(3)
     scene = make_scene(rng)
     measurements = scene.measurements(rng)
-    found = bundle(scene.machine, measurements, scene.state())
-    measurements = replace(measurements, look_variance=0.5)
+    fit = bundle(scene.machine, measurements, scene.state())
+    measurements = replace(measurements, imputation_covariance=0.5)
     more = bundle(scene.machine, measurements, scene.state())
-    np.testing.assert_array_equal(more.state.theta, found.state.theta)
-    np.testing.assert_array_equal(more.edge_residuals, found.edge_residuals)
-    assert more.statistics.look_scatter == pytest.approx(np.sqrt(0.5))
-    assert found.statistics.look_scatter == 0
-    larger = np.linalg.eigvalsh(more.joint_covariance - found.joint_covariance)
+    np.testing.assert_array_equal(more.state.theta, fit.state.theta)
+    np.testing.assert_array_equal(more.edge_residuals, fit.edge_residuals)
+    assert more.statistics.imputation_scatter == pytest.approx(np.sqrt(0.5))
+    assert fit.statistics.imputation_scatter == 0
+    larger = np.linalg.eigvalsh(more.joint_covariance - fit.joint_covariance)
     assert larger.min() > -1e-9 * larger.max()
-    n = len(found.data_share)
-    before, after = (np.diag(e.joint_covariance)[:n] for e in (found, more))
-    told, drawn = found.data_share > 0.99, (found.data_share < 0.01) & (before > 0)
-    assert told.any()
+    n = len(fit.data_share)
+    before, after = (np.diag(e.joint_covariance)[:n] for e in (fit, more))
+    values, drawn = fit.data_share > 0.99, (fit.data_share < 0.01) & (before > 0)
+    assert values.any()
     # readings' scales, radii, shading have part in what edges tell, and are drawn in part
-    assert np.all(after[told] > 1.1 * before[told])
+    assert np.all(after[values] > 1.1 * before[values])
     assert np.all(after <= 1.5001 * before)
     np.testing.assert_allclose(after[drawn], before[drawn], rtol=0.02)
     assert np.all(more.data_share > -0.01)  # no less is known than was drawn
     for name in ("edge_shift_sigma", "line_shift_sigma"):
-        assert np.all(getattr(more, name) >= getattr(found, name))
+        assert np.all(getattr(more, name) >= getattr(fit, name))

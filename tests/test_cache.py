@@ -27,8 +27,8 @@ def test_what_is_kept_is_read_again(folder):
     remember("a", b"first")
     remember("a", b"second")
     assert remembered("a") == b"second"
-    kept = [path.name for path in folder.rglob("*") if path.is_file()]
-    assert kept == ["a"]  # nothing half written is left beside it
+    retained = [path.name for path in folder.rglob("*") if path.is_file()]
+    assert retained == ["a"]  # nothing half written is left beside it
 
 
 def test_templates_are_compiled_once(folder, monkeypatch):

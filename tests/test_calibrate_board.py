@@ -12,7 +12,7 @@ import yaml
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.recognise import boards_of, read_photographs
+from pkmcal.calibration.localization import boards_of, read_photographs
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.papers import methods
@@ -57,9 +57,9 @@ def off(result, truth):
 
 def apart(machine, truth):
     """The same of any machine, after the best fit of both frames."""
-    found, there = machine.forward(truth.joints), truth.T_base_platform
-    frames = solve_pairs(found[None], there[None], 0.3)
-    error = frames.T_camera_base[0] @ found @ frames.T_mount[0] - there
+    forward_kinematics, there = machine.forward(truth.joints), truth.T_base_platform
+    frames = solve_pairs(forward_kinematics[None], there[None], 0.3)
+    error = frames.T_camera_base[0] @ forward_kinematics @ frames.T_mount[0] - there
     return np.sqrt(np.mean(np.sum(error[:, :3, 3] ** 2, axis=-1)))
 
 
@@ -76,17 +76,17 @@ def test_boards_are_where_they_are(rendered):
 
 
 def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
-    found = calibrate_session(rendered)
-    corners = board_corners(found.session, found.boards, found.estimate)
+    calibration = calibrate_session(rendered)
+    corners = board_corners(calibration.session, calibration.boards, calibration.estimate)
     assert len(corners) > 50
     # what the corners' own noise leaves, a few hundredths of a pixel
     assert np.sqrt(np.mean(corners.off[corners.used] ** 2)) < 0.15
-    state, turn = found.estimate.state, 1e-3
+    state, turn = calibration.estimate.state, 1e-3
     T_turned_camera = perturb(np.eye(4), np.array([0.0, turn, 0, 0, 0, 0]))
     turned = replace(state, T_camera_base=T_turned_camera @ state.T_camera_base)
-    moved = replace(found.estimate, state=turned)
-    change = board_corners(found.session, found.boards, moved).off - corners.off
-    focal = found.session.stations[0].camera.parameters[0]
+    shifted = replace(calibration.estimate, state=turned)
+    change = board_corners(calibration.session, calibration.boards, shifted).off - corners.off
+    focal = calibration.session.stations[0].camera.parameters[0]
     # expected farther right by the focal length times the turn, and more towards the border
     np.testing.assert_allclose(change[:, 0], -focal * turn, rtol=0.3)
 
@@ -99,10 +99,10 @@ def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
     assert s.n_poses > 40
     assert off(result, truth) < 0.2 * apart(result.session.machine, truth)
     # the camera from the board, in frames that do not matter
-    found = result.estimate.state
-    seen = found.T_camera_base[0] @ found.T_base_platform @ found.T_mount[0]
+    value = result.estimate.state
+    visible = value.T_camera_base[0] @ value.T_base_platform @ value.T_mount[0]
     true = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
-    error = pose_difference(seen, true)
+    error = pose_difference(visible, true)
     assert np.sqrt(np.mean(error[:, 3:] ** 2)) < 5e-4
     assert np.sqrt(np.mean(error[:, :3] ** 2)) < 2e-3
 
@@ -112,7 +112,7 @@ def test_the_board_alone(folder, tmp_path):
     result = calibrate_session(folder)
     assert len(result.observation.edges) == 0
     assert result.estimate.statistics.pose_scale < 1.6
-    assert result.boards.stations[0].seen.usable.sum() > 7
+    assert result.boards.stations[0].views.usable.sum() > 7
     save(result, tmp_path / "out")
     document = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert document["targets"][0]["fixed_to"] == "platform"

@@ -43,16 +43,16 @@ def errors_in_sigmas(calibration, folder):
     return (estimate.machine.values - true)[free] / sigma[free]
 
 
-def check_found(found, folder, centre):
+def check_found(value, folder, centre):
     """The joint centres come from millimetres to ``centre``, and the deviations say how far off."""
-    errors = compare_with_truth(found, folder)
+    errors = compare_with_truth(value, folder)
     assert errors.drawing.centre > 1e-3
     assert errors.calibrated.centre < centre
     assert errors.calibrated.orientation < errors.drawing.orientation / 5
     # 30 values, correlated: their rms over sigma scatters by some 0.2, about 0.8 on such sessions
-    z = errors_in_sigmas(found, folder)
+    z = errors_in_sigmas(value, folder)
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
-    assert found.verdict.usable
+    assert value.verdict.usable
 
 
 def test_the_machine_is_found(demo, calibrated):
@@ -74,10 +74,10 @@ def test_slim_bare_rods_are_told_honestly(tmp_path):
     it errors are 1.25 deviations here, with it 0.87.
     """
     folder = photographed(tmp_path / "session", seed=5)
-    found = pkmcal.calibrate(folder)
-    result = compare_with_truth(found, folder)
+    value = pkmcal.calibrate(folder)
+    result = compare_with_truth(value, folder)
     assert result.calibrated.centre < result.drawing.centre / 5
-    assert np.sqrt(np.mean(errors_in_sigmas(found, folder) ** 2)) < 1.2
+    assert np.sqrt(np.mean(errors_in_sigmas(value, folder) ** 2)) < 1.2
 
 
 @pytest.mark.slow
@@ -93,9 +93,9 @@ def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
         shift *= 0.1 / np.linalg.norm(shift)
         true = inverse(truth.T_camera_base[number])
         stations.append(replace(station, T_camera_base=inverse(true @ pose(rotation(turn), shift))))
-    found = pkmcal.calibrate(replace(session, stations=tuple(stations)))
+    values = pkmcal.calibrate(replace(session, stations=tuple(stations)))
     sigma = np.sqrt(np.diag(calibrated.estimate.covariance))
-    change = found.machine.values - calibrated.machine.values
+    change = values.machine.values - calibrated.machine.values
     # another path to the last look moves its profiles by hundredths of a pixel
     assert np.max(np.abs(change) / np.maximum(sigma, 1e-6)) < 1.0
 
@@ -110,8 +110,8 @@ def test_start_from_a_bad_drawing(demo, calibrated):
     loose = np.where(kinematic, 5e-3, table.tolerance)
     table = replace(table, drawing=table.drawing + off, tolerance=loose)
     machine = replace(session.machine, parameters=table, values=table.drawing)
-    found = pkmcal.calibrate(replace(session, machine=machine))
-    errors = compare_with_truth(found, demo.session).calibrated
+    value = pkmcal.calibrate(replace(session, machine=machine))
+    errors = compare_with_truth(value, demo.session).calibrated
     assert (
         errors.centre
         < 1.5 * compare_with_truth(calibrated, demo.session).calibrated.centre + 0.05e-3
@@ -154,13 +154,13 @@ def test_diameters_are_named_where_few_edges_happen_to_agree(tmp_path, seed):
 def test_one_station_alone(demo, calibrated):
     """Less is seen, so deviations grow, and still tell the truth."""
     session = load_session(demo.session)
-    found = pkmcal.calibrate(replace(session, stations=session.stations[:1]))
-    z = errors_in_sigmas(found, demo.session)
+    value = pkmcal.calibrate(replace(session, stations=session.stations[:1]))
+    z = errors_in_sigmas(value, demo.session)
     assert np.sqrt(np.mean(z**2)) < 1.8
-    before, after = (np.diag(c.estimate.covariance) for c in (calibrated, found))
+    before, after = (np.diag(c.estimate.covariance) for c in (calibrated, value))
     free = before > 1e-18
     assert np.median(after[free] / before[free]) > 2
-    assert found.verdict.of("configurations.unused")
+    assert value.verdict.of("configurations.unused")
 
 
 @pytest.mark.slow
@@ -169,13 +169,13 @@ def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, meth
     """They run on the same edges and come nowhere near; the verdict names the better method. By
     the command in test_cli.py; how good they are by themselves in the tests of the papers.
     """
-    found = pkmcal.calibrate(demo.session, method=method)
-    assert found.method == method
-    worse = compare_with_truth(found, demo.session).calibrated.centre
+    value = pkmcal.calibrate(demo.session, method=method)
+    assert value.method == method
+    worse = compare_with_truth(value, demo.session).calibrated.centre
     assert worse > 3 * compare_with_truth(calibrated, demo.session).calibrated.centre
-    if not found.verdict.usable:
-        assert found.verdict.of("estimate")
-    assert np.all(np.diag(found.estimate.covariance) >= 0)
+    if not value.verdict.usable:
+        assert value.verdict.of("estimate")
+    assert np.all(np.diag(value.estimate.covariance) >= 0)
 
 
 def test_rejected_edges_have_reasons(calibrated):
@@ -199,16 +199,16 @@ def test_cameras_are_refined(demo, calibrated):
     wrong = replace(camera, parameters=camera.parameters + off, covariance=np.diag(sigma**2))
     stations = tuple(replace(s, camera=wrong) for s in session.stations)
     held = pkmcal.calibrate(replace(session, stations=stations))
-    found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
-    spoilt, mended = (compare_with_truth(c, demo.session).calibrated for c in (held, found))
+    value = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
+    spoilt, mended = (compare_with_truth(c, demo.session).calibrated for c in (held, value))
     # the readings' scales, unsure to their tolerance, leave the size of everything, and with
     # it positions, open by as much
     assert mended.centre < spoilt.centre / 1.5
     assert mended.orientation < spoilt.orientation / 1.5
     assert mended.position < spoilt.position
-    refined = found.cameras.result(found.estimate, session.stations[0].camera_file)
-    left = (refined.parameters - camera.parameters)[:2]
-    assert np.all(np.abs(left) < 0.4 * np.abs(off[:2]))
+    refined = value.cameras.result(value.estimate, session.stations[0].camera_file)
+    remainder = (refined.parameters - camera.parameters)[:2]
+    assert np.all(np.abs(remainder) < 0.4 * np.abs(off[:2]))
     assert np.all(np.diag(refined.covariance)[:2] < sigma[:2] ** 2)
 
 
@@ -218,15 +218,15 @@ def test_a_camera_without_covariance_is_refined_from_what_is_usual(demo):
     off = 0.006 * np.where(np.arange(len(camera.parameters)) < 2, camera.parameters, 0.0)
     wrong = replace(camera, parameters=camera.parameters + off, covariance=None)
     stations = tuple(replace(s, camera=wrong) for s in session.stations)
-    found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
-    refined = found.cameras.result(found.estimate, session.stations[0].camera_file)
-    left, sigma = refined.parameters - camera.parameters, np.sqrt(np.diag(refined.covariance))
-    assert np.all(np.abs(left[:5]) < 3.5 * sigma[:5])
+    value = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
+    refined = value.cameras.result(value.estimate, session.stations[0].camera_file)
+    remainder, sigma = refined.parameters - camera.parameters, np.sqrt(np.diag(refined.covariance))
+    assert np.all(np.abs(remainder[:5]) < 3.5 * sigma[:5])
     assert np.all(sigma[:2] < 0.005 * camera.parameters[:2])
     assert sigma[5:].max() == 0  # nobody said that these are unknown
-    (told,) = found.verdict.of("camera.no_covariance")
-    assert told.facts["centre"] == pytest.approx(0.01)
-    assert found.departures == ()
+    (values,) = value.verdict.of("camera.no_covariance")
+    assert values.facts["centre"] == pytest.approx(0.01)
+    assert value.violations == ()
 
 
 def test_state_of_a_calibration_closes(calibrated):

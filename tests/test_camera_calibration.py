@@ -68,8 +68,8 @@ ONE_MODEL = pytest.mark.parametrize(
 def poses_for(camera, count, seed, tilt=0.6):
     """Poses with the whole board in the picture, in many directions, tilted to all sides."""
     rng = np.random.default_rng(seed)
-    found = []
-    while len(found) < count:
+    results = []
+    while len(results) < count:
         pixel = rng.uniform([80, 80], [SIZE[0] - 80, SIZE[1] - 80])
         ray = camera.ray(pixel)
         side = np.cross([0.0, 1.0, 0.0], ray)
@@ -80,11 +80,11 @@ def poses_for(camera, count, seed, tilt=0.6):
         T = pose(rot, middle - rot @ BOARD.points.mean(axis=0))
         pixels = camera.project(apply(T, BOARD.points))
         if camera.in_image(pixels, 5).all() and abs(rot[:, 2] @ ray) > 0.6:
-            found.append(T)
-    return np.stack(found)
+            results.append(T)
+    return np.stack(results)
 
 
-def detections(camera, T_camera_board, seed=0, noise=0.05, known=True, wrong=0):
+def detections(camera, T_camera_board, seed=0, noise=0.05, reference_values=True, wrong=0):
     """Corners of every pose with noise, the first ``wrong`` of each view 5 px off."""
     rng = np.random.default_rng(seed)
     out = []
@@ -93,7 +93,7 @@ def detections(camera, T_camera_board, seed=0, noise=0.05, known=True, wrong=0):
         pixels = pixels + rng.normal(0, noise, pixels.shape)
         pixels[:wrong] += 5.0
         ids = np.arange(len(pixels))
-        sigma = np.full(len(ids), noise if known else 0.0)
+        sigma = np.full(len(ids), noise if reference_values else 0.0)
         out.append(Detection(f"p{k}.png", SIZE, ids, pixels, sigma))
     return out
 
@@ -134,19 +134,19 @@ def wide_calibration(wide_pool):
         return calibration_of("unified")
 
 
-def check_truth(found, true):
+def check_truth(value, true):
     """Model and terms are found, and every intrinsic within its uncertainty."""
-    assert found.camera.model == true.model
-    assert set(TERMS[true.model]) <= set(found.terms) or true.model != "pinhole"
-    off = found.camera.parameters - true.parameters
-    free = found.sigma > 0
-    chi2 = off[free] @ np.linalg.inv(found.covariance[np.ix_(free, free)]) @ off[free]
+    assert value.camera.model == true.model
+    assert set(TERMS[true.model]) <= set(value.terms) or true.model != "pinhole"
+    off = value.camera.parameters - true.parameters
+    free = value.sigma > 0
+    chi2 = off[free] @ np.linalg.inv(value.covariance[np.ix_(free, free)]) @ off[free]
     assert chi2 < 4 * free.sum()
-    assert found.rms == pytest.approx(0.05 * np.sqrt(2), rel=0.1)
-    assert found.rms < found.held_out.rms < 1.2 * found.rms
-    assert found.held_out.straightness < 0.06
-    assert found.spread == 1.0
-    np.testing.assert_array_equal(found.camera.covariance, found.covariance)
+    assert value.rms == pytest.approx(0.05 * np.sqrt(2), rel=0.1)
+    assert value.rms < value.held_out.rms < 1.2 * value.rms
+    assert value.held_out.straightness < 0.06
+    assert value.spread == 1.0
+    np.testing.assert_array_equal(value.camera.covariance, value.covariance)
 
 
 def test_the_truth_comes_back(wide_calibration):
@@ -170,11 +170,11 @@ def test_photographs_give_the_camera(tmp_path, monkeypatch):
         image = render(camera, view(board, turn, where, 0.38), board, seed=k)
         paths.append(tmp_path / f"p{k}.png")
         cv2.imwrite(str(paths[-1]), image)
-    found = calibrate_photographs(paths, board, "pinhole")
-    focal, sigma = found.camera.parameters[:2], found.sigma[:2]
+    calibration = calibrate_photographs(paths, board, "pinhole")
+    focal, sigma = calibration.camera.parameters[:2], calibration.sigma[:2]
     np.testing.assert_allclose(focal, camera.parameters[:2], rtol=2e-3)
     assert np.all(np.abs(focal - camera.parameters[:2]) < 4 * sigma)
-    assert found.held_out.rms < 0.1
+    assert calibration.held_out.rms < 0.1
 
 
 @ONE_MODEL
@@ -184,7 +184,7 @@ def test_sigma_is_honest(true):
     free = positions(true, TERMS[true.model])
     scaled = []
     for seed in range(40):
-        views = views_of(detections(true, poses, seed, known=seed % 2 == 0), BOARD)
+        views = views_of(detections(true, poses, seed, reference_values=seed % 2 == 0), BOARD)
         fit = fit_camera(true, free, views, poses)
         sigma = np.sqrt(np.diag(covariance_of(fit, views)[0]))[free]
         scaled.append((fit.camera.parameters - true.parameters)[free] / sigma)
@@ -197,12 +197,12 @@ def test_sigma_is_honest(true):
 def test_opencv_agrees():
     """cv2.calibrateCamera, with the same terms and equal weights, is the same least squares."""
     true = TRUE["pinhole"]
-    found = detections(true, poses_for(true, 8, 3), 4, known=False)
-    views = views_of(found, BOARD)
+    value = detections(true, poses_for(true, 8, 3), 4, reference_values=False)
+    views = views_of(value, BOARD)
     free = positions(true, TERMS["pinhole"])
     ours = fit_camera(true, free, views, settled_poses(true, views)).camera.parameters
     objects = [BOARD.points.astype(np.float32)] * 8
-    pictures = [d.pixels.astype(np.float32).reshape(-1, 1, 2) for d in found]
+    pictures = [d.pixels.astype(np.float32).reshape(-1, 1, 2) for d in value]
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     _, k, d, *_ = cv2.calibrateCamera(
         objects, pictures, SIZE, None, None, flags=cv2.CALIB_FIX_K3, criteria=until
@@ -212,15 +212,17 @@ def test_opencv_agrees():
     np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
 
 
-def misnumbered(found, columns=8):
+def misnumbered(value, columns=8):
     """Detections whose corners of the first column bear the numbers of the row above."""
     out = []
-    for one in found:
+    for one in value:
         ids = one.ids.copy()
         first = ids % columns == 0
         ids[first] -= columns
-        kept = ids >= 0
-        out.append(replace(one, ids=ids[kept], pixels=one.pixels[kept], sigma=one.sigma[kept]))
+        retained = ids >= 0
+        out.append(
+            replace(one, ids=ids[retained], pixels=one.pixels[retained], sigma=one.sigma[retained])
+        )
     return out
 
 
@@ -228,9 +230,9 @@ def test_corners_with_wrong_numbers_are_no_lens(monkeypatch):
     """All fit but those of one column: the board is another, however well the rest fits."""
     alone(monkeypatch, "pinhole")
     true = TRUE["pinhole"]
-    found = detections(true, poses_for(true, 10, 1), 2)
+    value = detections(true, poses_for(true, 10, 1), 2)
     with pytest.raises(InputError, match="do not lie as its file numbers them") as caught:
-        calibrate_camera(misnumbered(found), BOARD, "pinhole")
+        calibrate_camera(misnumbered(value), BOARD, "pinhole")
     assert caught.value.found.startswith(f"{BOARD.counts[1] - 1} of {len(BOARD.points)} corners")
 
 
@@ -238,20 +240,22 @@ def test_corners_at_others_places_in_one_view_are_outliers(monkeypatch):
     """A detection that failed once says nothing of the board."""
     alone(monkeypatch, "pinhole")
     true = TRUE["pinhole"]
-    found = detections(true, poses_for(true, 10, 1), 2)
-    found = calibrate_camera([*misnumbered(found[:1]), *found[1:]], BOARD, "pinhole")
-    assert np.all(found.weight[1:] > 0)
+    calibration = detections(true, poses_for(true, 10, 1), 2)
+    calibration = calibrate_camera(
+        [*misnumbered(calibration[:1]), *calibration[1:]], BOARD, "pinhole"
+    )
+    assert np.all(calibration.weight[1:] > 0)
 
 
 def test_too_many_corners_off_are_refused(monkeypatch):
     """Fourteen of forty-eight some 5 px off: what is left of a board would be its own witness."""
     alone(monkeypatch, "pinhole")
     true = TRUE["pinhole"]
-    found, rng = detections(true, poses_for(true, 10, 1), 2), np.random.default_rng(3)
-    for one in found:
+    values, rng = detections(true, poses_for(true, 10, 1), 2), np.random.default_rng(3)
+    for one in values:
         one.pixels[rng.permutation(48)[:14]] += rng.normal(0, 5, (14, 2))
     with pytest.raises(ResultError, match="too many of the board's corners") as caught:
-        calibrate_camera(found, BOARD, "pinhole")
+        calibrate_camera(values, BOARD, "pinhole")
     assert float(caught.value.found.partition("%")[0]) == pytest.approx(100 * 14 / 48, abs=2)
 
 
@@ -263,23 +267,23 @@ def test_no_model_wins_by_giving_up_more():
     best = best_of(pool)
     by_view = best.by_view
     assert best.robust == pytest.approx(best.left_out, rel=0.02)  # none is given up
-    aside = replace(best, left_out=best.left_out / 2, robust=2 * best.robust, by_view=4 * by_view)
-    assert best_of((aside, best)) is best
-    assert is_worse(aside, best)
+    offset = replace(best, left_out=best.left_out / 2, robust=2 * best.robust, by_view=4 * by_view)
+    assert best_of((offset, best)) is best
+    assert is_worse(offset, best)
 
 
 @ONE_MODEL
 def test_single_bad_corners_do_no_harm(true, monkeypatch):
     alone(monkeypatch, true.model)
-    found = calibrate_camera(
+    calibration = calibrate_camera(
         detections(true, poses_for(true, 10, 1), 2, wrong=2), BOARD, true.model
     )
-    free = found.sigma > 0
-    assert np.all(found.weight[:, :2] < 0.1)
-    assert np.mean(found.weight[:, 2:] > 0.99) > 0.97
-    off = (found.camera.parameters - true.parameters)[free] / found.sigma[free]
+    free = calibration.sigma > 0
+    assert np.all(calibration.weight[:, :2] < 0.1)
+    assert np.mean(calibration.weight[:, 2:] > 0.99) > 0.97
+    off = (calibration.camera.parameters - true.parameters)[free] / calibration.sigma[free]
     assert np.abs(off[:5]).max() < 4
-    assert any("20 of 480 corners" in text for text in found.warnings)
+    assert any("20 of 480 corners" in text for text in calibration.warnings)
 
 
 def test_views_that_disagree_widen_sigma(monkeypatch):
@@ -288,13 +292,13 @@ def test_views_that_disagree_widen_sigma(monkeypatch):
     true = TRUE["pinhole"]
     poses, rng = poses_for(true, 10, 1), np.random.default_rng(0)
     x, y = ((BOARD.points - BOARD.points.mean(axis=0)) / 0.1)[:, :2].T
-    found = []
+    results = []
     for k, T in enumerate(poses):
         bent = BOARD.points.copy()
         bent[:, 2] += 1e-3 * (rng.normal() * x * x + rng.normal() * y * y + rng.normal() * x * y)
         pixels = true.project(apply(T, bent)) + rng.normal(0, 0.05, (48, 2))
-        found.append(Detection(f"p{k}.png", SIZE, np.arange(48), pixels, np.full(48, 0.05)))
-    result = calibrate_camera(found, BOARD, "pinhole")
+        results.append(Detection(f"p{k}.png", SIZE, np.arange(48), pixels, np.full(48, 0.05)))
+    result = calibrate_camera(results, BOARD, "pinhole")
     assert result.spread > 1.5
     assert any("views disagree" in text for text in result.warnings)
     assert np.all(np.abs(result.camera.parameters - true.parameters)[:2] < 4 * result.sigma[:2])
@@ -309,17 +313,17 @@ def test_linear_poses_are_exact(true):
 
 def test_board_poses_and_their_sigma(true):
     poses = poses_for(true, 40, 9)
-    found = board_poses(true, views_of(detections(true, poses, 1), BOARD))
-    off = pose_difference(found.T_camera_board, poses)
-    scaled = np.linalg.solve(np.linalg.cholesky(found.covariance), off[..., None])
+    value = board_poses(true, views_of(detections(true, poses, 1), BOARD))
+    off = pose_difference(value.T_camera_board, poses)
+    scaled = np.linalg.solve(np.linalg.cholesky(value.covariance), off[..., None])
     assert np.sqrt(np.mean(scaled**2)) == pytest.approx(1, abs=0.2)
     # by intrinsics: a camera with another focal length moves the poses as foretold
     step = np.zeros(len(true.parameters))
     step[0] = step[1] = 0.05
     other = replace(true, parameters=true.parameters + step)
-    moved = board_poses(other, views_of(detections(true, poses, 1), BOARD)).T_camera_board
-    foretold = found.by_intrinsics @ step
-    error = np.linalg.norm(pose_difference(moved, found.T_camera_board) - foretold, axis=1)
+    shifted = board_poses(other, views_of(detections(true, poses, 1), BOARD)).T_camera_board
+    foretold = value.by_intrinsics @ step
+    error = np.linalg.norm(pose_difference(shifted, value.T_camera_board) - foretold, axis=1)
     assert np.median(error) < 0.1 * np.median(np.linalg.norm(foretold, axis=1))
 
 
@@ -388,31 +392,31 @@ def test_corners_of_no_board(wide_views, monkeypatch):
 @pytest.mark.usefixtures("fitted_once")
 def test_a_photograph_without_a_board_is_not_dropped_silently(wide_views):
     nothing = replace(wide_views[0], name="dark.png", ids=np.zeros(0, dtype=int), reason="too dark")
-    found = calibrate_camera([*wide_views, nothing], BOARD, "unified")
-    assert found.views == tuple(d.name for d in wide_views)
-    assert "1 of 11 photographs are not used: dark.png (too dark)." in found.warnings
-    assert found.document()["not_used"] == {"dark.png": "too dark"}
+    calibration = calibrate_camera([*wide_views, nothing], BOARD, "unified")
+    assert calibration.views == tuple(d.name for d in wide_views)
+    assert "1 of 11 photographs are not used: dark.png (too dark)." in calibration.warnings
+    assert calibration.document()["not_used"] == {"dark.png": "too dark"}
 
 
 def test_the_strong_correlation_of_xi_is_named(monkeypatch):
     alone(monkeypatch, "unified")
     true = camera_of("unified", 1500, 1502, 515, 378, 0.9)
     near = replace(TRUE["pinhole"], parameters=TRUE["pinhole"].parameters * 1.0)
-    found = calibrate_camera(detections(true, poses_for(near, 10, 1), 2), BOARD, "unified")
-    pairs = [pair for pair in found.correlations if "xi" in pair[:2]]
+    calibration = calibrate_camera(detections(true, poses_for(near, 10, 1), 2), BOARD, "unified")
+    pairs = [pair for pair in calibration.correlations if "xi" in pair[:2]]
     assert pairs
     assert pairs[0][2] > 0.95
-    assert any(text.startswith("xi is hardly told apart from") for text in found.warnings)
+    assert any(text.startswith("xi is hardly told apart from") for text in calibration.warnings)
 
 
 # The page
 
 
 def test_the_page(wide_calibration, tmp_path):
-    found = wide_calibration
+    value = wide_calibration
     path = tmp_path / "p0.png"
     cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
-    html = page_html(outcome_of(found, [path]))
+    html = page_html(outcome_of(value, [path]))
     assert html.count('class="shot"') == 10
     assert html.count('href="data:image/jpeg;base64,') == 1
     assert html.count('class="seen"') == 480
@@ -432,8 +436,8 @@ def test_tries_that_do_not_see_a_whole_view_are_no_start(monkeypatch):
     monkeypatch.setitem(DEPTH, "pinhole", 1.2)
     poses = poses_for(TRUE["pinhole"], 25, seed=5)
     views = views_of(detections(TRUE["pinhole"], poses), BOARD)
-    known = [np.isfinite(c.ray(views.pixels)).all(axis=-1) for c in _tries("unified", SIZE)]
-    assert any((rays.sum(axis=-1) < 4).any() for rays in known)
+    finite = [np.isfinite(c.ray(views.pixels)).all(axis=-1) for c in _tries("unified", SIZE)]
+    assert any((rays.sum(axis=-1) < 4).any() for rays in finite)
     fit = first_fit("unified", views, SIZE)
     assert fit is not None
     assert np.linalg.norm(fit.T_camera_board[:, :3, 3] - poses[:, :3, 3], axis=-1).max() < 0.1

@@ -106,10 +106,10 @@ def opencv_pinhole_undistort(fields, pixels):
     matrix, distortion = opencv_matrix(fields)
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-13)
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4; in 5 the short name takes criteria
-        found = cv2.undistortPointsIter(pixels, matrix, distortion, None, None, until)
+        value = cv2.undistortPointsIter(pixels, matrix, distortion, None, None, until)
     else:
-        found = cv2.undistortPoints(pixels, matrix, distortion, criteria=until)
-    return found.reshape(-1, 2)
+        value = cv2.undistortPoints(pixels, matrix, distortion, criteria=until)
+    return value.reshape(-1, 2)
 
 
 def opencv_matrix(fields):
@@ -149,8 +149,8 @@ def seen_points(camera, seed, count=400):
     """Points of the camera frame whose image lies in the picture, at all depths."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(40 * count, 3)) * np.exp(rng.normal(size=(40 * count, 1)))
-    seen = camera.in_image(camera.project(points))
-    return points[seen][:count]
+    visible = camera.in_image(camera.project(points))
+    return points[visible][:count]
 
 
 def near_border(camera, share):
@@ -231,11 +231,11 @@ def differences(function, x, steps):
     return np.stack(columns, axis=-1)
 
 
-def agrees(found, oracle, tolerance):
+def agrees(value, oracle, tolerance):
     """Equal to a share of the largest entry of each matrix."""
-    assert np.isfinite(found).all()
+    assert np.isfinite(value).all()
     scale = np.abs(oracle).max(axis=(-1, -2), keepdims=True)
-    assert np.max(np.abs(found - oracle) / scale) < tolerance
+    assert np.max(np.abs(value - oracle) / scale) < tolerance
 
 
 class Place(NamedTuple):
@@ -285,8 +285,8 @@ def test_derivatives_of_project(case, place):
     by_point, by_parameters = camera.project_jacobians(points)
     steps = place.step * 1e-3 * np.linalg.norm(points, axis=-1, keepdims=True) * np.ones(3)
     agrees(by_point, differences(camera.project, points, steps), place.tolerance)
-    found = by_parameters_of("project", camera, points, place)
-    agrees(by_parameters, found, place.tolerance)
+    value = by_parameters_of("project", camera, points, place)
+    agrees(by_parameters, value, place.tolerance)
 
 
 def test_the_projection_with_its_motion_along_directions(case, place):
@@ -294,15 +294,15 @@ def test_the_projection_with_its_motion_along_directions(case, place):
     _, camera = case
     points = np.concatenate([rays_at(camera, place), [[0.0, 0.0, 0.0]]])
     directions = np.random.default_rng(0).normal(size=(2, *points.shape))
-    pixels, *moved = camera.project_along(points, *directions)
+    pixels, *shifted = camera.project_along(points, *directions)
     np.testing.assert_array_equal(pixels, camera.project(points))
     by_point = camera.project_jacobians(points)[0]
-    for found, direction in zip(moved, directions, strict=True):
-        told = (by_point @ direction[..., None])[..., 0]
+    for item, direction in zip(shifted, directions, strict=True):
+        values = (by_point @ direction[..., None])[..., 0]
         # what is rounded are the terms of sums that may cancel
         size = np.linalg.norm(by_point, axis=(1, 2)) * np.linalg.norm(direction, axis=1)
-        assert (np.abs(found - told).max(axis=1)[:-1] < 1e-12 * size[:-1]).all()
-        assert np.isnan(found[-1]).all()
+        assert (np.abs(item - values).max(axis=1)[:-1] < 1e-12 * size[:-1]).all()
+        assert np.isnan(item[-1]).all()
 
 
 def test_a_search_may_ask_in_single_precision(case, place):
@@ -310,9 +310,9 @@ def test_a_search_may_ask_in_single_precision(case, place):
     points = rays_at(camera, place)
     u = np.random.default_rng(1).normal(size=points.shape)
     single = camera.project_along(points.astype(np.float32), u.astype(np.float32))
-    for found, told in zip(single, camera.project_along(points, u), strict=True):
-        scale = np.nanmax(np.abs(told))
-        np.testing.assert_allclose(found, told, rtol=1e-3, atol=1e-4 * scale)
+    for item, entries in zip(single, camera.project_along(points, u), strict=True):
+        scale = np.nanmax(np.abs(entries))
+        np.testing.assert_allclose(item, entries, rtol=1e-3, atol=1e-4 * scale)
 
 
 def test_derivatives_of_ray(case, place):
@@ -321,8 +321,8 @@ def test_derivatives_of_ray(case, place):
     by_pixel, by_parameters = camera.ray_jacobians(pixels)
     steps = np.full(pixels.shape, 0.3 * place.step)
     agrees(by_pixel, differences(camera.ray, pixels, steps), place.tolerance)
-    found = by_parameters_of("ray", camera, pixels, place)
-    agrees(by_parameters, found, place.tolerance)
+    value = by_parameters_of("ray", camera, pixels, place)
+    agrees(by_parameters, value, place.tolerance)
 
 
 def test_derivatives_of_ray_undo_those_of_project(case, place):
@@ -380,10 +380,10 @@ def test_opencv_agrees(model, name):
     np.testing.assert_allclose(project(example.fields, points), pixels, atol=1e-9, rtol=0)
     # cv2's fixed-point iteration only converges in the middle of a strong lens
     middle = near_border(camera, 0.4)
-    found = undistort(example.fields, camera.project(middle))
-    np.testing.assert_allclose(found, middle[:, :2] / middle[:, 2:], atol=1e-10)
+    values = undistort(example.fields, camera.project(middle))
+    np.testing.assert_allclose(values, middle[:, :2] / middle[:, 2:], atol=1e-10)
     ray = camera.ray(camera.project(middle))
-    np.testing.assert_allclose(found, ray[:, :2] / ray[:, 2:], atol=1e-10)
+    np.testing.assert_allclose(values, ray[:, :2] / ray[:, 2:], atol=1e-10)
 
 
 def test_the_field_ends_where_the_model_does(case):
@@ -554,7 +554,7 @@ def test_a_changed_aspect_leaves_the_mean_focal_length(case):
     assert ratio - 1 == pytest.approx(share, rel=1e-3)
     assert other[0] * other[1] == pytest.approx(np.prod(camera.parameters[:2]), rel=share**2)
     np.testing.assert_array_equal(other[2:], camera.parameters[2:])
-    parts = camera.departures()
+    parts = camera.violations()
     assert len({part.code for part in parts}) == len(parts)
     every = np.concatenate([part.columns for part in parts], axis=1)
     assert np.linalg.matrix_rank(every[:4] / camera.image_size[0]) == 4

@@ -62,8 +62,8 @@ def test_a_crank_is_the_papers():
     )
     out = np.stack([np.cos(alpha), np.sin(alpha), zero], axis=-1)
     expected = (0.14 + 0.26 * np.cos(q + angle)) * out - [0, 0, 0.26 * np.sin(q + angle)]
-    found = Crank.place(parameters, np.full(3, q))[0]
-    np.testing.assert_allclose(found, expected, atol=1e-16)
+    values = Crank.place(parameters, np.full(3, q))[0]
+    np.testing.assert_allclose(values, expected, atol=1e-16)
 
 
 def test_a_crank_is_model_31s():
@@ -94,10 +94,10 @@ def test_readings_of_a_crank(zero):
     rng = np.random.default_rng(3)
     q, b = rng.uniform(-3, 3, 200), rng.normal(size=(200, 3))
     length = np.linalg.norm(b - Crank.place(parameters, q)[0], axis=1)
-    found = Crank.reading(parameters, b, length, q)
+    value = Crank.reading(parameters, b, length, q)
     # a rod square to its arm's motion hides the reading: a rounding e of lengths, root of e
-    np.testing.assert_allclose(found, q, atol=1e-6)
-    assert np.quantile(np.abs(found - q), 0.9) < 1e-12
+    np.testing.assert_allclose(value, q, atol=1e-6)
+    assert np.quantile(np.abs(value - q), 0.9) < 1e-12
     # both solutions, wherever one looks from
     for near in np.linspace(-3, 3, 7):
         other = Crank.reading(parameters, b, length, np.full(200, near))
@@ -115,8 +115,8 @@ def test_readings_of_a_slider():
     parameters, q, b = rng.normal(size=(100, 6)), rng.normal(size=100), rng.normal(size=(100, 3))
     length = np.linalg.norm(b - Slider.place(parameters, q)[0], axis=1)
     for near in (q, np.full(100, -9.0), np.full(100, 9.0)):
-        found = Slider.reading(parameters, b, length, near)
-        away = np.linalg.norm(b - Slider.place(parameters, found)[0], axis=1)
+        values = Slider.reading(parameters, b, length, near)
+        away = np.linalg.norm(b - Slider.place(parameters, values)[0], axis=1)
         np.testing.assert_allclose(away, length, atol=1e-12)
     np.testing.assert_allclose(Slider.reading(parameters, b, length, q), q, atol=1e-6)
     assert np.isnan(Slider.reading(parameters, b + 9, length * 0, q)).all()
@@ -129,9 +129,9 @@ def test_a_bar_keeps_its_direction():
     """Errata: A_i = (X + s h cos theta, Y + s h sin theta + t d, Z)."""
     x, y, z, theta, h, d = 0.02, -0.03, -0.4, 0.3, 0.06, 0.05
     T = perturb(np.eye(4), np.array([0, 0, theta, x, y, z]))
-    found = Bar.place(np.array([0, -d, 0, -h, 0, 0]), T)[0]
+    results = Bar.place(np.array([0, -d, 0, -h, 0, 0]), T)[0]
     expected = [x - h * np.cos(theta), y - h * np.sin(theta) - d, z]
-    np.testing.assert_allclose(found, expected, atol=1e-16)
+    np.testing.assert_allclose(results, expected, atol=1e-16)
 
 
 def test_a_hinged_bar_turned_back_is_a_bar():
@@ -147,7 +147,7 @@ def test_a_hinged_bars_derivatives_where_it_is_turned():
     rng = np.random.default_rng(5)
     parameters, phi = rng.normal(size=(4, 9)), rng.normal(size=4)
     T = perturb(np.eye(4), rng.normal(size=(4, 6)))
-    found = (
+    value = (
         HingedBar.by_parameters(parameters, T, phi),
         by_pose(HingedBar.place(parameters, T, phi)[1]),
         HingedBar.by_internal(parameters, T, phi)[..., None],
@@ -157,7 +157,7 @@ def test_a_hinged_bars_derivatives_where_it_is_turned():
         differences(lambda d: HingedBar.place(parameters, perturb(T, d), phi)[0], 6),
         differences(lambda d: HingedBar.place(parameters, T, phi + d)[0], 1),
     )
-    for got, oracle in zip(found, oracles, strict=True):
+    for got, oracle in zip(value, oracles, strict=True):
         np.testing.assert_allclose(got, oracle, atol=1e-10)
 
 
@@ -193,7 +193,7 @@ def test_base_points_move_with_the_base_frame(carrier, zero):
     if not zero and carrier is Crank:
         parameters = crank(7, zero=False, n=4)
     e, f = changes(8)
-    after = carrier.place(carrier.moved(parameters, e, f), q)[0]
+    after = carrier.place(carrier.reframed(parameters, e, f), q)[0]
     np.testing.assert_allclose(after, apply(e, carrier.place(parameters, q)[0]), atol=1e-14)
 
 
@@ -202,7 +202,7 @@ def test_platform_points_move_with_both_frames(carrier):
     parameters, phi = example(carrier, 9), np.linspace(-1, 1, 4)
     T = perturb(np.eye(4), np.random.default_rng(10).normal(size=(4, 6)))
     e, f = changes(11)
-    after = carrier.place(carrier.moved(parameters, e, f), e @ T @ inverse(f), phi)[0]
+    after = carrier.place(carrier.reframed(parameters, e, f), e @ T @ inverse(f), phi)[0]
     np.testing.assert_allclose(after, apply(e, carrier.place(parameters, T, phi)[0]), atol=1e-14)
 
 
@@ -214,16 +214,16 @@ def test_frames_first_order_and_what_errors_become(carrier, zero):
     if not zero and carrier is Crank:
         parameters, n = crank(12, zero=False, n=4), 10
 
-    def moved(d):
+    def shifted(d):
         frames = (perturb(np.eye(4), part) for part in (d[:6], d[6:]))
-        return carrier.moved(parameters, *frames)[..., :n]
+        return carrier.reframed(parameters, *frames)[..., :n]
 
-    found = carrier.by_frames(parameters)[..., :n, :]
-    np.testing.assert_allclose(found, differences(moved, 12), atol=1e-9)
+    values = carrier.by_frames(parameters)[..., :n, :]
+    np.testing.assert_allclose(values, differences(shifted, 12), atol=1e-9)
     e, f = changes(13)
     pad = np.zeros(parameters.shape[-1] - n)
     oracle = differences(
-        lambda d: carrier.moved(parameters + np.append(d, pad), e, f)[..., :n], n, 1e-4
+        lambda d: carrier.reframed(parameters + np.append(d, pad), e, f)[..., :n], n, 1e-4
     )
     carried = carrier.carried(parameters, e, f)[..., :n, :n]
     if carrier is Crank and zero:  # what the drawing holds has no errors
@@ -358,12 +358,12 @@ def test_models_of_a_file(tmp_path):
     path.write_text(DELTA + "home: {position: [0, 0, -0.1]}\n" + MODELS)
     own = load_mechanism(path).parameters
     free = load_mechanism(path, model="free").parameters
-    alike = load_mechanism(path, model="alike")
+    same = load_mechanism(path, model="alike")
     assert len(own.fixed) == 6
     assert free.fixed == ()
-    assert alike.parameters.free_matrix().shape[1] == free.free_matrix().shape[1] - 1
+    assert same.parameters.free_matrix().shape[1] == free.free_matrix().shape[1] - 1
     # what was chosen is what a written file holds
-    assert alike.to_document()["tied"] == [["legs[1].length.constant", "legs[2].length.constant"]]
+    assert same.to_document()["tied"] == [["legs[1].length.constant", "legs[2].length.constant"]]
     assert load_mechanism(path, model="other").name == "delta"
     with pytest.raises(InputError) as caught:
         load_mechanism(path, model="alik")

@@ -126,9 +126,9 @@ def assert_as_the_oracle(machine, readings, T):
     by_reading = complex_steps(
         lambda d: oracle(machine, theta, readings + d, rot, t), machine.n_joints
     )
-    found = np.zeros(by_reading.shape)
-    found[layout.driven_rows, np.arange(machine.n_joints)] = c.by_reading[layout.driven_rows]
-    np.testing.assert_allclose(found, by_reading, **close)
+    values = np.zeros(by_reading.shape)
+    values[layout.driven_rows, np.arange(machine.n_joints)] = c.by_reading[layout.driven_rows]
+    np.testing.assert_allclose(values, by_reading, **close)
 
 
 def wide_poses(machine, count, seed, wide=1.0):
@@ -173,10 +173,10 @@ def test_built_machines_move_as_drawn(machine):
         poses, joints = draw_configurations(built, 40, 0.5, np.random.default_rng(seed))
         error = closure(built.layout, built.values, joints, poses).rows.value
         assert np.abs(error).max() < 1e-11
-        found = built.forward(joints)
-        np.testing.assert_allclose(found, poses, atol=1e-10)
-        moved = kinematics.on_manifold(built.layout, built.values, poses)
-        np.testing.assert_allclose(moved.T_base_platform, poses, atol=1e-10)
+        forward_kinematics = built.forward(joints)
+        np.testing.assert_allclose(forward_kinematics, poses, atol=1e-10)
+        shifted = kinematics.on_manifold(built.layout, built.values, poses)
+        np.testing.assert_allclose(shifted.T_base_platform, poses, atol=1e-10)
 
 
 def loads_back(built):
@@ -227,8 +227,8 @@ def free_errors(drawing, estimate, truth):
     """
     table = drawing.parameters
     shift = np.zeros_like(estimate.state.edge_shift)
-    told = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
-    true = in_gauge(drawing, told, default_gauge(drawing)).theta
+    values = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
+    true = in_gauge(drawing, values, default_gauge(drawing)).theta
     error = table.to_free(estimate.machine.values) - table.to_free(true)
     to_free = np.linalg.pinv(table.free_matrix())
     covariance = to_free @ estimate.covariance @ to_free.T
@@ -238,19 +238,21 @@ def free_errors(drawing, estimate, truth):
 def whitened(drawing, estimate, truth):
     """Errors over their deviations, made independent."""
     error, scale, covariance = free_errors(drawing, estimate, truth)
-    known = scale > 1e-9
-    c = covariance[np.ix_(known, known)] / np.outer(scale[known], scale[known])
+    above_limit = scale > 1e-9
+    c = covariance[np.ix_(above_limit, above_limit)] / np.outer(
+        scale[above_limit], scale[above_limit]
+    )
     values, vectors = np.linalg.eigh(c)
     keep = values > 1e-6  # frames are held in combinations of several centres
-    return (vectors.T @ (error[known] / scale[known]))[keep] / np.sqrt(values[keep])
+    return (vectors.T @ (error[above_limit] / scale[above_limit]))[keep] / np.sqrt(values[keep])
 
 
 def in_sigmas(drawing, estimate, truth):
     """Each kinematic value's error over its deviation."""
     error, scale, _ = free_errors(drawing, estimate, truth)
     table = drawing.parameters
-    known = (scale > 1e-9) & (np.array(table.kinds)[table.first_of_free()] != "radius")
-    return error[known] / scale[known]
+    above_limit = (scale > 1e-9) & (np.array(table.kinds)[table.first_of_free()] != "radius")
+    return error[above_limit] / scale[above_limit]
 
 
 def test_a_simulated_session_calibrates(machine):
@@ -260,8 +262,8 @@ def test_a_simulated_session_calibrates(machine):
         truth, measurements = simulated(machine, seed)
         rough = np.stack([pose.T_camera_base() for pose in truth.rough])
         start = start_state(machine, measurements, rough)
-        found = bundle(machine, measurements, start)
-        z.append(whitened(machine, found, truth))
+        fit = bundle(machine, measurements, start)
+        z.append(whitened(machine, fit, truth))
     z = np.concatenate(z)
     assert np.mean(z**2) == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))
 
@@ -280,10 +282,10 @@ def test_photographs_calibrate(name, tmp_path):
     """
     drawing = load_mechanism(name)
     simulate_session(tmp_path / "s", drawing, CAMERA, Settings(stations=RENDERED[name]), seed=1)
-    found = pkmcal.calibrate(tmp_path / "s")
-    assert found.verdict.usable
+    value = pkmcal.calibrate(tmp_path / "s")
+    assert value.verdict.usable
     truth = load_truth(tmp_path / "s", drawing)
-    errors = compare_with_truth(found, tmp_path / "s")
+    errors = compare_with_truth(value, tmp_path / "s")
     assert errors.calibrated.position < errors.drawing.position / 5
     assert errors.calibrated.orientation < errors.drawing.orientation / 5
-    assert np.sqrt(np.mean(in_sigmas(drawing, found.estimate, truth) ** 2)) < 1.6
+    assert np.sqrt(np.mean(in_sigmas(drawing, value.estimate, truth) ** 2)) < 1.6

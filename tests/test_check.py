@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.numbering import equal_numberings, numbering_told
+from pkmcal.calibration.leg_numbering import equal_numberings, numbering_note
 from pkmcal.check import check
 from pkmcal.check.check import _kinematics, check_session
-from pkmcal.check.checked import JointCheck, StationCheck
-from pkmcal.check.words import joint_findings, station_findings
+from pkmcal.check.results import JointCheck, StationCheck
+from pkmcal.check.sentences import joint_findings, station_findings
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.outcome import Level
@@ -30,21 +30,21 @@ def changed(session, change, station="*"):
         assert cv2.imwrite(str(path), np.clip(change(picture), 0, 255).astype(np.uint8))
 
 
-def texts(found, level):
-    return [finding.text for finding in found.findings if finding.level is level]
+def texts(value, level):
+    return [finding.text for finding in value.findings if finding.level is level]
 
 
 # whole sessions
 
 
 def test_a_good_session(checked):
-    found = checked.found
-    assert found.exit_code == 0
-    assert texts(found, Level.WRONG) == texts(found, Level.DOUBTFUL) == []
-    assert (found.n_legs, found.configurations) == (6, 12)
-    assert found.singularity > 0.5
-    assert found.assemblies >= 2
-    for station in found.stations:
+    count = checked.found
+    assert count.exit_code == 0
+    assert texts(count, Level.WRONG) == texts(count, Level.DOUBTFUL) == []
+    assert (count.n_legs, count.configurations) == (6, 12)
+    assert count.singularity > 0.5
+    assert count.assemblies >= 2
+    for station in count.stations:
         assert station.recognised
         assert station.mismatch < 0.3
         # the simulation's poses by hand are 5 cm and 5 degrees off
@@ -54,13 +54,13 @@ def test_a_good_session(checked):
         assert 0.5 < station.blur < 1.2
         assert station.saturated < 0.1
         assert station.black < 0.1
-    assert all(0.6 < joint.used < 1 for joint in found.joints)
+    assert all(0.6 < joint.used < 1 for joint in count.joints)
 
 
 def test_progress_is_told_in_order(checked):
-    said, shares = zip(*checked.told, strict=True)
+    text, shares = zip(*checked.told, strict=True)
     assert list(shares) == sorted(shares)
-    assert said[-1] == "What such photographs will give"
+    assert text[-1] == "What such photographs will give"
 
 
 def test_a_workspace_blurred_and_overexposed_photographs(session):
@@ -69,31 +69,31 @@ def test_a_workspace_blurred_and_overexposed_photographs(session):
         file.write("workspace: {z: [1.0, 2.0]}\n")
     changed(session, lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.8), "station1")
     changed(session, lambda picture: picture * 2.5, "station2")
-    found = check_session(session)
-    assert found.exit_code == 1
-    doubts = texts(found, Level.DOUBTFUL)
-    (text,) = [text for text in doubts if text.startswith("session.yaml")]
+    check = check_session(session)
+    assert check.exit_code == 1
+    faults = texts(check, Level.DOUBTFUL)
+    (text,) = [text for text in faults if text.startswith("session.yaml")]
     assert text.startswith("session.yaml, workspace: the machine does not come to the workspace")
     assert "found z from 1 to 2 m" in text
-    (text,) = [text for text in doubts if text.startswith("station1: The edges")]
+    (text,) = [text for text in faults if text.startswith("station1: The edges")]
     assert text.startswith("station1: The edges are blurred over 1.")
-    assert found.stations[0].blur > 1.7
-    assert found.stations[2].blur < 1.2
+    assert check.stations[0].blur > 1.7
+    assert check.stations[2].blur < 1.2
     assert any(
         text.startswith("station2: ") and "are overexposed: edges vanish in white" in text
-        for text in doubts
+        for text in faults
     )
-    assert not [text for text in doubts if text.startswith("station3")]
+    assert not [text for text in faults if text.startswith("station3")]
 
 
 def test_black_photographs_of_nothing(session):
     only(session, "station1", "station3")
     changed(session, lambda picture: picture * 0, "station3")
-    found = check_session(session)
-    assert found.exit_code == 2
-    assert "station3: 100% of the pictures are black" in texts(found, Level.DOUBTFUL)[0]
-    assert "not recognised in the photographs of station3" in texts(found, Level.WRONG)[0]
-    assert [station.recognised for station in found.stations] == [True, False]
+    check = check_session(session)
+    assert check.exit_code == 2
+    assert "station3: 100% of the pictures are black" in texts(check, Level.DOUBTFUL)[0]
+    assert "not recognised in the photographs of station3" in texts(check, Level.WRONG)[0]
+    assert [station.recognised for station in check.stations] == [True, False]
 
 
 def test_all_broken_photographs_are_named(session):
@@ -101,18 +101,18 @@ def test_all_broken_photographs_are_named(session):
     names = [f"images/station1/{path.name}: the photograph cannot be decoded" for path in broken]
     for path in broken:
         path.write_bytes(path.read_bytes()[:-300])
-    found = check_session(session)
-    assert found.exit_code == 2
-    assert [text.partition(";")[0] for text in texts(found, Level.WRONG)] == names
-    assert found.stations[0].recognised  # by its other photographs
+    check = check_session(session)
+    assert check.exit_code == 2
+    assert [text.partition(";")[0] for text in texts(check, Level.WRONG)] == names
+    assert check.stations[0].recognised  # by its other photographs
 
 
 def test_a_station_whose_photographs_are_all_broken(session):
     for path in (session / "images" / "station1").iterdir():
         path.write_bytes(path.read_bytes()[:-300])
-    found = check_session(session)
-    assert len(texts(found, Level.WRONG)) == 4
-    assert not any(station.recognised for station in found.stations)
+    check = check_session(session)
+    assert len(texts(check, Level.WRONG)) == 4
+    assert not any(station.recognised for station in check.stations)
 
 
 def test_of_many_broken_photographs_some_are_named(session, monkeypatch):
@@ -128,20 +128,20 @@ def test_a_station_without_a_pose_is_found_anywhere(session):
     text = (session / "session.yaml").read_text()
     start, end = text.index("    pose:"), text.index("  station2:")
     (session / "session.yaml").write_text(text[:start] + text[end:])
-    found = check_session(session)
-    assert found.exit_code == 0
-    assert found.stations[0].recognised
-    assert np.isnan(found.stations[0].moved)
-    assert found.stations[0].by_chance < 1e-3
+    check = check_session(session)
+    assert check.exit_code == 0
+    assert check.stations[0].recognised
+    assert np.isnan(check.stations[0].moved)
+    assert check.stations[0].by_chance < 1e-3
 
 
 def test_what_cannot_be_observed_is_told(session):
     text = (session / "mechanism.yaml").read_text()
     lines = [line for line in text.splitlines() if "tubes:" not in line and "radius:" not in line]
     (session / "mechanism.yaml").write_text("\n".join(lines) + "\n")
-    found = check_session(session)
-    assert found.exit_code == 2
-    assert "no leg of the drawing has visible cylinders" in texts(found, Level.WRONG)[0]
+    check = check_session(session)
+    assert check.exit_code == 2
+    assert "no leg of the drawing has visible cylinders" in texts(check, Level.WRONG)[0]
 
 
 @pytest.mark.parametrize(
@@ -154,9 +154,9 @@ def test_what_cannot_be_observed_is_told(session):
 def test_readings_that_the_drawing_cannot_take(session, x, where, said):
     path = session / "mechanism.yaml"
     path.write_text(path.read_text().replace("[0.2693, 0.02,", f"[{x}, 0.02,"))
-    found = check_session(session)
-    assert found.exit_code == 2
-    text = texts(found, Level.WRONG)[0]
+    check = check_session(session)
+    assert check.exit_code == 2
+    text = texts(check, Level.WRONG)[0]
     assert text.startswith(where)
     assert said in text
     assert run("calibrate", session).err == f"Error: {text}\n"
@@ -178,8 +178,8 @@ def test_readings_that_the_drawing_cannot_take(session, x, where, said):
     ],
 )
 def test_a_stations_findings(station, said):
-    found = station_findings(station, 6)
-    assert (said is None and not found) or (len(found) == 1 and said in found[0].text)
+    count = station_findings(station, 6)
+    assert (said is None and not count) or (len(count) == 1 and said in count[0].text)
 
 
 def test_crowded_and_few_configurations(demo):
@@ -188,10 +188,10 @@ def test_crowded_and_few_configurations(demo):
         JointCheck("leg1", 0.4, 0.41, 0.07, (0, 0)),
         JointCheck("leg2", 0.35, 0.48, 0.9, (3, 3)),
     )
-    found = joint_findings(replace(session, configurations=("a", "b")), joints)
-    assert [finding.level for finding in found] == [Level.NOTE] * 2
-    assert found[0].text.startswith("leg1 used little of the range (down to 7%)")
-    assert found[1].text.startswith("There are only 2 configurations")
+    results = joint_findings(replace(session, configurations=("a", "b")), joints)
+    assert [finding.level for finding in results] == [Level.NOTE] * 2
+    assert results[0].text.startswith("leg1 used little of the range (down to 7%)")
+    assert results[1].text.startswith("There are only 2 configurations")
 
 
 def test_a_pose_under_several_names_is_told(demo):
@@ -203,11 +203,11 @@ def test_a_pose_under_several_names_is_told(demo):
     joints[1:3] = joints[0] + noise
     photos = [p for p in session.stations[0].photographs if p.configuration > 2]
 
-    def told(*seen):
+    def report(*in_view):
         """What is said where stations see these of the first three configurations."""
         stations = tuple(
             replace(s, photographs=(*(replace(photos[0], configuration=k) for k in rows), *photos))
-            for s, rows in zip(session.stations, seen, strict=True)
+            for s, rows in zip(session.stations, in_view, strict=True)
         )
         (finding,) = joint_findings(replace(session, joints=joints, stations=stations), ())
         assert finding.level is Level.NOTE
@@ -217,12 +217,12 @@ def test_a_pose_under_several_names_is_told(demo):
         )
         return finding.text.partition("one pose: ")[2]
 
-    assert told((0, 1, 2), (), ()) == (
+    assert report((0, 1, 2), (), ()) == (
         "at station1 name its photographs images/station1/0000_1.png and"
         " images/station1/0000_2.png, with images: images/station1/{configuration}_{repeat}.png,"
         " and keep one of its rows in joints.csv."
     )
-    assert told((0,), (1,), (2,)) == (
+    assert report((0,), (1,), (2,)) == (
         "its photographs bear one name at all stations, such as 0000, and it has one row in"
         " joints.csv."
     )
@@ -230,19 +230,19 @@ def test_a_pose_under_several_names_is_told(demo):
 
 def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
     session = load_session(demo.session)
-    assert [*numbering_told(session)] == []
+    assert [*numbering_note(session)] == []
     stations = tuple(replace(s, T_camera_base=None) for s in session.stations)
-    (found,) = numbering_told(replace(session, stations=stations))
-    assert (found.code, found.subject) == ("readings.first_leg_unknown", "joints.csv")
-    assert found.facts["columns"] == ["leg3", "leg5"]
-    assert found.text.startswith(
+    (value,) = numbering_note(replace(session, stations=stations))
+    assert (value.code, value.subject) == ("readings.first_leg_unknown", "joints.csv")
+    assert value.facts["columns"] == ["leg3", "leg5"]
+    assert value.text.startswith(
         "The drawing is alike from three sides: with the legs counted from the column leg3 or leg5"
         " of joints.csv on, photographs"
     )
     placed = replace(session, stations=(session.stations[0], *stations[1:]))
-    assert [*numbering_told(placed)] == []
+    assert [*numbering_note(placed)] == []
     board = tuple(replace(s, observe=("board",)) for s in stations)
-    assert [*numbering_told(replace(session, stations=board))] == []
+    assert [*numbering_note(replace(session, stations=board))] == []
 
 
 @pytest.mark.parametrize(

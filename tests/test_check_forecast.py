@@ -25,7 +25,7 @@ from pkmcal.check.pictures import (
     with_pictures,
     write_pictures,
 )
-from pkmcal.check.words import outcome_of
+from pkmcal.check.sentences import outcome_of
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
@@ -51,9 +51,9 @@ def alone(demo, tmp_path_factory):
     (folder / "session.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     rows = (folder / "joints.csv").read_text().splitlines()
     (folder / "joints.csv").write_text("\n".join(rows[:4]) + "\n")
-    kept = {row.split(",")[0] for row in rows[1:4]}
+    retained = {row.split(",")[0] for row in rows[1:4]}
     for path in (folder / "images").glob("*/*.png"):
-        if path.stem not in kept:
+        if path.stem not in retained:
             path.unlink()
     return folder
 
@@ -64,13 +64,13 @@ def alone(demo, tmp_path_factory):
 def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
     """From two photographs of each of three stations, for the four of each that there are."""
     each = len(calibrated.session.stations[0].photographs)
-    told = forecast(found.look, each)
+    values = forecast(found.look, each)
     _, tool = centres_and_tool(
         calibrated.session.machine, calibrated.estimate, calibrated.session.joints
     )
     # four configurations a station are few: which they are makes a third of it
-    assert told.position == pytest.approx(tool.position.mean(), rel=0.5)
-    assert told.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
+    assert values.position == pytest.approx(tool.position.mean(), rel=0.5)
+    assert values.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
 
 
 def test_more_photographs_tell_more(found):
@@ -80,45 +80,45 @@ def test_more_photographs_tell_more(found):
 
 
 def test_shares_are_parts_of_a_whole(found):
-    told = found.forecast
-    assert sum(leg.tells for leg in told.legs) == pytest.approx(1)
-    legs = sum(leg.variance for leg in told.legs)
-    assert legs + told.readings + told.drawing == pytest.approx(1)
+    values = found.forecast
+    assert sum(leg.tells for leg in values.legs) == pytest.approx(1)
+    legs = sum(leg.variance for leg in values.legs)
+    assert legs + values.readings + values.drawing == pytest.approx(1)
     assert legs > 0.5
-    assert [(leg.station, leg.leg) for leg in told.legs[:2]] == [("station1", 1), ("station1", 2)]
-    assert len(told.legs) == 18
-    for leg in told.legs:
+    assert [(leg.station, leg.leg) for leg in values.legs[:2]] == [("station1", 1), ("station1", 2)]
+    assert len(values.legs) == 18
+    for leg in values.legs:
         assert 0 <= leg.tells < 1
         assert 0 <= leg.seen <= 1
-    assert np.isnan(told.second)
+    assert np.isnan(values.second)
     assert "edges" not in found.as_dict()["forecast"]
     assert "look" not in found.as_dict()
 
 
 def test_three_photographs_of_one_station(alone):
-    found = check_session(alone)
-    assert not [f for f in found.findings if f.level is Level.WRONG]
-    told = found.forecast
-    assert [leg.leg for leg in told.legs] == [1, 2, 3, 4, 5, 6]
+    check = check_session(alone)
+    assert not [f for f in check.findings if f.level is Level.WRONG]
+    rows = check.forecast
+    assert [leg.leg for leg in rows.legs] == [1, 2, 3, 4, 5, 6]
     # from one place the line of sight is told badly
-    assert told.second < told.position
-    said = outcome_of(found).parts[-1].said
-    assert "by the edges of 3 photographs" in said[0]
+    assert rows.second < rows.position
+    text = outcome_of(check).parts[-1].terminal_text
+    assert "by the edges of 3 photographs" in text[0]
 
 
 def test_no_forecast_where_a_station_is_not_recognised(found):
-    look = found.look
-    lost = replace(look, stations=(*look.stations[:2], replace(look.stations[2], quality=None)))
+    edges = found.look
+    lost = replace(edges, stations=(*edges.stations[:2], replace(edges.stations[2], quality=None)))
     assert forecast(lost) is None
 
 
 def test_no_forecast_of_photographs_without_edges(found):
-    look = found.look
+    edges = found.look
     grey = [replace(s.photographs, images=[np.full_like(i, 90) for i in s.photographs.images])
-            for s in look.stations]  # fmt: skip
-    stations = [replace(s, photographs=p) for s, p in zip(look.stations, grey, strict=True)]
+            for s in edges.stations]  # fmt: skip
+    stations = [replace(s, photographs=p) for s, p in zip(edges.stations, grey, strict=True)]
     with pytest.raises(ResultError):
-        forecast(replace(look, stations=tuple(stations)))
+        forecast(replace(edges, stations=tuple(stations)))
 
 
 @pytest.mark.parametrize(
@@ -128,9 +128,9 @@ def test_no_forecast_of_photographs_without_edges(found):
 def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
     legs = [LegForecast("front", j, 0.9, 0.95, 0.1, 0.19, 0.1) for j in range(1, 6)]
     legs.append(LegForecast("front", 6, seen, found, 0.2, 0.02, 0.4))
-    told = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
-    part = words.forecast_part(told)
-    assert part.said[1] == f"Leg 6 tells little, 2% of what all edges tell: {why}."
+    values = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
+    part = words.forecast_part(values)
+    assert part.terminal_text[1] == f"Leg 6 tells little, 2% of what all edges tell: {why}."
     marks = [row.mark for row in part.tables[0].rows]
     assert marks == ["good"] * 5 + [Level.NOTE]
 
@@ -139,13 +139,13 @@ def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
 
 
 def test_a_second_place_is_advised_where_it_is_worth_it(found):
-    told = replace(found.forecast, position=2e-4, second=1e-4)
-    (said,) = words._second_place(told)
-    assert said.code == "images.second_place"
-    assert (said.facts["tool_sigma"], said.facts["tool_sigma_before"]) == (1e-4, 2e-4)
-    assert "15 in all then tell the platform's position to 0.10 mm, not 0.20 mm" in said.text
-    assert words._second_place(replace(told, second=1.8e-4)) == []
-    assert words._second_place(replace(told, second=float("nan"))) == []
+    values = replace(found.forecast, position=2e-4, second=1e-4)
+    (text,) = words._second_place(values)
+    assert text.code == "images.second_place"
+    assert (text.facts["tool_sigma"], text.facts["tool_sigma_before"]) == (1e-4, 2e-4)
+    assert "15 in all then tell the platform's position to 0.10 mm, not 0.20 mm" in text.text
+    assert words._second_place(replace(values, second=1.8e-4)) == []
+    assert words._second_place(replace(values, second=float("nan"))) == []
 
 
 def test_stations_on_one_side_are_told(found):
@@ -154,9 +154,9 @@ def test_stations_on_one_side_are_told(found):
     turn = rotation(np.array([0, 0, np.deg2rad(25)]))
     beside = first.found @ inverse(pose(turn, middle - turn @ middle))
     near = replace(found.look, stations=(first, replace(first, name="b", found=beside)))
-    (said,) = words._from_one_side(near)
-    assert said.code == "images.one_side"
-    assert 20 < said.facts["degrees"] < 25.5
+    (text,) = words._from_one_side(near)
+    assert text.code == "images.one_side"
+    assert 20 < text.facts["degrees"] < 25.5
     assert words._from_one_side(found.look) == []
 
 
@@ -167,9 +167,9 @@ def test_slim_tubes_are_told(found):
     half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)
     every = np.broadcast_to(half_width, first.quality.half_width.shape)
     slim = replace(first, quality=replace(first.quality, half_width=every))
-    (said,) = words._slim(replace(found.look, stations=(slim, *others)))
-    assert (said.code, said.station) == ("images.slim", first.name)
-    assert said.facts["tubes"] == ["tube 2 4.5 px"]
+    (text,) = words._slim(replace(found.look, stations=(slim, *others)))
+    assert (text.code, text.station) == ("images.slim", first.name)
+    assert text.facts["tubes"] == ["tube 2 4.5 px"]
 
 
 def test_hidden_legs_are_told_where_no_station_sees_them(found):
@@ -182,9 +182,9 @@ def test_hidden_legs_are_told_where_no_station_sees_them(found):
     one = replace(found.look, stations=(hiding(stations[0], 3, 0.8), hiding(stations[1], 0, 0.8)))
     assert words._hidden(one) == []
     every = replace(found.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
-    (said,) = words._hidden(every)
-    assert (said.code, said.subject, said.station) == ("images.hidden", "leg 4", "station1")
-    assert said.facts["share"] == pytest.approx(0.8)
+    (text,) = words._hidden(every)
+    assert (text.code, text.subject, text.station) == ("images.hidden", "leg 4", "station1")
+    assert text.facts["share"] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_why_edges_are_lost(found, level, behind, code):
     assert (one.code, one.station) == (code, "station1")
     assert one.facts["share"] == pytest.approx(0.5)
     assert one.facts.get("sheet", "dark") == "dark"
-    assert words._lost(found.look, station, replace(edges, found=np.ones_like(lost))) == []
+    assert words._lost(found.look, station, replace(edges, valid=np.ones_like(lost))) == []
 
 
 # ------------------------------------------------------------------ pictures
@@ -239,11 +239,11 @@ def test_pictures_of_large_photographs_are_binned(found):
     width, height = station.photographs.camera.image_size
     size = width // 2, height // 2
     drawn = []
-    for look, grey in (
+    for edges, grey in (
         (station, photo := station.photographs.images[0]),
         (large, binned(photo, 2)),
     ):
-        pane = picture(found.look, look, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
+        pane = picture(found.look, edges, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
         changed = np.any(np.abs(pane.astype(int) - grey[..., None]) > 40, axis=-1)
         drawn.append(cv2.resize(changed.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0)
     # what is drawn lies where it lay
@@ -267,7 +267,7 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
         return float(np.median(slope[mask > 0]))
 
     for station in found.look.stations:
-        assert strength(station.found, 0) > 1.15 * strength(station.by_hand, 0)
+        assert strength(station.T_camera_base, 0) > 1.15 * strength(station.by_hand, 0)
 
 
 def test_each_number_stands_once_and_apart(found):
@@ -275,7 +275,7 @@ def test_each_number_stands_once_and_apart(found):
 
     station = found.look.stations[0]
     eye = station.photographs.camera
-    _, spots = drawing_over_photograph(found.look, station, eye, station.found, 0)
+    _, spots = drawing_over_photograph(found.look, station, eye, station.T_camera_base, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
@@ -292,19 +292,19 @@ def test_a_page_with_pictures(found):
     assert part.html.count('plain">pose by hand') == part.html.count('plain">pose found') == 9
     assert "predicted edges" in part.html
     lost = found.look.stations[0]
-    look = replace(found.look, stations=(replace(lost, quality=None, by_hand=None),))
-    html = with_pictures(look).html
+    edges = replace(found.look, stations=(replace(lost, quality=None, by_hand=None),))
+    html = with_pictures(edges).html
     assert html.count('<svg class="shot"') == 3
     assert "best pose found, not recognised" in html
 
 
 def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
     """The second and third time of what was found the first time."""
-    kept = []
+    retained = []
 
     def once(*words, **more):
-        kept[:] = kept or [check_session(*words, **more)]
-        return kept[0]
+        retained[:] = retained or [check_session(*words, **more)]
+        return retained[0]
 
     monkeypatch.setattr("pkmcal.check.check.check_session", once)
     done = run("check", alone, "-o", tmp_path / "out", "--pictures", tmp_path / "drawn", "--json")

@@ -21,7 +21,7 @@ import pytest
 import pkmcal
 from conftest import run
 from pkmcal.boards.board import load_board
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
@@ -126,12 +126,12 @@ def test_a_reader_that_leaves_changes_nothing(unbuffered, monkeypatch):
     for merged in (subprocess.PIPE, subprocess.STDOUT):
         with subprocess.Popen(
             [sys.executable, "-c", TELLS], stdout=subprocess.PIPE, stderr=merged, text=True
-        ) as told:
-            assert told.stdout.readline() == "some thing that was found\n"
-            told.stdout.close()
-            if told.stderr:
-                assert told.stderr.read() == ""
-        assert told.returncode == 1  # the command's own
+        ) as values:
+            assert values.stdout.readline() == "some thing that was found\n"
+            values.stdout.close()
+            if values.stderr:
+                assert values.stderr.read() == ""
+        assert values.returncode == 1  # the command's own
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here that is always full")
@@ -244,12 +244,12 @@ def test_new_then_check_says_what_is_missing(tmp_path):
     assert done.code == 0
     assert all(name in done.out for name in session_texts())
     assert "pkmcal check" in done.out
-    found = run("check", tmp_path / "mine")
-    said = " ".join(found.out.split())
-    assert found.code == 2
-    assert "there is no photograph under this pattern; found only README.txt in" in said
+    value = run("check", tmp_path / "mine")
+    text = " ".join(value.out.split())
+    assert value.code == 2
+    assert "there is no photograph under this pattern; found only README.txt in" in text
     for name, what in ((n, w) for n, w in TO_FILL.items() if n in session_texts()):
-        assert f"{name} is still the example of pkmcal new: {what}" in said
+        assert f"{name} is still the example of pkmcal new: {what}" in text
 
 
 def test_new_files_load(tmp_path):
@@ -293,12 +293,12 @@ def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path
         assert "\nstations:" not in text
         session = load_session(folder)
     else:
-        seen = "legs" if drawn.document.legs[0].tubes else "board"
-        assert f"observe: {seen}\n" in text
+        in_view = "legs" if drawn.document.legs[0].tubes else "board"
+        assert f"observe: {in_view}\n" in text
         with pytest.raises(InputError, match="there is no photograph under this pattern"):
             load_session(folder)
         session = load_session(folder, measured=False)
-        assert (session.board is None) == (seen == "legs")
+        assert (session.board is None) == (in_view == "legs")
     assert session.machine.n_joints == drawn.n_joints
     untouched = " ".join(one.text for one in untouched_files(folder))
     assert all(f"{what}" in untouched for what in TO_FILL if (folder / what).exists())
@@ -363,12 +363,12 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
 
 def test_check_as_json(session, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
-    found = run("check", session, "--json").json
-    assert found["exit_code"] == 0
-    names = [station["name"] for station in found["stations"]]
+    count = run("check", session, "--json").json
+    assert count["exit_code"] == 0
+    names = [station["name"] for station in count["stations"]]
     assert names == ["station1", "station2", "station3"]
-    assert all(station["recognised"] for station in found["stations"])
-    assert len(found["joints"]) == 6
+    assert all(station["recognised"] for station in count["stations"])
+    assert len(count["joints"]) == 6
 
 
 def test_check_tells_errors_as_every_command_does(session, tmp_path):
@@ -377,12 +377,12 @@ def test_check_tells_errors_as_every_command_does(session, tmp_path):
     assert run("calibrate", tmp_path / "none", "--json").json.items() <= nowhere.items()
     photograph = min((session / "images" / "station1").iterdir())
     photograph.write_bytes(photograph.read_bytes()[:1000])
-    found = run("check", session, "--json").json
-    assert shape <= set(found)
-    assert found["exit_code"] == 2
-    assert found["what"] == "the photograph cannot be decoded"
-    broken, *others = found["findings"]
-    assert broken.items() >= {key: found[key] for key in shape - {"exit_code"}}.items()
+    actual_names = run("check", session, "--json").json
+    assert shape <= set(actual_names)
+    assert actual_names["exit_code"] == 2
+    assert actual_names["what"] == "the photograph cannot be decoded"
+    broken, *others = actual_names["findings"]
+    assert broken.items() >= {key: actual_names[key] for key in shape - {"exit_code"}}.items()
     assert broken["station"] == "station1"
     assert all(set(finding) == {"level", "text", "station"} for finding in others)
 
@@ -418,13 +418,13 @@ def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, m
     done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")
     assert (done.code, done.out, done.err) == (0, "", "")
     assert load(out).seed == 5
-    (kept,) = tmp_path.glob("result-*")
-    assert load(kept).seed == 0
+    (retained,) = tmp_path.glob("result-*")
+    assert load(retained).seed == 0
     # the same again: nothing is kept, and nothing told
     assert "kept" not in run("calibrate", session, "-o", out, "--seed", 5, "--json").json
     assert len(list(tmp_path.glob("result-*"))) == 1
-    found = run("calibrate", session, "-o", out, "--json").json
-    assert load(found["kept"]).seed == 5
+    value = run("calibrate", session, "-o", out, "--json").json
+    assert load(value["kept"]).seed == 5
     before = set(tmp_path.iterdir())
     assert run("calibrate", session, "-o", out, "--seed", 6, "--force", "--quiet").code == 0
     assert set(tmp_path.iterdir()) == before
@@ -460,11 +460,11 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 
 
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
-    found = calibrated
+    value = calibrated
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
-    verdict = judge(found.observation, found.estimate, found.findings, others=others)
-    found = replace(found, verdict=verdict)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: found)
+    verdict = judge(value.observation, value.estimate, value.findings, others=others)
+    value = replace(value, verdict=verdict)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: value)
     done = run("calibrate", session)
     assert done.code == 1
     assert "This calibration should not be used" in done.out
@@ -562,9 +562,9 @@ def test_usage_errors(words, said):
     assert said in done.err
     assert done.err.startswith("Error: ")
     assert not re.search("Value error|Input should|Possible options", done.err)
-    told = run(*words, "--json").json
-    assert told["exit_code"] == 2
-    assert done.err == f"Error: {told['message']}\n"
+    values = run(*words, "--json").json
+    assert values["exit_code"] == 2
+    assert done.err == f"Error: {values['message']}\n"
 
 
 @pytest.mark.parametrize(

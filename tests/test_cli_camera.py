@@ -29,10 +29,10 @@ def boards(tmp_path_factory):
 def test_a_camera_is_calibrated(boards, tmp_path):
     done = run("camera", boards, "-o", tmp_path / "out", "--to", "opencv", "--json")
     assert done.code == 0, done.err
-    found = load_camera(tmp_path / "out" / "camera.yaml")
-    assert found.model == done.json["camera"]["model"] == "pinhole"
-    sigma = np.sqrt(np.diag(found.covariance))
-    off = (found.parameters - TRUTH.parameters)[:4] / sigma[:4]
+    value = load_camera(tmp_path / "out" / "camera.yaml")
+    assert value.model == done.json["camera"]["model"] == "pinhole"
+    sigma = np.sqrt(np.diag(value.covariance))
+    off = (value.parameters - TRUTH.parameters)[:4] / sigma[:4]
     # four numbers of eight pictures; beyond four deviations the deviations would be wrong
     assert np.all(np.abs(off) < 4)
     assert sigma[0] < 1.0
@@ -60,7 +60,7 @@ def test_a_sessions_board_photographs(boards, tmp_path):
     refused = run("camera", folder, "-o", tmp_path / "out2")
     assert refused.code == 2
     assert "no station of this session observes a board" in refused.err
-    for said, instead, sentence in (
+    for words, instead, sentence in (
         ("board: board.yaml", "board: [1, 2]", "session.yaml, line 4, board"),
         (
             "board: board.yaml",
@@ -70,7 +70,7 @@ def test_a_sessions_board_photographs(boards, tmp_path):
         ("observe: legs", "observe: ledge", "session.yaml, line 6, stations.top.observe"),
     ):
         (folder / "session.yaml").write_text(
-            text.replace(said, instead).replace("observe: legs", "observe: board")
+            text.replace(words, instead).replace("observe: legs", "observe: board")
         )
         refused = run("camera", folder, "-o", tmp_path / "out2")
         assert refused.code == 2

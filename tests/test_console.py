@@ -32,8 +32,8 @@ class Heard:
 
 def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
-    with redirect_stderr(Heard()) as heard, console.progress() as told:
-        told("Finding the legs: 3 of 9 photographs", 0.35)
+    with redirect_stderr(Heard()) as heard, console.progress() as progress:
+        progress("Finding the legs: 3 of 9 photographs", 0.35)
         assert heard.written.wait(60)
     line = r"Finding the legs: 3 of 9 photographs \(35%, \d+ s\)"
     assert all(re.fullmatch(line, x) for x in heard.text.splitlines())
@@ -43,15 +43,15 @@ def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
 def test_nobody_speaks_where_nothing_is_wanted(monkeypatch):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     count = threading.active_count()
-    with redirect_stderr(Heard()) as heard, console.progress(quiet=True) as told:
-        told("Finding the legs", 0.35)
+    with redirect_stderr(Heard()) as heard, console.progress(quiet=True) as progress:
+        progress("Finding the legs", 0.35)
         assert threading.active_count() == count
     assert heard.text == ""
 
 
 def test_a_short_run_says_nothing():
-    with redirect_stderr(Heard()) as heard, console.progress() as told:
-        told("Finding the legs", 0.35)
+    with redirect_stderr(Heard()) as heard, console.progress() as progress:
+        progress("Finding the legs", 0.35)
     assert heard.text == ""
 
 
@@ -72,12 +72,12 @@ def test_a_calibration_tells_what_it_does(demo, calibrating, tmp_path, monkeypat
 
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", again)
-    said = run("calibrate", demo.session, "-o", tmp_path / "told")
-    assert said.code == 0
-    steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in said.err.splitlines())
+    text = run("calibrate", demo.session, "-o", tmp_path / "told")
+    assert text.code == 0
+    steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in text.err.splitlines())
     for step in ("Recognising", "Finding the legs", "Measuring edges", "Identifying"):
         assert any(x.startswith(step) for x in steps)
-    assert not any(step in said.out for step in steps)
+    assert not any(step in text.out for step in steps)
 
 
 def test_what_is_to_be_silent_is(demo, calibrated, tmp_path, monkeypatch):

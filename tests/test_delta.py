@@ -35,14 +35,16 @@ def test_delta_by_three_spheres():
     machine = load_mechanism("delta")
     rng = np.random.default_rng(0)
     q = rng.uniform(0.1, 0.9, (20, 3))
-    found = machine.forward(q)[:, :3, 3]
+    forward_kinematics = machine.forward(q)[:, :3, 3]
     for j, angle in enumerate(np.deg2rad([90, 210, 330])):
         out = np.array([np.cos(angle), np.sin(angle), 0])
         elbow = (0.085 - 0.035 + 0.1 * np.cos(q[:, j, None])) * out
         elbow = elbow - 0.1 * np.sin(q[:, j, None]) * [0, 0, 1]
         # the file gives centres to a tenth of a millimetre
-        np.testing.assert_allclose(np.linalg.norm(found - elbow, axis=1), 0.22, atol=1e-4)
-    assert (found[:, 2] < -0.1).all()
+        np.testing.assert_allclose(
+            np.linalg.norm(forward_kinematics - elbow, axis=1), 0.22, atol=1e-4
+        )
+    assert (forward_kinematics[:, 2] < -0.1).all()
 
 
 def test_linear_delta_by_its_carriages_heights():
@@ -67,9 +69,9 @@ def test_readings_in_and_out(name):
         readings = each.inverse(poses)
         poses, readings = (x[np.isfinite(readings).all(axis=1)] for x in (poses, readings))
         assert len(poses) > 30
-        found = each.forward_result(readings)
-        assert found.converged.all()
-        np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-10)
+        fk = each.forward_result(readings)
+        assert fk.converged.all()
+        np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["delta", "6-rus"])
@@ -100,13 +102,13 @@ def test_frames_change_no_reading(name):
     y = basis @ rng.normal(size=basis.shape[1]) * 0.2
     e, f = perturb(np.eye(4), y[:6]), perturb(np.eye(4), y[6:])
     state = State(machine.values, np.eye(4)[None], poses, np.zeros(1))
-    moved = changed_frames(machine.layout, state, e, f)
+    shifted = changed_frames(machine.layout, state, e, f)
     readings = machine.inverse(poses)
-    known = np.isfinite(readings).all(axis=1)
-    c = closure(machine.layout, moved.theta, readings[known], moved.T_base_platform[known])
+    finite = np.isfinite(readings).all(axis=1)
+    c = closure(machine.layout, shifted.theta, readings[finite], shifted.T_base_platform[finite])
     np.testing.assert_allclose(c.rows.value, 0, atol=1e-13)
-    back_e, back_f = alignment(machine, moved, default_gauge(machine))
-    again = changed_frames(machine.layout, moved, back_e, back_f)
+    back_e, back_f = alignment(machine, shifted, default_gauge(machine))
+    again = changed_frames(machine.layout, shifted, back_e, back_f)
     again = machine.parameters.unit_axes(again.theta)
     expected = machine.parameters.unit_axes(machine.values)
     np.testing.assert_allclose(again, expected, atol=1e-9)
@@ -123,11 +125,11 @@ def test_errors_are_as_large_as_they_say(name):
         poses = around_home(truth, rng)
         poses = poses[np.isfinite(truth.inverse(poses)).all(axis=1)]
         case = measured(truth, poses, rng)
-        found = estimated(machine, case, rng)
-        assert found.statistics.stopped == "converged"
-        chi2.append(found.statistics.chi2 / found.statistics.dof)
-        sigma = np.sqrt(np.diag(found.covariance))
-        ratios.append(found.pose_residuals.std())
+        value = estimated(machine, case, rng)
+        assert value.statistics.stopped == "converged"
+        chi2.append(value.statistics.chi2 / value.statistics.dof)
+        sigma = np.sqrt(np.diag(value.covariance))
+        ratios.append(value.pose_residuals.std())
         assert (sigma >= 0).all()
     assert 0.85 < np.mean(chi2) < 1.15
     assert np.mean(ratios) < 1.1

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pkmcal.calibration.recognise import boards_of, read_photographs, station_poses
+from pkmcal.calibration.localization import boards_of, localize_stations, read_photographs
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import diagnose
-from pkmcal.observe.diagnose import SeenStation, _best_names, _numbering, mistake
-from pkmcal.observe.evidence import StationView
+from pkmcal.observe import hypotheses
+from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.hypotheses import SuspectStation, _best_names, _numbering, mistake
+from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import FoundStation, find_station
-from pkmcal.observe.tables import distance_tables
+from pkmcal.observe.station_localization import LocalizedPose, find_station
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
@@ -55,11 +55,15 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
         mechanism.forward_result(readings).T_base_platform,
         distance_tables(pictures),
     )
-    found = find_station(view, by_hand, rng)
-    if by_hand is not None and not found.good:
-        found = max(found, find_station(view, None, rng), key=lambda f: (f.good, f.evidence))
+    localization = find_station(view, by_hand, rng)
+    if by_hand is not None and not localization.good:
+        localization = max(
+            localization,
+            find_station(view, None, rng),
+            key=lambda f: (f.good, f.log_likelihood_ratio),
+        )
     files = [f"images/front/{name}.png" for name in NAMES]
-    return SeenStation("front", files, NAMES, view, by_hand, found)
+    return SuspectStation("front", files, NAMES, view, by_hand, localization)
 
 
 def b_again():
@@ -91,7 +95,7 @@ def test_nothing_is_said_of_what_is_right(by_hand):
     """
     rng = np.random.default_rng(0)
     station = looked_for(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
-    assert station.found.sure
+    assert station.localization.sure
     assert mistake([station], rng) is None
 
 
@@ -145,9 +149,9 @@ def test_columns_turned_round(turn, or_else):
 
 
 def test_which_way_round_legs_are_numbered_is_told():
-    said = str(_numbering(np.array([5, 4, 3, 2, 1, 0])))
-    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in said
-    assert "and so on backwards" in said
+    text = str(_numbering(np.array([5, 4, 3, 2, 1, 0])))
+    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in text
+    assert "and so on backwards" in text
     assert "and so on round" in str(_numbering(np.array([5, 0, 1, 2, 3, 4])))
 
 
@@ -180,8 +184,10 @@ def test_photographs_of_one_configuration_are_not_taken_for_exchanged():
     rng = np.random.default_rng(1)
     images, readings = b_again()
     station = looked_for(rng, images, readings, by_hand=given(True))
-    short = station.found.evidence - 50 * station.found.grain
-    station = station._replace(found=replace(station.found, evidence=short))
+    short = station.localization.log_likelihood_ratio - 50 * station.localization.correlation_length
+    station = station._replace(
+        localization=replace(station.localization, log_likelihood_ratio=short)
+    )
     assert mistake([station], rng) is None
 
 
@@ -202,7 +208,7 @@ def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely
     wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
     right = looked_for(rng, pictures(), by_hand=given(True))
     stations = [
-        station._replace(name=name, found=replace(station.found, by_chance=by_chance))
+        station._replace(name=name, localization=replace(station.localization, by_chance=by_chance))
         for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
     ]
     error = mistake(stations, rng)
@@ -237,14 +243,14 @@ def test_tables_of_mirrored_photographs_are_mirrored_tables():
 
 def test_names_are_assigned_for_the_largest_sum():
     rng = np.random.default_rng(0)
-    kept = 0
+    retained = 0
     for _ in range(300):
         score = rng.normal(size=(4, 4)) + rng.uniform(0, 4) * np.eye(4)
         every = np.array(list(permutations(range(4))))
         best = every[np.argmax(score[np.arange(4), every].sum(axis=1))]
         np.testing.assert_array_equal(_best_names(score), best)
-        kept += np.array_equal(best, np.arange(4))
-    assert 100 < kept < 250
+        retained += np.array_equal(best, np.arange(4))
+    assert 100 < retained < 250
 
 
 @pytest.mark.slow
@@ -258,7 +264,7 @@ def test_diameters_for_radii():
     values[radii] *= 2
     rng, drawing = np.random.default_rng(0), mechanism.with_values(values)
     station = looked_for(rng, pictures(), mechanism=drawing, by_hand=given(True))
-    unsure = station._replace(found=replace(station.found, by_chance=1.0))
+    unsure = station._replace(localization=replace(station.localization, by_chance=1.0))
     error = mistake([unsure], rng)
     assert "the tubes' radii look like diameters" in str(error)
 
@@ -280,7 +286,7 @@ def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
     other = machine().with_values(values)
     rng, readings = np.random.default_rng(0), other.inverse(poses())
     station = looked_for(rng, pictures(), readings, mechanism=other, by_hand=given(True))
-    assert not station.found.sure
+    assert not station.localization.sure
     error = mistake([station], rng)
     assert error is None or "not recognised" in str(error)
 
@@ -291,14 +297,18 @@ def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
 ):
     """Of two photographs in which the machine was not recognised, chance confirms one of thirty."""
     rng, readings = np.random.default_rng(0), machine().inverse(poses())
-    found = FoundStation(rough_pose(4), 0.5, 1.0, 0.02, told=True)
-    two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(found=found)
+    localization = LocalizedPose(rough_pose(4), 0.5, 1.0, 0.02, has_prior=True)
+    two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(
+        found=localization
+    )
 
     def confirmed(view, _start, _rng, closely):
-        return replace(found, by_chance=by_chance)
+        return replace(localization, by_chance=by_chance)
 
-    monkeypatch.setattr(diagnose, "find_station", confirmed)
-    monkeypatch.setattr(diagnose, "evidence_from", lambda view, _: 0.0 if view is two.view else 1e3)
+    monkeypatch.setattr(hypotheses, "find_station", confirmed)
+    monkeypatch.setattr(
+        hypotheses, "likelihood_from", lambda view, _: 0.0 if view is two.view else 1e3
+    )
     error = mistake([two], rng)
     assert error is not None
     assert ("not recognised" in error.what) != named
@@ -321,4 +331,4 @@ def test_configurations_that_are_alike_do_not_change_names(tmp_path):
     session = load_session(tmp_path / "s")
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    assert len(station_poses(session, photographs, boards, np.random.default_rng(7))) == 1
+    assert len(localize_stations(session, photographs, boards, np.random.default_rng(7))) == 1

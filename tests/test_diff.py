@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify.change import machine_change
 from pkmcal.identify.gauge import moved_centres
+from pkmcal.identify.machine_change import machine_change
 from pkmcal.judge.difference import _shared, difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
@@ -66,10 +66,10 @@ def changes(pairs):
 @pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
 def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
     """Of 8 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.07."""
-    found = changes(pairs[kind])
-    dof = sum(c.dof for c in found)
-    assert sum(c.chi2 for c in found) / dof == pytest.approx(1, abs=0.2)
-    z = np.concatenate([(c.change / np.maximum(c.sigma, 1e-12))[c.sigma > 1e-9] for c in found])
+    value = changes(pairs[kind])
+    dof = sum(c.dof for c in value)
+    assert sum(c.chi2 for c in value) / dof == pytest.approx(1, abs=0.2)
+    z = np.concatenate([(c.change / np.maximum(c.sigma, 1e-12))[c.sigma > 1e-9] for c in value])
     assert np.mean(np.abs(z) < 1.96) == pytest.approx(0.95, abs=0.03)
 
 
@@ -84,9 +84,9 @@ def test_common_data_make_a_smaller_spread_and_that_is_needed(pairs):
 
 def test_a_result_beside_itself(pairs):
     a = pairs["new data"][0][0]
-    found = machine_change(a.machine, a.machine, (a.covariance, a.covariance), shared=1.0)
-    assert np.abs(found.change).max() < 1e-12
-    assert found.chi2 < 1e-6
+    values = machine_change(a.machine, a.machine, (a.covariance, a.covariance), shared=1.0)
+    assert np.abs(values.change).max() < 1e-12
+    assert values.chi2 < 1e-6
 
 
 def test_frames_make_no_difference(pairs):
@@ -94,12 +94,12 @@ def test_frames_make_no_difference(pairs):
     rng = np.random.default_rng(0)
     e, f = (perturb(np.eye(4), rng.normal(size=6) * 0.05) for _ in range(2))
     theta = moved_centres(b.machine.layout, b.machine.values, e, f)
-    moved = b.machine.with_values(theta)
+    shifted = b.machine.with_values(theta)
     same = machine_change(a.machine, a.machine.with_values(
         moved_centres(a.machine.layout, a.machine.values, e, f)), (None, None))  # fmt: skip
     assert np.abs(same.change).max() < 1e-9
     one = machine_change(a.machine, b.machine, (None, None)).change
-    two = machine_change(a.machine, moved, (None, None)).change
+    two = machine_change(a.machine, shifted, (None, None)).change
     assert np.allclose(one, two, atol=1e-6)
 
 
@@ -116,24 +116,24 @@ def test_what_changed_is_found_where_it_changed(pairs, name, times):
         quiet = machine_change(a.machine, b.machine, (a.covariance, b.covariance))
         values = b.machine.values.copy()
         values[k] += times * quiet.sigma[k]
-        found = machine_change(a.machine, b.machine.with_values(values), (a.covariance,
+        value = machine_change(a.machine, b.machine.with_values(values), (a.covariance,
                                b.covariance))  # fmt: skip
-        z = np.abs(found.change) / np.maximum(found.sigma, 1e-9)
+        z = np.abs(value.change) / np.maximum(value.sigma, 1e-9)
         hits += z[k] > 3.5
-        assert found.chi2 > quiet.chi2
+        assert value.chi2 > quiet.chi2
     assert hits >= PAIRS - 1
 
 
 def test_a_drawing_is_taken_at_its_word(pairs):
     a = pairs["new data"][0][0]
     drawing = a.machine.with_values(a.machine.parameters.drawing)
-    found = machine_change(drawing, a.machine, (None, a.covariance))
-    assert found.dof > 40
-    assert found.chi2 > 10 * found.dof  # it was built two millimetres off
+    value = machine_change(drawing, a.machine, (None, a.covariance))
+    assert value.dof > 40
+    assert value.chi2 > 10 * value.dof  # it was built two millimetres off
     both = machine_change(drawing, a.machine, (None, None))
     assert both.dof == 0
     assert not both.sigma.any()
-    assert np.allclose(both.change, found.change)
+    assert np.allclose(both.change, value.change)
 
 
 # ------------------------------------------------------------------ calibrations
@@ -157,32 +157,32 @@ def test_after_a_crash(saved):
     document = json.loads(json.dumps(saved.document))
     for entry in document["configurations"]:
         entry["photographs"] = [f"new {digest}" for digest in entry["photographs"]]
-    found = difference(saved, replace(after, document=document))
-    assert found.changed
-    assert found.shared == 0
-    assert found.ordered[0] == k
-    assert found.found.change[k] == pytest.approx(8e-3, rel=0.35)
-    assert found.verdict.headline.startswith("The calibrations differ by more than chance")
-    assert found.verdict.reasons[0].startswith("Leg 3 ")
+    value = difference(saved, replace(after, document=document))
+    assert value.changed
+    assert value.shared == 0
+    assert value.ordered[0] == k
+    assert value.change.change[k] == pytest.approx(8e-3, rel=0.35)
+    assert value.verdict.headline.startswith("The calibrations differ by more than chance")
+    assert value.verdict.reasons[0].startswith("Leg 3 ")
     # what leg 3's zero does to the tool, at the same readings
-    table = found.tool.after
-    even = slice(0, found.tool.spread)
+    table = value.tool.after
+    even = slice(0, value.tool.spread)
     poses = table.T_base_platform[even]
     readings = after.machine.inverse(poses)
     away = saved.machine.forward_result(readings, poses).T_base_platform
-    moved = np.linalg.norm(away[:, :3, 3] - poses[:, :3, 3], axis=1)
-    ratio = np.nanmedian(table.off_position[even]) / np.nanmedian(moved)
+    shifted = np.linalg.norm(away[:, :3, 3] - poses[:, :3, 3], axis=1)
+    ratio = np.nanmedian(table.off_position[even]) / np.nanmedian(shifted)
     assert 0.2 < ratio < 1.2  # less, for frames take a part of it
 
 
 def test_shared_photographs_are_counted(saved):
-    found = difference(saved, saved)
-    assert not found.changed
-    assert found.shared == int(saved.used.sum())
-    assert found.verdict.headline == (
+    value = difference(saved, saved)
+    assert not value.changed
+    assert value.shared == int(saved.used.sum())
+    assert value.verdict.headline == (
         "The two are the same: no number differs by more than rounding."
     )
-    assert any("100% of what" in text for text in found.assumed)
+    assert any("100% of what" in text for text in value.assumed)
 
 
 def test_photographs_are_counted_however_they_are_grouped(saved):
@@ -203,11 +203,11 @@ def test_a_refused_calibration_is_no_base_for_a_comparison(saved):
     refused = replace(
         saved, verdict=Verdict(False, "Bad.", (Finding("", Level.WRONG, saved_text="No light."),))
     )
-    found = difference(saved, refused)
-    assert not found.changed
-    assert not found.verdict.usable
-    assert "was refused when it was made: No light." in found.verdict.reasons[0]
-    assert outcome_of(found).exit_code == 1
+    value = difference(saved, refused)
+    assert not value.changed
+    assert not value.verdict.usable
+    assert "was refused when it was made: No light." in value.verdict.reasons[0]
+    assert outcome_of(value).exit_code == 1
 
 
 def test_another_machine_is_refused(saved):
@@ -220,15 +220,15 @@ def test_two_drawings():
     values = drawing.values.copy()
     k = drawing.parameters.index("legs[2].length.offset")
     values[k] += 1e-3
-    found = difference(drawing, drawing.with_values(values))
-    assert found.changed
-    assert found.found.dof == 0
-    assert found.ordered[0] == k
-    assert found.verdict.headline.startswith("The drawings differ: the tool differs by ")
-    assert np.isnan(found.chances).all()
-    told = found.document()
-    assert told["chi2"] is None
-    assert told["parameters"][k]["change"] == pytest.approx(1e-3, rel=0.2)
+    value = difference(drawing, drawing.with_values(values))
+    assert value.changed
+    assert value.change.dof == 0
+    assert value.ordered[0] == k
+    assert value.verdict.headline.startswith("The drawings differ: the tool differs by ")
+    assert np.isnan(value.chances).all()
+    document = value.document()
+    assert document["chi2"] is None
+    assert document["parameters"][k]["change"] == pytest.approx(1e-3, rel=0.2)
 
 
 def test_a_fixed_number_that_differs_is_told():
@@ -239,9 +239,9 @@ def test_a_fixed_number_that_differs_is_told():
     k = drawing.parameters.index(name)
     values = held.values.copy()
     values[k] += 1e-4
-    found = difference(held, held.with_values(values))
-    assert found.found.change[k] == pytest.approx(1e-4)
-    assert found.changed
+    value = difference(held, held.with_values(values))
+    assert value.change.change[k] == pytest.approx(1e-4)
+    assert value.changed
 
 
 # ------------------------------------------------------------------ command
@@ -254,13 +254,13 @@ def test_the_command(demo, tmp_path):
     assert "✓ The two are the same" in done.out
     assert {path.name for path in out.iterdir()} == {"diff.html", "diff.json"}
     done = run("diff", demo.calibration, "gough-stewart", "-o", out, "--json")
-    told = done.json
-    assert (done.code, told["exit_code"]) == (1, 1)
-    assert (told["a"]["kind"], told["b"]["kind"]) == ("calibration", "drawing")
-    assert told["changed"] is True
-    assert told["chance"] < 1e-6
-    assert told["tool"]["change"]["position"]["median"] > 1e-3
-    assert told["shared_configurations"] == 0
+    values = done.json
+    assert (done.code, values["exit_code"]) == (1, 1)
+    assert (values["a"]["kind"], values["b"]["kind"]) == ("calibration", "drawing")
+    assert values["changed"] is True
+    assert values["chance"] < 1e-6
+    assert values["tool"]["change"]["position"]["median"] > 1e-3
+    assert values["shared_configurations"] == 0
     page = (out / "diff.html").read_text()
     assert "How far each joint moved" in page
     done = run("diff", demo.calibration, "gough-stewart", "-o", out)
@@ -297,13 +297,13 @@ def test_an_earlier_difference_is_kept_beside_the_calibration(demo, tmp_path, mo
     before = (folder / "diff.json").read_text()
     assert "kept" not in run("diff", "gough-stewart", b, "--json").json
     second = run("diff", b, b, "--json").json
-    kept = Path(second["kept"])
-    assert kept.parent == folder.parent
-    assert kept.name.startswith("diff-20")
-    assert (kept / "diff.json").read_text() == before != (folder / "diff.json").read_text()
-    assert (kept / "diff.html").is_file()
+    retained = Path(second["kept"])
+    assert retained.parent == folder.parent
+    assert retained.name.startswith("diff-20")
+    assert (retained / "diff.json").read_text() == before != (folder / "diff.json").read_text()
+    assert (retained / "diff.html").is_file()
     assert "kept" not in run("diff", "gough-stewart", b, "--force", "--json").json
-    assert sorted(p.name for p in folder.parent.iterdir()) == ["calibration", "diff", kept.name]
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["calibration", "diff", retained.name]
     assert list((tmp_path / "here").iterdir()) == []
 
 
@@ -319,8 +319,8 @@ def test_a_machine_without_a_map_is_compared_all_the_same(monkeypatch):
         raise InputError("nothing can be reached")
 
     monkeypatch.setattr("pkmcal.judge.difference.map_of", refuse)
-    found = difference("h4", "h4")
-    outcome = outcome_of(found)
+    value = difference("h4", "h4")
+    outcome = outcome_of(value)
     assert "There is no map of the workspace: " in outcome.parts[0].text[0]
-    assert found.document()["tool"]["why_not"]
+    assert value.document()["tool"]["why_not"]
     assert "There is no map" in page_html(outcome)

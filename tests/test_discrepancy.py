@@ -9,25 +9,25 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate_measurements
-from pkmcal.calibration.departures import model_violations
-from pkmcal.calibration.doubts import WRONG_MODEL_READING_SCALE, noise_doubt
-from pkmcal.calibration.gather import edges_by_camera
-from pkmcal.calibration.model_errors import (
+from pkmcal.calibration.camera_refinement import edges_by_camera
+from pkmcal.calibration.discrepancy_basis import (
     CORRELATION_LENGTHS,
     discrepancy_components,
     smooth_functions,
     with_discrepancy,
 )
+from pkmcal.calibration.faults import WRONG_MODEL_READING_SCALE, noise_fault
+from pkmcal.calibration.model_violations import model_violations
 from pkmcal.geometry.cylinders import line_through, tangent_basis
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import Component, discrepancy_of
 from pkmcal.identify.kinds import READING_ROWS_KIND
-from pkmcal.identify.score import Departures, RandomEffects, columns_of
+from pkmcal.identify.score import RandomEffects, ScoreTests, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
 from pkmcal.measurements import Effect
-from test_departures import measured, scales
+from test_model_violations import measured, scales
 
 FEW = 14
 """Configurations of sessions that dense algebra takes whole."""
@@ -59,7 +59,7 @@ def scales_in_use(estimate):
 
 def discrepancy_in(data, estimate, named=()):
     return discrepancy_of(
-        *as_ended(data, estimate),
+        *linearize_at_solution(data, estimate),
         discrepancy_components(data, estimate),
         named,
         scales_in_use(estimate),
@@ -90,7 +90,7 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
     )
     data = replace(data, joint_noise=estimate.statistics.reading_scale * data.joint_noise)
     estimate = replace(estimate, statistics=replace(estimate.statistics, reading_scale=1.0))
-    assembled, info = as_ended(data, estimate)
+    assembled, info = linearize_at_solution(data, estimate)
     root = np.array([[1.0, 0, 0], [0.5, 1, 0], [0, 0, 2.0]])
     one = Component("functions", Effect(readings=functions), (root,))
     result = discrepancy_of(assembled, info, [one])
@@ -99,8 +99,8 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
     J, r, G = dense(assembled, info, [one.effect])
     length = np.maximum(np.linalg.norm(J, axis=0), 1e-30)
     u, s, _ = np.linalg.svd(J / length, full_matrices=True)
-    left = u[:, np.sum(s > 1e-10 * s[0]) :]
-    H, y = left.T @ G @ root, left.T @ r
+    residual = u[:, np.sum(s > 1e-10 * s[0]) :]
+    H, y = residual.T @ G @ root, residual.T @ r
 
     def likelihood(scale):
         V = np.eye(len(y)) + scale**2 * H @ H.T
@@ -123,12 +123,12 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
 def test_scores_beside_random_effects_are_those_of_correlated_noise():
     rng = np.random.default_rng(6)
     _, data, estimate, _ = session_estimate(6, lambda q: 2e-3 * q * (np.arange(6) == 1), count=FEW)
-    assembled, info = as_ended(data, estimate)
+    assembled, info = linearize_at_solution(data, estimate)
     random = Effect(readings=rng.standard_normal((FEW, 6, 2)))
     root = 2e-4 * np.array([[1.0, 0.0], [0.3, 0.7]])
     tests = [Effect(readings=by) for by in scales(data)[:2]]
     beside = RandomEffects((random,), root)
-    scores = Departures(assembled, info, tests, beside=beside).scores()
+    scores = ScoreTests(assembled, info, tests, beside=beside).scores()
     J, r, G = dense(assembled, info, [*tests, random])
     V = np.eye(len(r)) + G[:, 2:] @ root @ root.T @ G[:, 2:].T
     white = np.linalg.inv(np.linalg.cholesky(V))
@@ -168,7 +168,9 @@ def test_legs_that_give_way_are_found_and_contained():
     estimate = bundle(drawing, data, right.state)
     result = discrepancy_in(data, estimate)
     assert result.scales[0].code == "readings.workspace"
-    contained = with_discrepancy(data, estimate, as_ended(data, estimate)[1].problem, result)
+    contained = with_discrepancy(
+        data, estimate, linearize_at_solution(data, estimate)[1].problem, result
+    )
     before, after = (tool_in_sigmas(truth, x, true) for x in (estimate, contained))
     assert before > 3
     assert after < 3
@@ -197,8 +199,8 @@ def test_a_right_session_has_no_discrepancy(seed):
 
 @pytest.mark.slow
 def test_right_sessions_seldom_have_one():
-    found = [discrepancy_in(*session_estimate(seed)[1:3]).scales for seed in range(100, 140)]
-    assert sum(map(bool, found)) <= 2
+    results = [discrepancy_in(*session_estimate(seed)[1:3]).scales for seed in range(100, 140)]
+    assert sum(map(bool, results)) <= 2
 
 
 def test_noisy_readings_are_noise_and_hardly_more():
@@ -207,7 +209,9 @@ def test_noisy_readings_are_noise_and_hardly_more():
     _, data, estimate, _ = session_estimate(9, lambda q: 3e-5 * rng.standard_normal(q.shape))
     assert estimate.statistics.reading_scale > 3
     result = discrepancy_in(data, estimate)
-    contained = with_discrepancy(data, estimate, as_ended(data, estimate)[1].problem, result)
+    contained = with_discrepancy(
+        data, estimate, linearize_at_solution(data, estimate)[1].problem, result
+    )
     offsets = estimate.machine.parameters.of_kind("offset")
     more, before = (np.diag(x.covariance)[offsets].sum() for x in (contained, estimate))
     assert more < 2 * before
@@ -252,23 +256,23 @@ def through_lens(calibrated, change, stations):
     measurements = replace(calibrated.measurements, edges=edges)
     estimate = bundle(session.machine, measurements, calibrated.estimate.state)
     observation = replace(observation, edges=edges)
-    end = as_ended(measurements, estimate)
+    end = linearize_at_solution(measurements, estimate)
     return model_violations(session, observation, measurements, estimate, end)
 
 
 def test_pixels_that_are_not_square_are_named(calibrated):
     camera = calibrated.session.stations[0].camera
     stations = list(range(len(calibrated.session.stations)))
-    found = through_lens(calibrated, 0.006 * camera.aspect_part, stations)
-    first = found.departures[0]
+    value = through_lens(calibrated, 0.006 * camera.aspect_part, stations)
+    first = value.violations[0]
     assert (first.code, first.of) == ("camera.aspect", "cameras/camera.yaml")
     assert abs(first.value[0] - 0.006) < 4 * first.sigma[0]
 
 
 def test_a_station_with_another_lens_than_its_file_is_named(calibrated):
     camera = calibrated.session.stations[1].camera
-    found = through_lens(calibrated, 0.02 * camera.aspect_part, [1])
-    first = found.departures[0]
+    value = through_lens(calibrated, 0.02 * camera.aspect_part, [1])
+    first = value.violations[0]
     name = calibrated.session.station_names[1]
     assert (first.code, first.of) == ("station.aspect", name)
     assert first.value[0] == pytest.approx(0.02, abs=4 * first.sigma[0] + 4e-3)
@@ -282,8 +286,8 @@ def test_a_right_session_has_no_errors_left_out(calibrated):
 def test_readings_far_beyond_their_noise_are_no_noise(calibrated):
     def reasons(factor):
         statistics = replace(calibrated.estimate.statistics, reading_scale=factor)
-        found = replace(calibrated.estimate, statistics=statistics)
-        return [one.code for one in noise_doubt(calibrated.session, found)]
+        value = replace(calibrated.estimate, statistics=statistics)
+        return [one.code for one in noise_fault(calibrated.session, value)]
 
     tolerance = calibrated.session.machine.document.tolerance.offset
     assert WRONG_MODEL_READING_SCALE * calibrated.session.joint_noise < tolerance

@@ -13,10 +13,10 @@ import printers
 from conftest import run
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.gather import refinement_of
-from pkmcal.calibration.recognise import known_stations
-from pkmcal.calibration.source import load_source
-from pkmcal.calibration.turns import identify_poses
+from pkmcal.calibration.camera_refinement import refinement_of
+from pkmcal.calibration.localization import prior_station_poses
+from pkmcal.calibration.machine_source import load_source
+from pkmcal.calibration.refinement import identify_poses
 from pkmcal.errors import InputError
 from pkmcal.export.contract import make_export
 from pkmcal.identify.tool import pose_by_parameters
@@ -95,7 +95,7 @@ def test_deviations_hold(tmp_path):
         kit = distance_sessions.write(tmp_path / str(k), true, rng)
         session = load_session(kit)
         boards, held = Boards(), refinement_of(session, False)
-        T = known_stations(session, boards)
+        T = prior_station_poses(session, boards)
         estimate = identify_poses(session, boards, T, held, lambda _text, _share: None).estimate
         z.append(distance_sessions.stretch(true, estimate.machine) / stretch_sigma(estimate))
         s = estimate.statistics
@@ -180,9 +180,9 @@ def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
 def test_held_out_configurations_take_their_distances_with_them(kit):
     result = calibrate_session(kit, holdout=4)
     out = set(result.holdout.region.rows.tolist())
-    kept = result.measurements.link_ends
-    assert not out & set(kept.ravel().tolist())
-    assert len(result.estimate.link_weights) == len(kept)
+    retained = result.measurements.link_ends
+    assert not out & set(retained.ravel().tolist())
+    assert len(result.estimate.link_weights) == len(retained)
 
 
 def fault(kit, folder, **files):
@@ -193,7 +193,7 @@ def fault(kit, folder, **files):
     for name, text in files.items():
         (folder / name.replace("_", ".")).write_text(text)
     with pytest.raises(InputError) as caught:
-        known_stations(load_session(folder), Boards())
+        prior_station_poses(load_session(folder), Boards())
     return caught.value
 
 

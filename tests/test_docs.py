@@ -72,9 +72,9 @@ def test_pictures_are_used_small_and_made_by_the_script(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tools")
     script = importlib.import_module("pictures")
     there = {path.stem for path in PICTURES.iterdir()}
-    shown = {Path(link).stem for name in NAMES for link in LINK.findall(text_of(name))
+    display = {Path(link).stem for name in NAMES for link in LINK.findall(text_of(name))
              if link.endswith(".png")}  # fmt: skip
-    assert there == shown == set(script.PICTURES)
+    assert there == display == set(script.PICTURES)
     for path in PICTURES.iterdir():
         assert path.read_bytes().startswith(b"\x89PNG"), path.name
         assert path.stat().st_size <= 200_000, path.name
@@ -138,26 +138,26 @@ def calls(text: str) -> list[tuple[str, str]]:
     """Commands of pkmcal in a page's code, with what follows each on its line."""
     code = re.findall(r"`([^`\n]+)`", prose(text)) + [body for _, body in FENCE.findall(text)]
     call = re.compile(r"(?:^|[\s/])pkmcal +([a-z]+)\b([^\n#]*)")
-    return [found for part in code for found in call.findall(part)]
+    return [value for part in code for value in call.findall(part)]
 
 
 def test_commands_named_exist():
     listed = run("--help").out.partition("Commands:")[2].strip("\n").partition("\n\n")[0]
-    known = set(re.findall(r"^  (\w+) ", listed, re.MULTILINE))
-    assert {"demo", "new", "check", "calibrate"} <= known
+    above_limit = set(re.findall(r"^  (\w+) ", listed, re.MULTILINE))
+    assert {"demo", "new", "check", "calibrate"} <= above_limit
     assert {command for command, _ in calls(text_of("README.md"))} >= {"demo", "new", "check"}
     for name in NAMES:
-        assert {command for command, _ in calls(text_of(name))} <= known, name
+        assert {command for command, _ in calls(text_of(name))} <= above_limit, name
     explained = re.findall(r"^## pkmcal (\w+)", text_of("docs/commands.md"), re.MULTILINE)
-    assert known <= set(explained)
+    assert above_limit <= set(explained)
 
 
 def test_options_named_exist():
-    told = cache(lambda command: run(command, "--help").out)
+    values = cache(lambda command: run(command, "--help").out)
     for name in NAMES:
         for command, rest in calls(text_of(name)):
             for option in re.findall(r"(?<!\S)--[a-z-]+", rest):
-                assert option in told(command), f"{name}: {command} {option}"
+                assert option in values(command), f"{name}: {command} {option}"
 
 
 @pytest.mark.parametrize("name", NAMES)

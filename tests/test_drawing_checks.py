@@ -217,8 +217,8 @@ def test_whole_axes_may_be_held_or_tied(tmp_path):
 
 def test_an_axis_of_any_length_is_a_direction(tmp_path):
     path = drawn(tmp_path, "3-rps", ("axis: [-1, 0, 0]", "axis: [-1.0e+200, 0, 0]"))
-    found = load_mechanism(path)
-    np.testing.assert_array_equal(found.base_axes()[0], [-1, 0, 0])
+    values = load_mechanism(path)
+    np.testing.assert_array_equal(values.base_axes()[0], [-1, 0, 0])
 
 
 # Drawings that pass these checks and still cannot be assembled
@@ -233,9 +233,9 @@ UNASSEMBLED = (
 
 def test_simulate_refuses_a_drawing_that_cannot_be_assembled(tmp_path):
     drawing = drawn(tmp_path, "constant-legs", *SHORT)
-    told = run("simulate", tmp_path / "session", "--mechanism", drawing)
-    assert told.code == 2
-    assert UNASSEMBLED in " ".join(told.err.split())
+    values = run("simulate", tmp_path / "session", "--mechanism", drawing)
+    assert values.code == 2
+    assert UNASSEMBLED in " ".join(values.err.split())
     assert not (tmp_path / "session").exists()
 
 
@@ -243,9 +243,9 @@ def test_simulate_refuses_a_home_far_from_any_configuration(tmp_path):
     drawing = drawn(
         tmp_path, "constant-legs", ("legs:", "home: {position: [0, 0, 5]}\nlegs:"), *SHORT
     )
-    told = run("simulate", tmp_path / "session", "--mechanism", drawing)
-    assert told.code == 2
-    assert "has too few usable configurations" in told.err
+    values = run("simulate", tmp_path / "session", "--mechanism", drawing)
+    assert values.code == 2
+    assert "has too few usable configurations" in values.err
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +261,6 @@ def test_sessions_with_such_a_drawing_are_refused(small_session, tmp_path, comma
     session = tmp_path / "session"
     shutil.copytree(small_session, session)
     drawn(tmp_path, "constant-legs", *SHORT).replace(session / "mechanism.yaml")
-    told = run(command, session, "--json")
-    assert told.code == 2
-    assert f"mechanism.yaml: {UNASSEMBLED}" in told.out + told.err
+    values = run(command, session, "--json")
+    assert values.code == 2
+    assert f"mechanism.yaml: {UNASSEMBLED}" in values.out + values.err

@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from pkmcal.identify import line_shading
-from pkmcal.identify.alike import covariance_of_alike
 from pkmcal.identify.assembly import SHIFT_SIGMA, assemble, lines
-from pkmcal.identify.bundle import as_ended, bundle, solve_batch
+from pkmcal.identify.bundle import bundle, linearize_at_solution, solve_batch
+from pkmcal.identify.error_correlation import covariance_of_correlated
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.line_shading import common_shading
-from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, TUBES_ALIKE, concatenate
+from pkmcal.measurements import (
+    OWN_SHADING,
+    SHADING_CORRELATION_ANGLE,
+    TUBE_CORRELATION,
+    concatenate,
+)
 from pkmcal.measurements.edges import EdgeData
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import minimise
@@ -33,7 +38,7 @@ def alike(rng, line, normal):
     for run, number in np.ndindex(len(normal), line.max() + 1):
         mine = np.flatnonzero(line == number)
         angle = np.arccos(np.clip(normal[run, mine] @ normal[run, mine].T, -1, 1))
-        root = np.exp(-angle / SHADING_ALIKE_ANGLE) + 1e-9 * np.eye(len(mine))
+        root = np.exp(-angle / SHADING_CORRELATION_ANGLE) + 1e-9 * np.eye(len(mine))
         out[run, mine] = np.linalg.cholesky(root) @ rng.normal(size=len(mine))
     return out
 
@@ -74,7 +79,7 @@ def test_scale_and_shading_are_found(factor):
     result = solve_batch(problem, truth)
     np.testing.assert_allclose(np.median(result.edges.scale, axis=0), factor, rtol=0.1)
     np.testing.assert_allclose(np.median(result.edges.shading, axis=0), 0.15, rtol=0.15)
-    assert np.median(result.edges.tails) >= 20
+    assert np.median(result.edges.dof) >= 20
     assert off(result, truth) == pytest.approx(1, abs=0.2)
 
 
@@ -96,8 +101,8 @@ def test_heavy_tails_are_found_and_deviations_hold():
     assembled, truth = shaded(rng, 0.02).batch(Heavy(rng, 3))
     result = solve_batch(assembled.problem, truth)
     # lighter than drawn, for the furthest are let go
-    assert np.median(result.edges.tails) <= 10
-    assert result.trust.min() < 0.3
+    assert np.median(result.edges.dof) <= 10
+    assert result.robust_weight.min() < 0.3
     assert off(result, truth) == pytest.approx(1, abs=0.2)
 
 
@@ -110,8 +115,8 @@ def test_the_same_edge_many_times_tells_its_shading_once():
     eight = [replace(one.edges, configuration=one.edges.configuration + k * n) for k in range(8)]
     many = replace(one, edges=concatenate(eight), joints=np.tile(one.joints, (8, 1)))
     gauge = default_gauge(scene.machine)
-    found = [assemble(scene.machine, m, gauge) for m in (one, many)]
-    own = [at.places.edges.taken(at.problem.data.own[0]) for at in found]
+    results = [assemble(scene.machine, m, gauge) for m in (one, many)]
+    own = [at.places.edges.taken(at.problem.data.own[0]) for at in results]
     np.testing.assert_allclose(own[1], np.sqrt(8) * np.tile(own[0], 8))
     assert (own[0] > OWN_SHADING).all()
 
@@ -135,7 +140,7 @@ def test_a_tube_that_nobody_saw_keeps_what_is_stated(seen, other):
     noise = bundle(scene.machine, alone, scene.state()).edge_noise
     assert noise.scale[seen] != 1
     assert (noise.scale[other], noise.shading[other]) == (1, OWN_SHADING)
-    assert noise.tails[other] == np.inf
+    assert noise.dof[other] == np.inf
 
 
 def test_a_crowd_is_the_sum_over_its_line():
@@ -146,13 +151,15 @@ def test_a_crowd_is_the_sum_over_its_line():
     expected = np.empty(len(edges))
     for k in range(len(edges)):
         near = edges.normal[number == number[k]] @ edges.normal[k]
-        expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / SHADING_ALIKE_ANGLE).sum()
-    np.testing.assert_allclose(LineCells.of(edges.normal, number, side).crowd, expected, rtol=0.01)
+        expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / SHADING_CORRELATION_ANGLE).sum()
+    np.testing.assert_allclose(
+        LineCells.of(edges.normal, number, side).n_effective, expected, rtol=0.01
+    )
     same = np.broadcast_to(edges.normal[0], edges.normal.shape)
     counted = np.bincount(number)[number]
-    np.testing.assert_allclose(LineCells.of(same, number, side).crowd, counted)
+    np.testing.assert_allclose(LineCells.of(same, number, side).n_effective, counted)
     alone = np.where(number == 0, -1, number)
-    np.testing.assert_array_equal(LineCells.of(same, alone, side).crowd[number == 0], 1)
+    np.testing.assert_array_equal(LineCells.of(same, alone, side).n_effective[number == 0], 1)
 
 
 def test_what_edges_have_in_common_is_in_the_covariance():
@@ -175,8 +182,8 @@ def test_what_edges_have_in_common_is_in_the_covariance():
     number = lines(measurements)[1]
     angle = np.arccos(np.clip(edges.normal @ edges.normal.T, -1, 1))
     together = np.all([k[:, None] == k for k in (edges.station, edges.leg, edges.side)], axis=0)
-    near = np.exp(-angle / SHADING_ALIKE_ANGLE) * together
-    shaded_alike = near * np.where(edges.tube[:, None] == edges.tube, 1.0, TUBES_ALIKE)
+    near = np.exp(-angle / SHADING_CORRELATION_ANGLE) * together
+    shaded_alike = near * np.where(edges.tube[:, None] == edges.tube, 1.0, TUBE_CORRELATION)
     near = near * (number[:, None] == number)
     noise = at.taken(data.scale[0]) ** 2
     own = result.edges.shading[0][edges.tube] * size
@@ -185,17 +192,19 @@ def test_what_edges_have_in_common_is_in_the_covariance():
         np.outer(counted, counted)
     )
     inverse, n = info.covariance[0], len(edges)
-    moved = {
+    shifted = {
         part: inverse @ (along.T @ (shift - np.eye(n)) @ along + part * tilts) @ inverse
         for part in (0.0, 1.0)
         for tilts in [across.T @ (near - np.eye(n)) @ across]
     }
-    found = covariance_of_alike(info)[0] - inverse
+    value = covariance_of_correlated(info)[0] - inverse
     # one number is free, how alike tilts are
-    part = np.sum((found - moved[0]) * (moved[1] - moved[0])) / np.sum((moved[1] - moved[0]) ** 2)
+    part = np.sum((value - shifted[0]) * (shifted[1] - shifted[0])) / np.sum(
+        (shifted[1] - shifted[0]) ** 2
+    )
     assert 0 <= part <= 1
-    expected = moved[0] + part * (moved[1] - moved[0])
-    assert np.abs(found - expected).max() < 0.03 * np.abs(expected).max()
+    expected = shifted[0] + part * (shifted[1] - shifted[0])
+    assert np.abs(value - expected).max() < 0.03 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("tilt", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
@@ -217,10 +226,12 @@ def test_deviations_hold_where_edges_err_alike(tilt):
 def integrated(shift, covariance, sigma, least):
     """The mean of the lines' variance by quadrature, of normal shifts with one deviation."""
     tried = np.geomspace(least, 100 * least, 1000)
-    known = np.linalg.inv(covariance) - np.diag(1 / sigma**2)
-    best = np.linalg.solve(known, np.linalg.solve(covariance, shift))
+    inverse_covariance = np.linalg.inv(covariance) - np.diag(1 / sigma**2)
+    best = np.linalg.solve(inverse_covariance, np.linalg.solve(covariance, shift))
     density = [
-        multivariate_normal.logpdf(best, cov=np.linalg.inv(known) + s**2 * np.eye(len(shift)))
+        multivariate_normal.logpdf(
+            best, cov=np.linalg.inv(inverse_covariance) + s**2 * np.eye(len(shift))
+        )
         for s in tried
     ]
     share = np.exp(density - np.max(density)) / (1 + (tried / SHIFT_SIGMA) ** 2)
@@ -239,12 +250,12 @@ def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
     sigma = np.full(n, 0.2)
     covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
     shift = covariance @ np.linalg.solve(noise, measured)
-    found = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03)[0]
-    np.testing.assert_allclose(found, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
+    values = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03)[0]
+    np.testing.assert_allclose(values, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
     if told < 0.1:
-        np.testing.assert_allclose(found, 0.1, rtol=0.2)
+        np.testing.assert_allclose(values, 0.1, rtol=0.2)
     else:
-        assert np.all(found > 0.1)
+        assert np.all(values > 0.1)
 
 
 numbers = st.floats(-3, 3, allow_nan=False)
@@ -264,8 +275,8 @@ def test_the_whitening_is_a_root_of_the_inverse_cotold(entries, scale, own):
         scale=np.full((1, 1, 1), scale), own=np.full((1, 1, 1), own),
     )  # fmt: skip
     covariance = scale**2 * root @ root.T + own**2 * np.outer(shift, shift)
-    found = data.whiten[0, 0, 0]
-    np.testing.assert_allclose(found @ covariance @ found.T, np.eye(2), atol=1e-6)
+    values = data.whiten[0, 0, 0]
+    np.testing.assert_allclose(values @ covariance @ values.T, np.eye(2), atol=1e-6)
 
 
 def test_what_was_found_is_what_counts_afterwards():
@@ -275,17 +286,17 @@ def test_what_was_found_is_what_counts_afterwards():
     scene = shaded(rng, 0.15, runs=1)
     measurements = scene.measurements(rng)
     estimate = bundle(scene.machine, measurements, scene.state())
-    assembled, info = as_ended(measurements, estimate)
-    found = minimise(assembled.problem, info.state).state
-    rows = assembled.places.edges.taken(assembled.problem.unweighted(found).edges[0])
+    assembled, info = linearize_at_solution(measurements, estimate)
+    solution = minimise(assembled.problem, info.state).state
+    rows = assembled.places.edges.taken(assembled.problem.unweighted(solution).edges[0])
     np.testing.assert_allclose(rows, estimate.edge_residuals, atol=0.02)
     alone = replace(measurements, shaded=False)
     edges = assemble(scene.machine, alone, default_gauge(scene.machine)).problem.data
     at = assembled.places.edges
     # that one edge's residual is in the deviations that it has by itself
     own = assembled.problem.data
-    crowd = at.taken(assembled.problem.blocks.crowd)
-    variance = at.taken(own.own[0]) ** 2 / crowd
+    n_effective = at.taken(assembled.problem.blocks.n_effective)
+    variance = at.taken(own.own[0]) ** 2 / n_effective
     np.testing.assert_allclose(
         variance, estimate.edge_noise.shading[measurements.edges.tube] ** 2, rtol=1e-9
     )

@@ -60,11 +60,11 @@ def test_every_error_belongs_to_the_family():
 
 
 def test_as_dict_is_json_and_complete():
-    told = json.loads(json.dumps(InputError(**FULL).as_dict()))
-    assert told["error"] == "InputError"
-    assert told["exit_code"] == 2
-    assert told["message"].startswith("joints.csv, line 4")
-    assert {name: told[name] for name in FULL} == FULL
+    values = json.loads(json.dumps(InputError(**FULL).as_dict()))
+    assert values["error"] == "InputError"
+    assert values["exit_code"] == 2
+    assert values["message"].startswith("joints.csv, line 4")
+    assert {name: values[name] for name in FULL} == FULL
 
 
 def test_errors_survive_the_way_back_from_a_worker_process():
@@ -86,7 +86,7 @@ def test_names_that_nothing_can_have_are_shortened():
     error = InputError("no", where=f"a/{'n' * 5000} line 2", found="n" * 5000)
     short = f"{'n' * 40}…{'n' * 20}"
     assert str(error) == f"a/{short} line 2: no; found {short}."
-    told = InputError("no", found="w " * 5000, next_step="m" * 5000)
-    assert len(str(told)) < 700
+    values = InputError("no", found="w " * 5000, next_step="m" * 5000)
+    assert len(str(values)) < 700
     path = "/" + "/".join(["folder" * 20] * 20)
     assert path in str(InputError("no", where=path))  # a long path is needed whole

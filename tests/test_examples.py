@@ -53,10 +53,10 @@ def test_a_calibration_is_held_beside_its_truth(demo):
     done = run_example("against_truth.py", demo.session, demo.calibration)
     assert done.returncode == 0, done.stderr
     rows = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
-    told = json.loads(demo.run.out)["comparison"]  # the demonstration's own figures
+    values = json.loads(demo.run.out)["comparison"]  # the demonstration's own figures
     for name in ("drawing", "calibrated"):
-        assert float(rows[name][1]) == pytest.approx(1e3 * told[name]["centre"], abs=6e-4)
-        assert float(rows[name][3]) == pytest.approx(1e3 * told[name]["position"], abs=6e-4)
+        assert float(rows[name][1]) == pytest.approx(1e3 * values[name]["centre"], abs=6e-4)
+        assert float(rows[name][3]) == pytest.approx(1e3 * values[name]["position"], abs=6e-4)
     assert float(rows["calibrated"][3]) < 0.25 * float(rows["drawing"][3])
     assert "without a pose" not in done.stdout
     done = run_example("against_truth.py", demo.calibration, demo.calibration)
@@ -111,9 +111,9 @@ def test_the_notebook_is_small_and_names_no_place_of_one_computer():
         for output in cell.get("outputs", []):
             assert output["output_type"] in ("execute_result", "display_data", "stream")
             assert output.get("name") != "stderr"
-            shown = {"text/plain": output.get("text", ""), **output.get("data", {})}
-            told = [text_of(text) for kind, text in shown.items() if kind != "image/png"]
-            assert not re.search(r"/(home|root|tmp|work|Users)/", " ".join(told))
+            display = {"text/plain": output.get("text", ""), **output.get("data", {})}
+            rows = [text_of(text) for kind, text in display.items() if kind != "image/png"]
+            assert not re.search(r"/(home|root|tmp|work|Users)/", " ".join(rows))
 
 
 @pytest.mark.slow
@@ -137,8 +137,8 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
         text_of(cell["outputs"][0]["text"]) for cell in BOOK["cells"]
         if "result.summary()" in text_of(cell["source"])
     )  # fmt: skip
-    shown = [line.partition(":")[0] for line in summary.splitlines()[:7]]
-    assert shown == [line.partition(":")[0] for line in
+    display = [line.partition(":")[0] for line in summary.splitlines()[:7]]
+    assert display == [line.partition(":")[0] for line in
                      namespace["result"].summary().splitlines()[:7]]  # fmt: skip
     from matplotlib import pyplot
 

@@ -11,7 +11,7 @@ import yaml
 
 from conftest import run
 from export_sources import CAMERA, built, calibration, source_of
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.machine_source import load_source
 from pkmcal.cameras.files import load_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
@@ -47,8 +47,8 @@ REFUSALS = {
 def test_every_format_of_the_folder_is_found():
     assert set(OURS) <= set(exporters())
     assert all(name == exporter.name for name, exporter in exporters().items())
-    told = run("export", "--help").out
-    assert all(name in told for name in exporters())
+    values = run("export", "--help").out
+    assert all(name in values for name in exporters())
 
 
 @pytest.mark.parametrize("name", OURS)
@@ -152,13 +152,13 @@ def test_every_base_carriers_chain_is_its_place(carrier):
     rng = np.random.default_rng(0)
     parameters, q = rng.normal(size=(20, len(carrier.parameters))), rng.normal(size=20)
     chain = carrier.chain(parameters)
-    moved = {
+    shifted = {
         "fixed": lambda: chain.arm,
         "slide": lambda: chain.arm + q[:, None] * chain.axis,
         "turn": lambda: swung(chain, q),
     }
-    found = chain.point + moved[chain.motion]()
-    np.testing.assert_allclose(found, carrier.place(parameters, q)[0], atol=1e-14)
+    values = chain.point + shifted[chain.motion]()
+    np.testing.assert_allclose(values, carrier.place(parameters, q)[0], atol=1e-14)
     assert carrier.driven == (chain.motion != "fixed")
 
 
@@ -170,8 +170,8 @@ def test_every_platform_carriers_chain_is_its_place(carrier):
     chain = carrier.chain(parameters)
     still = np.zeros((20, 3))
     own = {"fixed": chain.arm, "turn": swung(chain, phi), "float": still}[chain.motion]
-    found = apply(T, chain.point + own) + (chain.arm if chain.motion == "float" else still)
-    np.testing.assert_allclose(found, carrier.place(parameters, T, phi)[0], atol=1e-14)
+    values = apply(T, chain.point + own) + (chain.arm if chain.motion == "float" else still)
+    np.testing.assert_allclose(values, carrier.place(parameters, T, phi)[0], atol=1e-14)
 
 
 # What a calibration gives
@@ -183,9 +183,9 @@ def test_calibrated_values_are_exported(tmp_path):
     source = load_source(folder)
     np.testing.assert_array_equal(source.machine.values, machine.values)
     text = make_export(source, "yaml").files["mechanism.yaml"]
-    found = yaml.safe_load(text)["legs"][3]["base"]["center"]
+    value = yaml.safe_load(text)["legs"][3]["base"]["center"]
     k = machine.parameters.index("legs[4].base.center.x")
-    assert found == machine.values[k : k + 3].tolist()
+    assert value == machine.values[k : k + 3].tolist()
     sigma = source.sigma_of("legs[4].base.center.x")
     assert f"{sigma:.3g}" in text
     assert "Calibrated: well." in text
@@ -303,11 +303,11 @@ def test_ros_gets_cameras_and_where_they_stand(tmp_path):
         "camera_info_front.yaml",
         "camera_info_left_side.yaml",
     }
-    found = ros.transforms(made.files["static_transforms.launch.yaml"])
-    np.testing.assert_allclose(found["front"], source.T_base_camera["front"], atol=1e-14)
+    values = ros.transforms(made.files["static_transforms.launch.yaml"])
+    np.testing.assert_allclose(values["front"], source.T_base_camera["front"], atol=1e-14)
     # its z axis, forward, points from the camera to the base's origin
-    forward = -found["left_side"][:3, 3] / np.linalg.norm(found["left_side"][:3, 3])
-    np.testing.assert_allclose(found["left_side"][:3, 2], forward, atol=1e-12)
+    forward = -values["left_side"][:3, 3] / np.linalg.norm(values["left_side"][:3, 3])
+    np.testing.assert_allclose(values["left_side"][:3, 2], forward, atol=1e-12)
     path = tmp_path / "camera.yaml"
     path.write_text(made.files["camera_info_front.yaml"])
     np.testing.assert_array_equal(load_camera(path).parameters, CAMERA.parameters)

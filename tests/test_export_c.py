@@ -14,7 +14,7 @@ import pytest
 
 from conftest import run
 from export_sources import built, calibration, source_of
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_SOURCE_FOLDER, MACHINE_NUMBERS_END, CSource
 from pkmcal.export.contract import make_export
@@ -97,12 +97,12 @@ def library(tmp_path_factory):
     """A catalogue machine's library, off its drawing, compiled once."""
     if COMPILER is None:
         pytest.skip("NO C COMPILER (gcc or cc): the exported C source is not tested")
-    known = {}
+    reference_values = {}
 
     def of(name):
-        if name not in known:
-            known[name] = compiled(built(name), tmp_path_factory.mktemp(name))
-        return known[name]
+        if name not in reference_values:
+            reference_values[name] = compiled(built(name), tmp_path_factory.mktemp(name))
+        return reference_values[name]
 
     return of
 
@@ -122,9 +122,9 @@ def test_c_is_our_own_kinematics(name, library):
     near = perturb(poses, 0.01 * rng.normal(size=(len(poses), 6)) @ motion @ motion.T)
     elsewhere = 0
     for T, q, start in zip(poses, joints, near, strict=True):
-        status, found = inverse(c, T)
+        status, value = inverse(c, T)
         assert status == OK
-        np.testing.assert_allclose(found, c.machine.inverse(T[None])[0], atol=1e-12, rtol=0)
+        np.testing.assert_allclose(value, c.machine.inverse(T[None])[0], atol=1e-12, rtol=0)
         for begin in (start, home):
             status, pose, report = forward(c, q, begin)
             assert status == OK
@@ -144,8 +144,8 @@ def test_c_jacobian_is_ours(name, library):
     for T in samples(c.machine, 5)[0]:
         out = numbers(c, np.zeros(6 * c.machine.n_joints))
         assert c.compiled.pkmcal_inverse_jacobian(ctypes.byref(pose_of(c, T)), out) == OK
-        found = np.reshape(out, (-1, 6))
-        np.testing.assert_allclose(found, c.machine.inverse_jacobian(T[None])[0], atol=1e-11)
+        values = np.reshape(out, (-1, 6))
+        np.testing.assert_allclose(values, c.machine.inverse_jacobian(T[None])[0], atol=1e-11)
 
 
 @needs_compiler
@@ -166,9 +166,9 @@ def test_a_build_in_floats_is_right_to_the_last_digits_of_floats(name, tmp_path,
     assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
     poses, joints = samples(c.machine, 40, seed=5)
     for T, q in zip(poses, joints, strict=True):
-        status, found = inverse(c, T)
+        status, value = inverse(c, T)
         assert status == OK
-        assert np.abs(found - q).max() < 100 * EPSILON["float"]
+        assert np.abs(value - q).max() < 100 * EPSILON["float"]
         for start in (T, c.machine.home()):
             status, pose, report = forward(c, q, start)
             assert status == OK
@@ -319,7 +319,7 @@ def test_an_old_self_test_is_not_taken_for_the_new_ones(tmp_path, monkeypatch):
         calibration(tmp_path / place, built("gough-stewart", seed=seed))
         for seed, place in ((1, "monday"), (2, "friday"))
     )
-    told = {}
+    entries = {}
     for folder, words in ((first, ()), (second, ("--json",))):
         made = run("export", folder, "--to", "c", "-o", "for my robot", *words)
         assert made.code == 0, made.err
@@ -330,10 +330,10 @@ def test_an_old_self_test_is_not_taken_for_the_new_ones(tmp_path, monkeypatch):
         for _ in range(2):
             done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
-        told[folder] = done.stdout.splitlines()[-1]
-        assert told[folder].endswith(f"of gough-stewart ({load_source(folder).identity})")
+        entries[folder] = done.stdout.splitlines()[-1]
+        assert entries[folder].endswith(f"of gough-stewart ({load_source(folder).identity})")
     # both have one name, and one session's
-    assert told[first] != told[second]
+    assert entries[first] != entries[second]
     stranger = tmp_path / "for my robot" / "a.out"
     stranger.write_text("mine")
     assert run("export", first, "--to", "c", "-o", "for my robot").code == 2
@@ -420,9 +420,9 @@ def test_the_limit_of_steps_and_a_name_that_cannot_leave_its_comment(tmp_path):
     assert statuses == {NOT_CONVERGED}
     text = c.compiled.pkmcal_status_text
     text.restype = ctypes.c_char_p
-    told = [text(k) for k in range(6)]
-    assert told[0] == b"ok"
-    assert len(set(told)) == 6
+    rows = [text(k) for k in range(6)]
+    assert rows[0] == b"ok"
+    assert len(set(rows)) == 6
 
 
 def test_as_many_equations_as_unknowns(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from export_sources import built, calibration, source_of
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export import klipper, linuxcnc, reprap
 from pkmcal.export.contract import exporters, make_export
@@ -84,10 +84,10 @@ def test_an_ideal_linear_delta_is_recovered():
     )
     np.testing.assert_allclose(fit.rod, [270, 271.2, 269.5], atol=1e-3)
     text = make_export(source_of(machine), "klipper").files["pkmcal_printer.cfg"]
-    found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
-    found.read_string(text)
-    assert found.getfloat("stepper_b", "arm_length") == pytest.approx(271.2, abs=1e-3)
-    assert found.getfloat("printer", "delta_radius") == pytest.approx(110, abs=1e-3)
+    config = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+    config.read_string(text)
+    assert config.getfloat("stepper_b", "arm_length") == pytest.approx(271.2, abs=1e-3)
+    assert config.getfloat("printer", "delta_radius") == pytest.approx(110, abs=1e-3)
 
 
 def test_an_ideal_rotary_delta_is_recovered():
@@ -145,9 +145,9 @@ def with_radius(machine, radius):
 
 
 def klipper_config(text):
-    found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
-    found.read_string(text)
-    return found
+    config = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+    config.read_string(text)
+    return config
 
 
 def test_the_print_radius_is_the_printers_own(tmp_path):
@@ -265,9 +265,11 @@ def test_reprap_carriages_at_home():
     middle = reprap.reprap_carriage_heights(words, np.array([[0.0, 0.0, 300.0]]))[0]
     np.testing.assert_allclose(middle, homed - [1, -1, 0.5])
     # towards the X tower, at the front left, its carriage rises
-    left = reprap.reprap_carriage_heights(words, np.array([[-10.0, -10 / np.sqrt(3), 300.0]]))[0]
-    assert left[0] > middle[0]
-    assert left[1] < middle[1]
+    remainder = reprap.reprap_carriage_heights(words, np.array([[-10.0, -10 / np.sqrt(3), 300.0]]))[
+        0
+    ]
+    assert remainder[0] > middle[0]
+    assert remainder[1] < middle[1]
 
 
 def test_arms_of_all_programs_in_the_middle():
@@ -276,9 +278,9 @@ def test_arms_of_all_programs_in_the_middle():
     text = "M669 K10 U100:100:100 L200:200:200 H300:300:300 R40 A-60:30 B80 X0 Y0 Z0"
     words = reprap.read_words(text)
     point = np.array([[0.0, 0.0, 300 - below], [0.0, 0.0, 320 - below]])
-    found = reprap.reprap_arm_angles(words, point)
-    np.testing.assert_allclose(found[0], 0, atol=1e-12)
-    assert (found[1] > 1).all()  # upwards counts up
+    values = reprap.reprap_arm_angles(words, point)
+    np.testing.assert_allclose(values[0], 0, atol=1e-12)
+    assert (values[1] > 1).all()  # upwards counts up
     config = ConfigParser(delimiters=(":",))
     stepper = "upper_arm_length: 100\nlower_arm_length: 200\nposition_endstop: 1\n"
     config.read_string(
@@ -288,14 +290,14 @@ def test_arms_of_all_programs_in_the_middle():
             for n, a in zip("abc", (210, 330, 90), strict=True)
         )
     )
-    np.testing.assert_allclose(klipper.klipper_arm_angles(config, point), found, atol=1e-9)
+    np.testing.assert_allclose(klipper.klipper_arm_angles(config, point), values, atol=1e-9)
     side = np.array([[20.0, -10.0, 150.0]])
     np.testing.assert_allclose(
         klipper.klipper_arm_angles(config, side), reprap.reprap_arm_angles(words, side), atol=1e-9
     )
     pins = {"platformradius": 50.0, "footradius": 10.0, "thighlength": 100.0, "shinlength": 200.0}
     mid = rotary_joints(pins, point - [0, 0, 300])
-    np.testing.assert_allclose(mid, -found, atol=1e-9)
+    np.testing.assert_allclose(mid, -values, atol=1e-9)
     # joint 0 at -90 degrees, 1 at 30: the arm that the tool goes to goes up, its angle falls
     for k, angle in enumerate((-90, 30, 150)):
         p = np.array(
@@ -313,8 +315,8 @@ def test_lineardeltakins_joint_0_is_the_tower_behind():
 def test_genhexkins_angles_are_roll_pitch_yaw():
     machine = built("gough-stewart")
     poses = samples(machine, 8)[0]
-    found = linuxcnc.world(poses)
-    for T, (a, b, c) in zip(poses, found[:, 3:] / DEGREES_A_RADIAN, strict=True):
+    value = linuxcnc.world(poses)
+    for T, (a, b, c) in zip(poses, value[:, 3:] / DEGREES_A_RADIAN, strict=True):
         rot = rotation(np.array([0, 0, c])) @ rotation(np.array([0, b, 0]))
         np.testing.assert_allclose(rot @ rotation(np.array([a, 0, 0])), T[:3, :3], atol=1e-12)
     made = make_export(source_of(machine), "linuxcnc")

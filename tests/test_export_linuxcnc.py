@@ -165,8 +165,8 @@ def middle_poses(machine, count, seed=0):
     rng = np.random.default_rng(seed)
     low, high = machine.joint_ranges.T
     share = rng.uniform(0.35, 0.65, (4 * count, machine.n_joints))
-    found = machine.forward_result(low + share * (high - low))
-    poses = found.T_base_platform[found.converged][:count]
+    fk = machine.forward_result(low + share * (high - low))
+    poses = fk.T_base_platform[fk.converged][:count]
     return poses, machine.inverse(poses)
 
 
@@ -391,17 +391,17 @@ def test_a_module_is_the_machine_in_linuxcncs_units(machine, letters, tmp_path):
     expected = joints_of(ini, readings)
     last = World()  # of all zeros, as LinuxCNC has it before
     for row, wanted in zip(coordinates, expected, strict=True):
-        asked = [x if c in letters else 0.0 for c, x in zip("XYZABC", row, strict=True)]
-        at = World((ctypes.c_double * 9)(*asked))
+        queries = [x if c in letters else 0.0 for c, x in zip("XYZABC", row, strict=True)]
+        at = World((ctypes.c_double * 9)(*queries))
         assert module.kinematicsInverse(ctypes.byref(at), joints, None, None) == 0
         np.testing.assert_allclose(joints[: machine.n_joints], wanted, atol=1e-9)
         # from next to it, as from one cycle to the next, with an angle of a whole turn more
-        near = [x + 0.5 * (c in letters) for c, x in zip("XYZABC", asked, strict=True)]
+        near = [x + 0.5 * (c in letters) for c, x in zip("XYZABC", queries, strict=True)]
         near[5] += 360.0 * ("C" in letters)
         back = World((ctypes.c_double * 9)(*near))
         assert module.kinematicsForward(joints, ctypes.byref(back), None, None) == 0
-        asked[5] += 360.0 * ("C" in letters)
-        np.testing.assert_allclose(list(back.values), [*asked, 0, 0, 0], atol=1e-7)
+        queries[5] += 360.0 * ("C" in letters)
+        np.testing.assert_allclose(list(back.values), [*queries, 0, 0, 0], atol=1e-7)
     assert module.kinematicsForward(joints, ctypes.byref(last), None, None) == 0
     far = World((ctypes.c_double * 9)(5e3, 5e3, 5e3, 0, 0, 0))
     assert module.kinematicsInverse(ctypes.byref(far), joints, None, None) == (

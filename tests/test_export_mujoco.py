@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machine_of, made
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
 from pkmcal.export.home import home_state
@@ -29,8 +29,8 @@ PLACE, TURN = 1e-12, 1e-11
 
 def exported(machine, **of):
     source = MachineSource(machine, origin="a test", **of)
-    found = exporters()["mujoco"].files(source)
-    ((name, text),) = found.items()
+    value = exporters()["mujoco"].files(source)
+    ((name, text),) = value.items()
     assert name.endswith(".xml")
     return source, text
 
@@ -45,7 +45,7 @@ def reachable(machine, readings, pieces=12):
     """
     begin = home_state(machine).readings
     share = np.linspace(0, 1, pieces + 1)[:, None]
-    layout, kept = machine.layout, []
+    layout, retained = machine.layout, []
     for goal in readings:
         at, good = machine.home(), True
         for q in begin + share * (goal - begin):
@@ -53,8 +53,8 @@ def reachable(machine, readings, pieces=12):
             at, good = step.T_base_platform, good and bool(step.converged)
             good = good and float(step.singularity) > 0.03
         if good:
-            kept.append((goal, at))
-    return kept
+            retained.append((goal, at))
+    return retained
 
 
 # ------------------------------------------------------------------ in MuJoCo
@@ -157,9 +157,9 @@ def test_drives_and_sensors_are_the_readings():
 @pytest.mark.parametrize("name", ALL)
 def test_the_text_read_again_agrees(name):
     source, text = exported(machine_of(name))
-    found = differences(source, text)
-    assert len(found) == 8
-    assert not [d for d in found if d.beyond]
+    count = differences(source, text)
+    assert len(count) == 8
+    assert not [d for d in count if d.beyond]
 
 
 WRONG = {
@@ -192,8 +192,8 @@ def test_a_wrong_number_in_the_text_is_found(what):
 def test_joints_that_move_another_way_are_found(name, old, new):
     source, text = exported(machine_of(name))
     assert old in text
-    found = differences(source, text.replace(old, new, 1))
-    assert any("platform's" in d.what for d in found if d.beyond)
+    value = differences(source, text.replace(old, new, 1))
+    assert any("platform's" in d.what for d in value if d.beyond)
 
 
 @pytest.mark.parametrize("name", ["3-upu", "h4", "h4-rods", "3-spr", "rpr-and-spu"])
@@ -202,9 +202,9 @@ def test_what_is_read_again_closes_from_beside(name):
     rng = np.random.default_rng(0)
     away = model.key + 0.1 * rng.normal(size=(3, model.key.size))
     assert np.abs(model.gaps(away)).max(axis=1).min() > 1e-3
-    found = model.closed(away, np.zeros(model.key.size, dtype=bool))
-    assert np.abs(model.gaps(found)).max() < 1e-13
-    assert np.abs(found - away).max() > 1e-3
+    valid = model.closed(away, np.zeros(model.key.size, dtype=bool))
+    assert np.abs(model.gaps(valid)).max() < 1e-13
+    assert np.abs(valid - away).max() > 1e-3
 
 
 # ------------------------------------------------------------------ words and refusals
@@ -216,8 +216,8 @@ def test_the_header_says_what_it_is():
     assert "Drawing only" in text
     assert "a test" in text
     sigma = np.full(len(drawing.parameters), 1.5e-5)
-    _, told = exported(drawing, sigma=sigma, calibrated=True, headline="Better than the drawing.")
-    header = told.partition("<mujoco")[0]
+    _, values = exported(drawing, sigma=sigma, calibrated=True, headline="Better than the drawing.")
+    header = values.partition("<mujoco")[0]
     for word in ("Better than the drawing.", "sigma 1.5e-05 m", "T_base_platform",
                  "PLACEHOLDERS", "legs[3].length.constant = 0.22 m"):  # fmt: skip
         assert word in header
@@ -281,6 +281,6 @@ def test_a_machine_that_does_not_close_is_refused():
 @pytest.mark.parametrize(("carrier", "side"), [(Crank, "base"), (RigidPlatform, "platform")])
 def test_joints_that_are_not_elementary_are_refused(carrier, side, monkeypatch):
     monkeypatch.setattr(carrier, "chain", lambda parameters: None)
-    told = f"leg 1 of mechanism 'delta' is carried on its {side} side by no joint that an export"
-    with pytest.raises(InputError, match=told):
+    values = f"leg 1 of mechanism 'delta' is carried on its {side} side by no joint that an export"
+    with pytest.raises(InputError, match=values):
         exported(machine_of("delta"))

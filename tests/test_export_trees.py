@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from export_sources import built, calibration
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, machine_of, made
-from pkmcal.calibration.source import MachineSource, load_source
+from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.export import sdf_read, urdf_read
 from pkmcal.export.contract import exporters
 from pkmcal.export.home import home_state
@@ -49,8 +49,8 @@ def solved(model, machine):
 def in_mujoco(text):
     """A URDF in MuJoCo, which wants masses and so is told to take some."""
     mujoco = pytest.importorskip("mujoco", reason=LOUD)
-    kept = '<compiler fusestatic="false" boundmass="0.001" boundinertia="0.001" />'
-    text = re.sub(r"(<robot [^>]*>)", rf"\1<mujoco>{kept}</mujoco>", text, count=1)
+    retained = '<compiler fusestatic="false" boundmass="0.001" boundinertia="0.001" />'
+    text = re.sub(r"(<robot [^>]*>)", rf"\1<mujoco>{retained}</mujoco>", text, count=1)
     model = mujoco.MjModel.from_xml_string(text)
     return mujoco, model, mujoco.MjData(model)
 
@@ -72,10 +72,10 @@ def assert_closed_in_mujoco(files, model, machine):
     states, poses = solved(model, machine)
     assert len(poses) >= 2
     for x, T in zip(states, poses, strict=True):
-        found = closed_in_mujoco(text, model, x)
-        assert np.abs(found["platform"] - T).max() < CLOSED
+        values = closed_in_mujoco(text, model, x)
+        assert np.abs(values["platform"] - T).max() < CLOSED
         for loop in yaml.safe_load(loops)["loops"]:
-            first, second = (found[name] for name in loop["frames"])
+            first, second = (values[name] for name in loop["frames"])
             off = first - second if loop["coincide"] == "pose" else (first - second)[:3, 3]
             assert np.abs(off).max() < CLOSED
 
@@ -151,19 +151,19 @@ class Drawn:
     def at(self, name):
         """Where something is drawn (4, 4)."""
         node = self.links[name] if name in self.links else self.frames[name]
-        told = node.find("pose")
-        if told is None:
+        values = node.find("pose")
+        if values is None:
             return np.eye(4)
-        above = told.get("relative_to") or node.get("attached_to")
-        v = np.array(told.text.split(), dtype=float)
+        above = values.get("relative_to") or node.get("attached_to")
+        v = np.array(values.text.split(), dtype=float)
         own = pose(from_roll_pitch_yaw(v[3:]), v[:3])
         return own if above is None else self.at(above) @ own
 
     def screws(self, name):
         """(4, 4) generators of a joint's axes, in the model's frame as drawn."""
         node = self.joints[name]
-        told = node.find("pose")
-        frame = node.findtext("child") if told is None else told.get("relative_to")
+        values = node.find("pose")
+        frame = node.findtext("child") if values is None else values.get("relative_to")
         T = self.at(frame)
         for tag in ("axis", "axis2"):
             xyz = node.find(f"{tag}/xyz")
@@ -207,13 +207,13 @@ def test_an_sdf_closes_by_screws(name):
             for j in body.joints:
                 if j.kind != "free":
                     values.setdefault(j.name, []).append(x[j.dof] - j.ref)
-        found = {link: drawn.moved(link, values, T) for link in drawn.links}
-        assert np.abs(found["platform"] @ drawn.at("platform") - T).max() < CLOSED
+        results = {link: drawn.moved(link, values, T) for link in drawn.links}
+        assert np.abs(results["platform"] @ drawn.at("platform") - T).max() < CLOSED
         loops = [n for n in drawn.joints if n.endswith("_loop")]
         assert len(loops) == source.machine.n_legs
         for loop in loops:
             node = drawn.joints[loop]
-            parent, child = (found[node.findtext(end)] for end in ("parent", "child"))
+            parent, child = (results[node.findtext(end)] for end in ("parent", "child"))
             anchor = drawn.at(node.find("pose").get("relative_to"))[:, 3]
             assert np.abs(parent @ anchor - child @ anchor).max() < CLOSED
             own = parent
@@ -223,8 +223,8 @@ def test_an_sdf_closes_by_screws(name):
                 assert np.abs(own - child).max() < CLOSED
     # readings as the text tells them are those of these poses
     readings = source.machine.inverse(poses)
-    for k, told in enumerate(drawn.readings):
-        home, scale = float(told["home"]), float(told["scale"])
+    for k, items in enumerate(drawn.readings):
+        home, scale = float(items["home"]), float(items["scale"])
         dof = model.actuated[k]
         assert np.abs(states[:, dof] - scale * readings[:, k]).max() < CLOSED
         assert abs(model.key[dof] - scale * home) < 1e-15
@@ -234,7 +234,7 @@ def test_an_sdf_declares_the_lowest_version_that_has_what_it_uses():
     """By SDFormat's list of changes; readers refuse models of later versions than they know."""
     first = {"relative_to": "1.7", "attached_to": "1.7", "expressed_in": "1.7", "mimic": "1.11"}
     later = {"rotation_format", "degrees", "merge", "placement_frame"}  # of 1.8 and later
-    found = set()
+    actual_names = set()
     for name in ("gough-stewart", "3-rps", "h4-rods", "h4", "linear-delta"):
         (text,) = exported(name, "sdf")[1].values()
         root = fromstring(text)
@@ -244,8 +244,8 @@ def test_an_sdf_declares_the_lowest_version_that_has_what_it_uses():
         assert not words & later
         expected = max((first[word] for word in words & set(first)), key=lambda v: int(v[2:]))
         assert root.get("version") == expected
-        found.add(expected)
-    assert found == {"1.7", "1.11"}
+        actual_names.add(expected)
+    assert actual_names == {"1.7", "1.11"}
 
 
 def test_an_sdf_names_everything_once():
@@ -267,8 +267,8 @@ def test_an_sdfs_motors_are_those_that_have_an_effort():
     limit = next(j for j in model.findall("joint") if j.get("name") == "leg1").find("axis/limit")
     machine = machine_of("6-spu-passive")
     reach = machine.joint_ranges[0] - home_state(machine).readings[0]
-    found = [float(limit.findtext(end)) for end in ("lower", "upper")]
-    np.testing.assert_allclose(found, reach, atol=1e-15)
+    results = [float(limit.findtext(end)) for end in ("lower", "upper")]
+    np.testing.assert_allclose(results, reach, atol=1e-15)
 
 
 # ------------------------------------------------------------------ both, read again
@@ -278,9 +278,9 @@ def test_an_sdfs_motors_are_those_that_have_an_effort():
 @pytest.mark.parametrize("name", ALL)
 def test_the_text_read_again_agrees(name, to):
     source, files, _ = exported(name, to)
-    found = exporters()[to].check(files, source)
-    assert len(found) == 8
-    assert not [d for d in found if d.beyond]
+    count = exporters()[to].check(files, source)
+    assert len(count) == 8
+    assert not [d for d in count if d.beyond]
 
 
 WRONG = {
@@ -311,8 +311,8 @@ def test_a_wrong_number_is_found(to, what):
     for name, text in files.items():
         spoilt[name] = re.sub(WRONG[to][what], r"\g<1>0.123", text, count=1, flags=re.DOTALL)
     assert spoilt != files
-    found = exporters()[to].check(spoilt, source)
-    assert any(what in d.what for d in found if d.beyond)
+    value = exporters()[to].check(spoilt, source)
+    assert any(what in d.what for d in value if d.beyond)
 
 
 @pytest.mark.parametrize(
@@ -340,9 +340,9 @@ def test_what_is_not_known_is_said(to):
     assert "Drawing only, not calibrated." in flat
     assert "NOT KNOWN: masses and inertias" in flat
     assert "<inertial" not in text
-    told = " ".join(note.text for note in exporters()[to].notes(source))
-    assert "photographs weigh nothing" in told
-    assert {"urdf": "A URDF is a tree", "sdf": "may leave them open"}[to] in told
+    values = " ".join(note.text for note in exporters()[to].notes(source))
+    assert "photographs weigh nothing" in values
+    assert {"urdf": "A URDF is a tree", "sdf": "may leave them open"}[to] in values
 
 
 @pytest.mark.parametrize("to", READERS)

@@ -16,10 +16,10 @@ from pkmcal.files import (
     closest,
     field_path,
     parse_yaml,
+    quoted,
     read_csv,
     read_json,
     read_yaml,
-    shown,
     validated_document,
     yaml_text,
 )
@@ -332,8 +332,8 @@ def test_words_for_messages():
     assert listed(["a"]) == "a"
     assert listed(["a", "b", "c"]) == "a, b and c"
     assert listed([str(n) for n in range(20)]) == "0, 1, 2, 3, 4 and 15 more"
-    assert shown(None) == "nothing"
-    assert len(shown("x" * 500)) == 60
+    assert quoted(None) == "nothing"
+    assert len(quoted("x" * 500)) == 60
 
 
 @pytest.mark.parametrize("text", ["1e300", "-2e15", "9" * 300])

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import pkmcal
-from pkmcal.calibration.departures import KINDS
+from pkmcal.calibration.model_violations import KINDS
 from pkmcal.errors import InputError, ResultError
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import (
@@ -33,18 +33,18 @@ FIELDS = {
     for code, entry in ENTRIES.items()
 }
 MAKERS = {"finding", "wrong", "doubtful", "note"}
-DEPARTURE_FACTS = ("calibration/departures.py", "cameras/contract.py", "session/readings.py")
+DEPARTURE_FACTS = ("calibration/model_violations.py", "cameras/contract.py", "session/readings.py")
 
 
 def keys(tree: ast.AST) -> set[str]:
     """Names of facts that code may give: keys of dictionaries, and of assignments to them."""
-    found = {k.value for n in ast.walk(tree) if isinstance(n, ast.Dict) for k in n.keys
+    results = {k.value for n in ast.walk(tree) if isinstance(n, ast.Dict) for k in n.keys
              if isinstance(k, ast.Constant)}  # fmt: skip
-    found |= {n.slice.value for n in ast.walk(tree)
+    results |= {n.slice.value for n in ast.walk(tree)
               if isinstance(n, ast.Subscript) and isinstance(n.slice, ast.Constant)}  # fmt: skip
-    found |= {k.arg for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords
+    results |= {k.arg for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords
               if k.arg}  # fmt: skip
-    return {key for key in found if isinstance(key, str)}
+    return {key for key in results if isinstance(key, str)}
 
 
 def codes_of(code: ast.expr, facts: set[str]) -> set[str]:
@@ -69,7 +69,7 @@ def calls() -> list[tuple[str, set[str], set[str]]]:
         p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|Departure", text)
     }
     del trees[SOURCE / "outcome" / "finding.py"]
-    departed = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))
+    detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))
     out: list[tuple[str, set[str], set[str]]] = []
     for path, tree in trees.items():
         nodes = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
@@ -79,7 +79,7 @@ def calls() -> list[tuple[str, set[str], set[str]]]:
             facts = {k.arg for k in node.keywords if k.arg} | {"subject"}
             others = any(k.arg is None for k in node.keywords)
             if others or getattr(node.func, "id", "") == "Departure":
-                facts |= inside | departed
+                facts |= inside | detections
             where = f"{path.relative_to(SOURCE)}:{node.lineno}"
             out.append((where, codes_of(node.args[0], facts), facts))
     return out
@@ -107,7 +107,7 @@ def test_entries_hold_a_text_and_perhaps_a_next_step():
 
 
 FAILURES = {"PkmcalError", "ResultError", "GeometryError", "NO_ESTIMATE"}
-STARTS = {"better_start", "_tracker_starts"}
+STARTS = {"initial_guess", "_tracker_starts"}
 """Choose where a search starts; without another start nothing is missing from its result."""
 
 
@@ -178,10 +178,10 @@ def test_a_verdict_has_findings_by_level_and_their_document():
 
 def test_an_error_is_a_finding_under_its_code():
     error = InputError("is turned", where="joints.csv", code="readings.sign")
-    found = of_error(error, station="front")
-    assert (found.code, found.level, found.station) == ("readings.sign", Level.WRONG, "front")
-    assert found.text == str(error)
-    assert found.document()["where"] == "joints.csv"
+    value = of_error(error, station="front")
+    assert (value.code, value.level, value.station) == ("readings.sign", Level.WRONG, "front")
+    assert value.text == str(error)
+    assert value.document()["where"] == "joints.csv"
     assert of_error(ResultError("none"), Level.DOUBTFUL).code == "error.result"
     assert error.located("folder").code == error.code
 

@@ -37,10 +37,10 @@ def test_a_path_is_followed(name):
         readings = machine.inverse(poses)
     assert closes(machine, readings)
     follow = machine.follower()
-    found = np.array([follow(row) for row in readings])
-    np.testing.assert_array_equal(follow.T_base_platform, found[-1])
-    wanted = machine.forward(readings, found)
-    np.testing.assert_allclose(found, wanted, atol=1e-10)
+    values = np.array([follow(row) for row in readings])
+    np.testing.assert_array_equal(follow.T_base_platform, values[-1])
+    wanted = machine.forward(readings, values)
+    np.testing.assert_allclose(values, wanted, atol=1e-10)
 
 
 def test_one_of_other_values_and_another_start():
@@ -59,10 +59,10 @@ def test_rounding_does_not_add_up():
     readings = path(machine, 120)
     follow = machine.follower()
     for k in range(2 * POSES_BETWEEN_SQUARINGS):
-        found = follow(readings[k % 120])
-    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-14)
+        values = follow(readings[k % 120])
+    np.testing.assert_allclose(values[:3, :3] @ values[:3, :3].T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(
-        machine.inverse(found), readings[k % 120], atol=CONVERGED_CLOSURE_ERROR
+        machine.inverse(values), readings[k % 120], atol=CONVERGED_CLOSURE_ERROR
     )
 
 

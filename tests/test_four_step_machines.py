@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.turns import better_start
+from pkmcal.calibration.refinement import initial_guess
 from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
@@ -81,10 +81,10 @@ def readings_of(machine: Machine, rng, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Readings (n, m) in the ranges at which the machine closes, and its poses there."""
     low, high = machine.joint_ranges.T
     q = rng.uniform(low, high, (6 * n, len(low)))
-    found = machine.forward_result(q)
-    good = np.flatnonzero(found.converged & (found.singularity > 0.1))[:n]
+    fk = machine.forward_result(q)
+    good = np.flatnonzero(fk.converged & (fk.singularity > 0.1))[:n]
     assert len(good) == n
-    return q[good], found.T_base_platform[good]
+    return q[good], fk.T_base_platform[good]
 
 
 def make_scene(
@@ -164,18 +164,18 @@ def with_boards(scene: Scene, T_body_board, bodies, sees) -> Measurements:
     return replace(scene.measurements, poses=poses, mounts=mounts)
 
 
-def assert_same(found: State, truth: State, atol=1e-8):
-    np.testing.assert_allclose(found.theta, truth.theta, atol=atol)
-    np.testing.assert_allclose(found.T_camera_base, truth.T_camera_base, atol=atol)
-    np.testing.assert_allclose(found.T_base_platform, truth.T_base_platform, atol=atol)
+def assert_same(value: State, truth: State, atol=1e-8):
+    np.testing.assert_allclose(value.theta, truth.theta, atol=atol)
+    np.testing.assert_allclose(value.T_camera_base, truth.T_camera_base, atol=atol)
+    np.testing.assert_allclose(value.T_base_platform, truth.T_base_platform, atol=atol)
 
 
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("name", [m for m in MACHINES if m != "3-upu"])
 def test_the_chain_is_exact_without_noise(name, shared):
     scene = make_scene(name, np.random.default_rng(1), 24, shared=shared)
-    found = four_step(scene.drawing, scene.measurements)
-    assert_same(found, scene.truth)
+    value = four_step(scene.drawing, scene.measurements)
+    assert_same(value, scene.truth)
     # and the errors that it found are those of the tolerances, not nothing
     assert np.abs(scene.truth.theta - scene.drawing.values).max() > 1e-3
 
@@ -183,11 +183,11 @@ def test_the_chain_is_exact_without_noise(name, shared):
 def test_three_upu():
     """Centres, offsets and the difference of each leg's axes; their common turn stays drawn."""
     scene = make_scene("3-upu", np.random.default_rng(2), 24)
-    found = four_step(scene.drawing, scene.measurements)
-    layout, theta, truth = scene.drawing.layout, found.theta, scene.truth.theta
+    value = four_step(scene.drawing, scene.measurements)
+    layout, theta, truth = scene.drawing.layout, value.theta, scene.truth.theta
     plain = np.array([kind != "axis" for kind in scene.drawing.parameters.kinds])
     np.testing.assert_allclose(theta[plain], truth[plain], atol=1e-8)
-    np.testing.assert_allclose(found.T_camera_base, scene.truth.T_camera_base, atol=1e-8)
+    np.testing.assert_allclose(value.T_camera_base, scene.truth.T_camera_base, atol=1e-8)
     # the platform of this machine does not turn: its frame stands at one angle to the base's
     rot = scene.truth.T_base_platform[:, :3, :3]
     np.testing.assert_allclose(rot, np.broadcast_to(rot[0], rot.shape), atol=1e-12)
@@ -200,7 +200,7 @@ def test_three_upu():
     np.testing.assert_allclose(v - w, true_v - true_w, atol=1e-8)
     for drawn, wrong in ((v, true_v), (w, true_w)):
         assert np.abs(drawn - wrong).max() > 2e-3
-    np.testing.assert_allclose(found.T_base_platform, scene.truth.T_base_platform, atol=1e-8)
+    np.testing.assert_allclose(value.T_base_platform, scene.truth.T_base_platform, atol=1e-8)
 
 
 def test_three_upu_whose_platform_turns():
@@ -213,12 +213,12 @@ def test_three_upu_whose_platform_turns():
 def test_the_printed_form_runs_on_every_machine(name):
     """Noise-free, its lengths are right; what lies across coplanar joints need not be."""
     scene = make_scene(name, np.random.default_rng(3), 24, parallel=True)
-    found = four_step(scene.drawing, scene.measurements, form="printed")
+    value = four_step(scene.drawing, scene.measurements, form="printed")
     rod = scene.drawing.layout.rod
     rod = rod[rod >= 0]
-    np.testing.assert_allclose(found.theta[rod], scene.truth.theta[rod], atol=1e-7)
+    np.testing.assert_allclose(value.theta[rod], scene.truth.theta[rod], atol=1e-7)
     flat = centre_index(scene.drawing.layout)[0][:, :2]
-    np.testing.assert_allclose(found.theta[flat], scene.truth.theta[flat], atol=2e-3)
+    np.testing.assert_allclose(value.theta[flat], scene.truth.theta[flat], atol=2e-3)
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -228,9 +228,9 @@ def test_a_start_from_anywhere(name):
     turn = perturb(np.eye(4), np.array([0.4, -0.8, 1.1, 0, 0, 0]))[:3, :3]
     edges = scene.measurements.edges
     turned = replace(edges, normal=edges.normal @ turn.T, basis=turn @ edges.basis)
-    found = four_step(scene.drawing, replace(scene.measurements, edges=turned))
+    values = four_step(scene.drawing, replace(scene.measurements, edges=turned))
     np.testing.assert_allclose(
-        found.T_camera_base[:, :3, :3], turn @ scene.truth.T_camera_base[:, :3, :3], atol=1e-7
+        values.T_camera_base[:, :3, :3], turn @ scene.truth.T_camera_base[:, :3, :3], atol=1e-7
     )
 
 
@@ -347,10 +347,10 @@ def test_a_board_on_the_base_joins_stations_that_share_no_legs():
         without = replace(scene.measurements, edges=edges)
         with pytest.raises(ResultError, match="too few legs"):
             four_step(scene.drawing, without)
-        found = four_step(scene.drawing, replace(measurements, edges=edges))
-        assert_same(found, scene.truth)
-        np.testing.assert_allclose(found.T_mount, boards, atol=1e-7)
-        np.testing.assert_array_equal(found.on_platform, [False, True])
+        value = four_step(scene.drawing, replace(measurements, edges=edges))
+        assert_same(value, scene.truth)
+        np.testing.assert_allclose(value.T_mount, boards, atol=1e-7)
+        np.testing.assert_array_equal(value.on_platform, [False, True])
 
 
 def test_two_boards_in_a_chain():
@@ -361,16 +361,16 @@ def test_two_boards_in_a_chain():
     measurements = with_boards(scene, boards, ("base", "base"), sees)
     legs = np.array([[0, 1, 6], [2, 3, 3], [4, 5, 5]])
     part = replace(measurements, edges=measurements.edges.select(seen_by(scene, legs)))
-    found = four_step(scene.drawing, part)
-    assert_same(found, scene.truth)
-    np.testing.assert_allclose(found.T_mount, boards, atol=1e-7)
+    value = four_step(scene.drawing, part)
+    assert_same(value, scene.truth)
+    np.testing.assert_allclose(value.T_mount, boards, atol=1e-7)
 
 
 def test_given_poses_join_stations_that_share_no_legs():
     scene = make_scene("gough-stewart", np.random.default_rng(12), 24)
     part = scene.select(seen_by(scene, THREE_BY_THREE))
-    found = four_step(scene.drawing, part, T_camera_base_guess=scene.truth.T_camera_base)
-    assert_same(found, scene.truth)
+    value = four_step(scene.drawing, part, T_camera_base_guess=scene.truth.T_camera_base)
+    assert_same(value, scene.truth)
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -379,14 +379,14 @@ def test_the_bundle_starts_from_the_steps(name):
     rng = np.random.default_rng(13)
     scene = make_scene(name, rng, 24)
     measurements = noisy(scene.measurements, rng)
-    found = four_step(scene.drawing, measurements)
-    assert np.isfinite(found.theta).all()
-    assert np.abs(found.theta - scene.truth.theta).max() < 0.03
-    far = scene.drawing.with_values(found.theta)
-    known = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
-    start = better_start(scene.drawing, measurements, known)
+    values = four_step(scene.drawing, measurements)
+    assert np.isfinite(values.theta).all()
+    assert np.abs(values.theta - scene.truth.theta).max() < 0.03
+    far = scene.drawing.with_values(values.theta)
+    reference_values = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
+    start = initial_guess(scene.drawing, measurements, reference_values)
     assert edge_misfit(scene.drawing, measurements, start) <= edge_misfit(
-        scene.drawing, measurements, known
+        scene.drawing, measurements, reference_values
     )
     best = bundle(scene.drawing, measurements, start)
     again = bundle(scene.drawing, measurements, four_step(far, measurements))
@@ -404,14 +404,14 @@ def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     board = perturb(np.eye(4), rng.normal(size=(1, 6)))
     measurements = with_boards(scene, board, ("base",), [(0, 0), (1, 0), (2, 0)])
     measurements = noisy(measurements, rng)
-    known = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
-    joint = bundle(scene.drawing, measurements, known)
-    found = methods.by_paper("four-step", scene.drawing, measurements, joint)
-    sigma = np.sqrt(np.diag(found.covariance))
+    reference_values = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
+    joint = bundle(scene.drawing, measurements, reference_values)
+    values = methods.by_paper("four-step", scene.drawing, measurements, joint)
+    sigma = np.sqrt(np.diag(values.covariance))
     free = sigma > 1e-9
-    ratio = ((found.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2
+    ratio = ((values.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2
     # one draw of correlated parameters: 0.5 to 1.9 over seeds
     assert 0.3 < np.sqrt(np.mean(ratio)) < 2.2
-    assert found.pose_residuals.shape == (len(measurements.poses), 6)
-    again = machine_from(mechanism_text(found.machine), tmp_path)
-    np.testing.assert_allclose(again.values, found.state.theta, atol=1e-12)
+    assert values.pose_residuals.shape == (len(measurements.poses), 6)
+    again = machine_from(mechanism_text(values.machine), tmp_path)
+    np.testing.assert_allclose(again.values, values.state.theta, atol=1e-12)

@@ -132,8 +132,8 @@ def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapo
     keep = seen_by(scene, THREE_BY_TWO)
     part = scene.select(keep)
     guess = scene.truth.T_camera_base
-    found = four_step(scene.drawing, part, T_camera_base_guess=guess)
-    np.testing.assert_allclose(found.theta, scene.truth.theta, atol=1e-8)
+    values = four_step(scene.drawing, part, T_camera_base_guess=guess)
+    np.testing.assert_allclose(values.theta, scene.truth.theta, atol=1e-8)
     with pytest.raises(ResultError, match="no configuration shows enough legs"):
         four_step(scene.drawing, part, T_camera_base_guess=guess, form="printed")
 
@@ -192,58 +192,58 @@ def test_a_length_that_collapsed_is_told():
 # the paper's counts ------------------------------------------------------------------------
 
 
-def by_equation(name, seen) -> dict[str, Condition]:
-    found = conditions(load_mechanism(name), np.asarray(seen, dtype=bool))
-    return {c.equation: c for c in found}
+def by_equation(name, in_view) -> dict[str, Condition]:
+    values = conditions(load_mechanism(name), np.asarray(in_view, dtype=bool))
+    return {c.equation: c for c in values}
 
 
 def test_counts_of_the_papers_own_example():
     """[A] 4.1: three stations, four legs each, are sufficient by (12)."""
-    seen = np.zeros((3, 6), dtype=bool)
+    visible = np.zeros((3, 6), dtype=bool)
     for s in range(3):
-        seen[s, [(2 * s + k) % 6 for k in range(4)]] = True
-    found = by_equation("gough-stewart", seen)
-    assert (found["[A] 11, 12"].needed, found["[A] 11, 12"].available) == (12, 18)
-    assert (found["[A] 15"].needed, found["[A] 15"].available) == (6, 18)
-    assert (found["[A] 17"].needed, found["[A] 17"].available) == (12, 18)
-    assert all(c.met for c in found.values())
-    seen[:, 3:] = False
-    found = by_equation("gough-stewart", seen)
-    assert not found["[A] 3.3"].met
-    assert "legs 4 to 6" in found["[A] 3.3"].text
-    assert (found["[A] 11, 12"].available, found["[A] 11, 12"].met) == (4, False)
+        visible[s, [(2 * s + k) % 6 for k in range(4)]] = True
+    value = by_equation("gough-stewart", visible)
+    assert (value["[A] 11, 12"].needed, value["[A] 11, 12"].available) == (12, 18)
+    assert (value["[A] 15"].needed, value["[A] 15"].available) == (6, 18)
+    assert (value["[A] 17"].needed, value["[A] 17"].available) == (12, 18)
+    assert all(c.met for c in value.values())
+    visible[:, 3:] = False
+    value = by_equation("gough-stewart", visible)
+    assert not value["[A] 3.3"].met
+    assert "legs 4 to 6" in value["[A] 3.3"].text
+    assert (value["[A] 11, 12"].available, value["[A] 11, 12"].met) == (4, False)
 
 
 def test_counts_of_a_planar_machine():
     """(10) corrected: 1 + 2 (n - 2) = 3 for three legs, where the paper prints 4."""
-    found = by_equation("3-rpr", [[1, 1, 1]])
-    assert (found["[A] 10, 12"].needed, found["[A] 10, 12"].available) == (3, 3)
-    assert (found["[A] 17"].needed, found["[A] 17"].available) == (3, 3)
-    assert all(c.met for c in found.values())
+    value = by_equation("3-rpr", [[1, 1, 1]])
+    assert (value["[A] 10, 12"].needed, value["[A] 10, 12"].available) == (3, 3)
+    assert (value["[A] 17"].needed, value["[A] 17"].available) == (3, 3)
+    assert all(c.met for c in value.values())
     assert not by_equation("3-rpr", [[1, 1, 0], [0, 1, 1]])["[A] 10, 12"].met
 
 
 def test_counts_with_revolute_axes():
     """(11): 3 + 2 r of three centres and axes; (12): 3 + 3 + 6 products of one station."""
-    found = by_equation("3-rps", [[1, 1, 1]])["[A] 11, 12"]
-    assert (found.needed, found.available, found.met) == (9, 12, True)
-    found = by_equation("3-rps", [[1, 1, 0], [0, 1, 1]])["[A] 11, 12"]
-    assert (found.needed, found.available, found.met) == (9, 2 * (1 + 1 + 2), False)
+    value = by_equation("3-rps", [[1, 1, 1]])["[A] 11, 12"]
+    assert (value.needed, value.available, value.met) == (9, 12, True)
+    value = by_equation("3-rps", [[1, 1, 0], [0, 1, 1]])["[A] 11, 12"]
+    assert (value.needed, value.available, value.met) == (9, 2 * (1 + 1 + 2), False)
 
 
 def test_counts_of_a_passive_leg():
-    found = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 1]])
-    assert (found["[A] 15"].needed, found["[A] 17"].needed) == (6, 12)
-    assert (found["[A] 19"].needed, found["[A] 19"].available) == (3, 6)
-    found = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 0], [1, 1, 0, 0, 0, 0, 1]])
-    assert (found["[A] 19"].available, found["[A] 19"].met) == (2, False)
-    assert "passive leg 7" in found["[A] 19"].text
+    value = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 1]])
+    assert (value["[A] 15"].needed, value["[A] 17"].needed) == (6, 12)
+    assert (value["[A] 19"].needed, value["[A] 19"].available) == (3, 6)
+    value = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 0], [1, 1, 0, 0, 0, 0, 1]])
+    assert (value["[A] 19"].available, value["[A] 19"].met) == (2, False)
+    assert "passive leg 7" in value["[A] 19"].text
 
 
 def test_counts_are_necessary_at_most(hexapod):
     """Errata, A 12: enough equations by the count, and the stations still share too few legs."""
     two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
-    seen = np.zeros((3, 6), dtype=bool)
-    seen[np.arange(3)[:, None], two] = True
-    assert all(c.met for c in conditions(hexapod.drawing, seen))
+    visible = np.zeros((3, 6), dtype=bool)
+    visible[np.arange(3)[:, None], two] = True
+    assert all(c.met for c in conditions(hexapod.drawing, visible))
     refused(hexapod, hexapod.select(seen_by(hexapod, two)), "share too few legs")

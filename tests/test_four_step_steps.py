@@ -65,11 +65,11 @@ def test_centres_are_where_the_axes_meet():
     u = unit(rng.normal(size=(3, 5, 4, 3)))
     u[:, 1, 3] = u[:, 0, 3]  # leg 4 of station 1 does not turn
     point = a[:, group] + rng.normal(size=(3, 5, 4, 1)) * u
-    seen = np.ones((5, 4), dtype=bool)
-    seen[0, 1] = False  # leg 2 of station 1 is seen once
-    found, known = nearest_points(u, point, seen, group, 2)
-    np.testing.assert_array_equal(known, [[True, False, True, False], [True] * 4])
-    np.testing.assert_allclose(found[:, known], a[:, known], atol=1e-12)
+    visible = np.ones((5, 4), dtype=bool)
+    visible[0, 1] = False  # leg 2 of station 1 is seen once
+    values, reference_values = nearest_points(u, point, visible, group, 2)
+    np.testing.assert_array_equal(reference_values, [[True, False, True, False], [True] * 4])
+    np.testing.assert_allclose(values[:, reference_values], a[:, reference_values], atol=1e-12)
 
 
 def test_revolute_axes_are_square_to_the_leg():
@@ -79,10 +79,10 @@ def test_revolute_axes_are_square_to_the_leg():
     group = np.repeat([0, 1], 6)
     u = unit(np.cross(v[:, group], rng.normal(size=(2, 12, 3, 3))))
     u[:, :6, 2] = unit(u[:, :1, 2] + 1e-3 * u[:, :6, 2])
-    seen = np.ones((12, 3), dtype=bool)
-    found, known = revolute_axes(u, seen, group, 2)
-    np.testing.assert_array_equal(known, [[True, True, False], [True] * 3])
-    np.testing.assert_allclose(np.abs(dot(found, v))[:, known], 1, atol=1e-12)
+    visible = np.ones((12, 3), dtype=bool)
+    values, reference_values = revolute_axes(u, visible, group, 2)
+    np.testing.assert_array_equal(reference_values, [[True, True, False], [True] * 3])
+    np.testing.assert_allclose(np.abs(dot(values, v))[:, reference_values], 1, atol=1e-12)
 
 
 def test_revolute_axes_weigh_the_line_of_sight():
@@ -91,17 +91,17 @@ def test_revolute_axes_weigh_the_line_of_sight():
     v = unit(np.array([0.3, 0.1, 1.0]))
     sight = unit(rng.normal(size=(400, 12, 1, 3)))
     u = unit(np.cross(v, rng.normal(size=(400, 12, 1, 3))))
-    aside = unit(np.cross(sight, u))
-    deep = np.cross(u, aside)
+    lateral = unit(np.cross(sight, u))
+    deep = np.cross(u, lateral)
     noise = rng.normal(size=(2, 400, 12, 1, 1))
-    measured = unit(u + 1e-3 * noise[0] * aside + 2e-2 * noise[1] * deep)
-    information = 1e6 * aside[..., :, None] * aside[..., None, :]
+    measured = unit(u + 1e-3 * noise[0] * lateral + 2e-2 * noise[1] * deep)
+    information = 1e6 * lateral[..., :, None] * lateral[..., None, :]
     information = information + 2.5e3 * deep[..., :, None] * deep[..., None, :]
-    seen, group = np.ones((12, 1), dtype=bool), np.zeros(12, dtype=int)
+    visible, group = np.ones((12, 1), dtype=bool), np.zeros(12, dtype=int)
 
     def error(*args):
-        found = revolute_axes(measured, seen, group, 1, *args)[0][:, 0, 0]
-        return np.median(np.linalg.norm(np.cross(found, v), axis=-1))
+        values = revolute_axes(measured, visible, group, 1, *args)[0][:, 0, 0]
+        return np.median(np.linalg.norm(np.cross(values, v), axis=-1))
 
     assert error(information) < 0.5 * error()
 
@@ -111,18 +111,20 @@ def test_normal_of_a_plane_from_all_legs_together():
     rng = np.random.default_rng(4)
     n = unit(rng.normal(size=(5, 3)))
     u = unit(np.cross(n[:, None, None], rng.normal(size=(5, 1, 2, 3))))
-    found, known = plane_normals(u, np.ones((1, 2), dtype=bool), np.zeros(1, dtype=int), 1)
-    assert known.all()
-    np.testing.assert_allclose(np.abs(dot(found[:, 0, 0], n)), 1, atol=1e-12)
+    valid, reference_values = plane_normals(
+        u, np.ones((1, 2), dtype=bool), np.zeros(1, dtype=int), 1
+    )
+    assert reference_values.all()
+    np.testing.assert_allclose(np.abs(dot(valid[:, 0, 0], n)), 1, atol=1e-12)
 
 
 # step 2 ------------------------------------------------------------------------------------
 
 
-def base_views(rng, seen, directions_seen, noise=0.0):
+def base_views(rng, in_view, directions_visible, noise=0.0):
     """Items of views with every third direction told with the other sign, and the truth."""
-    n_views, n = seen.shape
-    d = directions_seen.shape[1]
+    n_views, n = in_view.shape
+    d = directions_visible.shape[1]
     drawn = rng.normal(size=(n, 3))
     drawn_directions = unit(rng.normal(size=(d, 3)))
     base = drawn + 2e-3 * rng.normal(size=(4, n, 3))
@@ -131,33 +133,33 @@ def base_views(rng, seen, directions_seen, noise=0.0):
     centres = apply(T[:, :, None], base[:, None]) + noise * rng.normal(size=(4, n_views, n, 3))
     turned = (T[:, :, None, :3, :3] @ directions[:, None, :, :, None])[..., 0]
     sign = np.where(rng.random((4, n_views, d, 1)) < 0.3, -1.0, 1.0)
-    items = Items(centres, seen, sign * turned, directions_seen, drawn, drawn_directions)
+    items = Items(centres, in_view, sign * turned, directions_visible, drawn, drawn_directions)
     return items, T, base, directions
 
 
-def laid_on(found, truth, T_found, T_true):
+def laid_on(value, truth, T_found, T_true):
     """Both forms fix the base only up to its frame: compare after laying one on the other."""
-    e = poses_laying_items(found, truth, np.ones(found.shape[:2]))
+    e = poses_laying_items(value, truth, np.ones(value.shape[:2]))
     np.testing.assert_allclose(T_true @ e[:, None], T_found, atol=1e-8)
-    return e, apply(e[:, None], found)
+    return e, apply(e[:, None], value)
 
 
 @pytest.mark.parametrize("join", [base_by_registration, base_by_products])
 def test_views_that_share_legs_and_axes(join):
     """[A] 9: centres and axes of five legs over three views; two of them see three centres."""
     rng = np.random.default_rng(5)
-    seen = np.array([[1, 1, 1, 0, 0], [0, 1, 1, 1, 1], [1, 0, 0, 1, 1]], dtype=bool)
+    visible = np.array([[1, 1, 1, 0, 0], [0, 1, 1, 1, 1], [1, 0, 0, 1, 1]], dtype=bool)
     axes = np.array([[1, 1], [1, 0], [1, 1]], dtype=bool)
-    items, T, base, directions = base_views(rng, seen, axes)
+    items, T, base, directions = base_views(rng, visible, axes)
     items = with_signs(items, T[..., :3, :3])
     gauge = _frame_rows(items)
-    found = join(items, gauge)
-    e, centres = laid_on(found.centres, base, found.T_view_base, T)
+    value = join(items, gauge)
+    e, centres = laid_on(value.centres, base, value.T_view_base, T)
     np.testing.assert_allclose(centres, base, atol=1e-9)
-    turned = (e[:, None, :3, :3] @ found.directions[..., None])[..., 0]
+    turned = (e[:, None, :3, :3] @ value.directions[..., None])[..., 0]
     np.testing.assert_allclose(turned, directions, atol=1e-9)
     np.testing.assert_allclose(
-        (found.centres - items.drawn).reshape(4, -1) @ gauge[:, :15].T, 0, atol=1e-9
+        (value.centres - items.drawn).reshape(4, -1) @ gauge[:, :15].T, 0, atol=1e-9
     )
 
 
@@ -175,31 +177,31 @@ def _frame_rows(items):
 def test_axes_replace_centres_that_views_do_not_share():
     """Two centres and one axis fix a view as three centres do; two centres alone do not."""
     rng = np.random.default_rng(6)
-    seen = np.array([[1, 1, 1, 1], [1, 1, 0, 0]], dtype=bool)
-    items, T, base, _ = base_views(rng, seen, np.array([[True], [True]]))
+    in_view = np.array([[1, 1, 1, 1], [1, 1, 0, 0]], dtype=bool)
+    items, T, base, _ = base_views(rng, in_view, np.array([[True], [True]]))
     items = with_signs(items, T[..., :3, :3])
     np.testing.assert_array_equal(items.fixed(), [True, True])
-    found = base_by_registration(items, _frame_rows(items))
-    laid_on(found.centres, base, found.T_view_base, T)
-    without = items._replace(directions_seen=np.zeros((2, 1), dtype=bool))
+    value = base_by_registration(items, _frame_rows(items))
+    laid_on(value.centres, base, value.T_view_base, T)
+    without = items._replace(directions_visible=np.zeros((2, 1), dtype=bool))
     np.testing.assert_array_equal(without.fixed(), [True, False])
 
 
 def test_products_leave_the_depth_of_coplanar_centres_open_and_axes_close_it():
     """Errata, A 9: rank 9 of 12 for six coplanar centres; an axis across makes them first order."""
     rng = np.random.default_rng(7)
-    seen = np.ones((2, 6), dtype=bool)
+    visible = np.ones((2, 6), dtype=bool)
     worst = []
     for d in (0, 1):
-        items, T, _, _ = base_views(rng, seen, np.ones((2, d), dtype=bool))
+        items, T, _, _ = base_views(rng, visible, np.ones((2, d), dtype=bool))
         flat = items.drawn * [1, 1, 0]
         base = flat + 2e-3 * rng.normal(size=(4, 6, 3))
         items = items._replace(centres=apply(T[:, :, None], base[:, None]), drawn=flat)
         items = with_signs(items, T[..., :3, :3])
         for join in (base_by_products, base_by_registration):
-            found = join(items, _frame_rows(items)).centres
-            e = poses_laying_items(found, base, np.ones(found.shape[:2]))
-            worst.append(np.abs(apply(e[:, None], found) - base).max())
+            values = join(items, _frame_rows(items)).centres
+            e = poses_laying_items(values, base, np.ones(values.shape[:2]))
+            worst.append(np.abs(apply(e[:, None], values) - base).max())
     printed, corrected, printed_with_axis, corrected_with_axis = worst
     assert printed > 5e-4
     assert max(corrected, corrected_with_axis, printed_with_axis) < 1e-8
@@ -242,8 +244,8 @@ def test_mean_pose_weighs_by_the_covariances():
     group = np.repeat([0, 1], 200)
     sigma = np.where(rng.random(400) < 0.5, 1e-3, 1e-1)
     T = perturb(truth[group], sigma[:, None] * rng.normal(size=(400, 6)))
-    found = mean_pose(T, np.eye(6) / sigma[:, None, None], group, 2)
-    np.testing.assert_allclose(found, truth, atol=5e-4)  # 1e-3 / sqrt(100), four deviations
+    values = mean_pose(T, np.eye(6) / sigma[:, None, None], group, 2)
+    np.testing.assert_allclose(values, truth, atol=5e-4)  # 1e-3 / sqrt(100), four deviations
     equal = mean_pose(T, np.tile(np.eye(6), (400, 1, 1)), group, 2)
     assert np.abs(equal - truth).max() > 2e-3
 
@@ -263,8 +265,8 @@ def body_axes(rng, runs=3, photos=12, legs=4, constant=()):
     q0 = 0.02 * rng.normal(size=(runs, legs))
     readings = length - q0[:, None]
     station = np.repeat([0, 1], photos // 2)
-    seen = np.ones((photos, legs), dtype=bool)
-    axes = Axes(station, np.arange(photos), seen, line / length[..., None], 0 * line, readings)
+    visible = np.ones((photos, legs), dtype=bool)
+    axes = Axes(station, np.arange(photos), visible, line / length[..., None], 0 * line, readings)
     return axes, base, body, T, q0
 
 
@@ -275,17 +277,17 @@ def test_offsets_keep_the_distances(form):
     axes, base, _, _, q0 = body_axes(rng)
     a = np.broadcast_to(base[:, None], axes.u.shape)
     np.testing.assert_allclose(joint_distance_offsets(axes, a, np.zeros(4), form), q0, atol=1e-9)
-    passive = replace(axes, seen=axes.seen & [True, True, True, False])
-    found = joint_distance_offsets(passive, a, np.array([0, 0, 0, 0.7]), form)
-    np.testing.assert_allclose(found[:, :3], q0[:, :3], atol=1e-9)
-    np.testing.assert_array_equal(found[:, 3], 0.7)
+    passive = replace(axes, visible=axes.visible & [True, True, True, False])
+    values = joint_distance_offsets(passive, a, np.array([0, 0, 0, 0.7]), form)
+    np.testing.assert_allclose(values[:, :3], q0[:, :3], atol=1e-9)
+    np.testing.assert_array_equal(values[:, 3], 0.7)
 
 
 @pytest.mark.parametrize("form", ["corrected", "printed"])
 def test_slopes_of_the_distances(form):
     rng = np.random.default_rng(12)
     axes, base, _, _, q0 = body_axes(rng)
-    axes = replace(axes, seen=rng.random(axes.seen.shape) < 0.8)
+    axes = replace(axes, visible=rng.random(axes.visible.shape) < 0.8)
     a = np.broadcast_to(base[:, None], axes.u.shape)
     for at in (q0, q0 + 0.05, 0 * q0 - 1.0):
         value, slope = joint_distance_deviations(axes, a, at, form)
@@ -312,8 +314,8 @@ def constant_legs(rng):
     u = line / np.linalg.norm(line, axis=-1, keepdims=True)
     photos = np.arange(30)
     readings = joint_values(machine.layout, machine.values, scene.measurements.joints)
-    seen = np.ones((30, 6), dtype=bool)
-    axes = Axes(0 * photos, photos, seen, u[None], 0 * u[None], readings[None])
+    visible = np.ones((30, 6), dtype=bool)
+    axes = Axes(0 * photos, photos, visible, u[None], 0 * u[None], readings[None])
     return machine, axes, np.broadcast_to(ends.a, u.shape)[None]
 
 
@@ -328,7 +330,7 @@ def test_constant_lengths_and_their_false_minimum():
         np.testing.assert_allclose(
             joint_distance_offsets(axes, a, start, form)[0], truth, atol=1e-8
         )
-    struts = replace(axes, seen=axes.seen & (machine.layout.actuated < 0))
+    struts = replace(axes, visible=axes.visible & (machine.layout.actuated < 0))
     value, _ = joint_distance_deviations(struts, a, np.zeros((1, 6)), "corrected")
     np.testing.assert_allclose(value, 0, atol=1e-15)
 
@@ -363,15 +365,15 @@ def test_platform_centres_by_registration_and_by_distances():
     drawing = body[0] + 1e-3 * rng.normal(size=(4, 3))
     body = body[:1]
     b = apply(T[:, :, None], body[:, None])
-    items = Items(b, axes.seen, b[:, :, :0], axes.seen[:, :0], drawing, np.zeros((0, 3)))
+    items = Items(b, axes.visible, b[:, :, :0], axes.visible[:, :0], drawing, np.zeros((0, 3)))
     gauge = _frame_rows(items)
-    for found in (
-        platform_by_registration(b, axes.seen, drawing, gauge),
-        platform_by_distances(b, axes.seen, axes.station, drawing, gauge),
+    for item in (
+        platform_by_registration(b, axes.visible, drawing, gauge),
+        platform_by_distances(b, axes.visible, axes.station, drawing, gauge),
     ):
-        e = poses_laying_items(found, np.broadcast_to(body, found.shape), np.ones(found.shape[:2]))
+        e = poses_laying_items(item, np.broadcast_to(body, item.shape), np.ones(item.shape[:2]))
         np.testing.assert_allclose(
-            apply(e[:, None], found), np.broadcast_to(body, found.shape), atol=1e-9
+            apply(e[:, None], item), np.broadcast_to(body, item.shape), atol=1e-9
         )
 
 
@@ -381,27 +383,27 @@ def test_a_platform_that_moves_less_needs_fewer_legs(motion):
     rng = np.random.default_rng(16)
     body = 0.2 * rng.normal(size=(2, 4, 3))
     T = perturb(np.eye(4), (0.4 * rng.normal(size=(2, 9, 6))) @ motion @ motion.T)
-    seen = np.zeros((9, 4), dtype=bool)
+    visible = np.zeros((9, 4), dtype=bool)
     k = np.arange(9)
     width = 2 if motion is PLANAR else 1
     for step in range(width + 1):
-        seen[k, (k + step) % 4] = True
-    seen[8, 1:] = False
-    seen[8, 0] = motion is TRANSLATION
+        visible[k, (k + step) % 4] = True
+    visible[8, 1:] = False
+    visible[8, 0] = motion is TRANSLATION
     b = apply(T[:, :, None], body[:, None])
     drawing = body[0] + 1e-3 * rng.normal(size=(4, 3))
-    fixed = fixes_pose(drawing, seen, motion=motion)
+    fixed = fixes_pose(drawing, visible, motion=motion)
     np.testing.assert_array_equal(fixed, k < 8 if motion is PLANAR else k < 9)
-    assert not fixes_pose(drawing, seen[:8], motion=SPATIAL).any() or motion is PLANAR
-    assert loose(drawing, seen, motion=motion).shape[-1] == 0
+    assert not fixes_pose(drawing, visible[:8], motion=SPATIAL).any() or motion is PLANAR
+    assert loose(drawing, visible, motion=motion).shape[-1] == 0
     x = (drawing - drawing.mean(axis=0))[:, :2]
     rows = np.zeros((6, 4, 3))
     rows[2, :, 0], rows[2, :, 1] = -x[:, 1], x[:, 0]
     rows[3:] = np.eye(3)[:, None]
     gauge = motion.T @ rows.reshape(6, 12)
-    found = platform_by_registration(b[:, fixed], seen[fixed], drawing, gauge, motion)
-    e = poses_laying_items(found, body, np.ones((2, 4)), motion=motion)
-    np.testing.assert_allclose(apply(e[:, None], found), body, atol=1e-9)
+    values = platform_by_registration(b[:, fixed], visible[fixed], drawing, gauge, motion)
+    e = poses_laying_items(values, body, np.ones((2, 4)), motion=motion)
+    np.testing.assert_allclose(apply(e[:, None], values), body, atol=1e-9)
     if motion is TRANSLATION:
         np.testing.assert_array_equal(e[:, :3, :3], np.broadcast_to(np.eye(3), (2, 3, 3)))
 
@@ -410,19 +412,19 @@ def test_loose_ways_are_the_ones_that_exist():
     """Two groups that share two points hinge about them: one way to move, and it turns there."""
     rng = np.random.default_rng(17)
     p = rng.normal(size=(6, 3))
-    seen = np.array([[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 1, 1]], dtype=bool)
-    free = loose(p, seen)
+    in_view = np.array([[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 1, 1]], dtype=bool)
+    free = loose(p, in_view)
     assert free.shape == (6, 3, 1)
-    way = free[..., 0]
+    sense = free[..., 0]
     # take out the body's own turn that the first group makes: the others then turn about the hinge
-    rates = dot(p[:, None] - p, way[:, None] - way)
+    rates = dot(p[:, None] - p, sense[:, None] - sense)
     np.testing.assert_allclose(rates[:4, :4], 0, atol=1e-9)
     assert np.abs(rates[2:4, 4:]).max() > 1e-2
     shared = np.array([[1, 1, 1, 1, 0, 0], [1, 1, 1, 0, 1, 1]], dtype=bool)
     assert loose(p, shared).shape[-1] == 0
     # a common axis, not along the hinge, closes it too
     items = np.concatenate([p, [[0.3, -0.5, 0.8]]])
-    assert loose(items, np.pad(seen, ((0, 0), (0, 1)), constant_values=True), 1).shape[-1] == 0
+    assert loose(items, np.pad(in_view, ((0, 0), (0, 1)), constant_values=True), 1).shape[-1] == 0
 
 
 def test_revolute_axes_and_passive_legs_on_the_platform():
@@ -432,16 +434,16 @@ def test_revolute_axes_and_passive_legs_on_the_platform():
     w = unit(rng.normal(size=(2, 3, 3)))
     local = unit(np.cross(w[:, None], rng.normal(size=(2, 8, 3, 3))))
     u = (T[:, :, None, :3, :3] @ local[..., None])[..., 0]
-    seen = np.ones((8, 3), dtype=bool)
-    seen[1:, 2] = False
-    found, known = platform_axes(u, seen, T)
-    np.testing.assert_array_equal(known, [True, True, False])
-    np.testing.assert_allclose(np.abs(dot(found, w))[:, :2], 1, atol=1e-12)
+    visible = np.ones((8, 3), dtype=bool)
+    visible[1:, 2] = False
+    values, reference_values = platform_axes(u, visible, T)
+    np.testing.assert_array_equal(reference_values, [True, True, False])
+    np.testing.assert_allclose(np.abs(dot(values, w))[:, :2], 1, atol=1e-12)
     b, base = rng.normal(size=(2, 2, 3, 3))
     u = unit(apply(T[:, :, None], b[:, None]) - base[:, None])
-    found, known = passive_centres(u, base, seen, T)
-    np.testing.assert_array_equal(known, [True, True, False])
-    np.testing.assert_allclose(found[:, :2], b[:, :2], atol=1e-10)
+    values, reference_values = passive_centres(u, base, visible, T)
+    np.testing.assert_array_equal(reference_values, [True, True, False])
+    np.testing.assert_allclose(values[:, :2], b[:, :2], atol=1e-10)
 
 
 def test_torsion_and_its_slopes():
@@ -453,9 +455,9 @@ def test_torsion_and_its_slopes():
     np.testing.assert_allclose(value, dot(u, np.cross(v, turned)), atol=1e-14)
     for by, k in ((by_v, 0), (by_w, 1)):
         for axis in np.eye(3):
-            moved = [v + 1e-30j * axis, w] if k == 0 else [v, w + 1e-30j * axis]
-            c = (rot @ moved[1][..., None])[..., 0]
-            complex_value = dot(u, np.cross(moved[0], c))
+            shifted = [v + 1e-30j * axis, w] if k == 0 else [v, w + 1e-30j * axis]
+            c = (rot @ shifted[1][..., None])[..., 0]
+            complex_value = dot(u, np.cross(shifted[0], c))
             np.testing.assert_allclose(dot(by, axis), complex_value.imag / 1e-30, atol=1e-14)
 
 
@@ -474,9 +476,9 @@ def test_universal_axes_of_a_platform_that_turns():
     rng = np.random.default_rng(20)
     v, w, rot, u = universal_legs(rng, 0.5)
     drawn = tuple(unit(a + 5e-3 * rng.normal(size=a.shape)) for a in (v, w))
-    seen = np.ones((30, 3), dtype=bool)
-    found = universal_axes(u, rot, seen, drawn, np.full(3, 0.005))
-    for got, true in zip(found, (v, w), strict=True):
+    visible = np.ones((30, 3), dtype=bool)
+    values = universal_axes(u, rot, visible, drawn, np.full(3, 0.005))
+    for got, true in zip(values, (v, w), strict=True):
         np.testing.assert_allclose(got, true, atol=1e-9)
 
 
@@ -487,11 +489,11 @@ def test_universal_axes_of_a_platform_that_does_not_turn():
     rot = np.broadcast_to(np.eye(3), (2, 30, 3, 3))
     u = unit(rng.normal(size=(2, 30, 3, 3)))
     drawn = tuple(unit(v + 5e-3 * rng.normal(size=v.shape)) for _ in range(2))
-    found = universal_axes(u, rot, np.ones((30, 3), dtype=bool), drawn, np.full(3, 0.005))
-    np.testing.assert_allclose(found[0], found[1], atol=1e-10)
+    valid = universal_axes(u, rot, np.ones((30, 3), dtype=bool), drawn, np.full(3, 0.005))
+    np.testing.assert_allclose(valid[0], valid[1], atol=1e-10)
     middle = unit(drawn[0] + drawn[1])
-    np.testing.assert_allclose(found[0], middle, atol=1e-5)  # to second order of 5 mrad
-    assert np.abs(found[0] - v).max() > 2e-3
+    np.testing.assert_allclose(valid[0], middle, atol=1e-5)  # to second order of 5 mrad
+    assert np.abs(valid[0] - v).max() > 2e-3
 
 
 def test_noise_leaves_weak_directions_to_the_drawing():
@@ -504,8 +506,8 @@ def test_noise_leaves_weak_directions_to_the_drawing():
     u = unit(u + 1e-3 * rng.normal(size=u.shape))
     noisy = rotation(1e-3 * rng.normal(size=(20, 30, 3))) @ rot
     drawn = (v, w)
-    found = universal_axes(u, noisy, np.ones((30, 3), dtype=bool), drawn, np.full(3, 0.005))
-    for got in found:
+    valid = universal_axes(u, noisy, np.ones((30, 3), dtype=bool), drawn, np.full(3, 0.005))
+    for got in valid:
         assert np.sqrt(np.mean(np.sum((got - v) ** 2, axis=-1))) < 0.005
 
 
@@ -518,17 +520,17 @@ def test_several_photographs_of_one_configuration_count_as_one():
     row = np.searchsorted([4, 5, 7], configuration)
     u = (T[:, station, None, :3, :3] @ truth[:, row, :, :, None])[..., 0]
     sight = unit(rng.normal(size=(1, 5, 2, 3)))
-    aside = unit(np.cross(sight, u))
-    deep = np.cross(u, aside)
+    lateral = unit(np.cross(sight, u))
+    deep = np.cross(u, lateral)
     measured = unit(u + 0.02 * rng.normal(size=(1, 5, 2, 1)) * deep)
-    information = aside[..., :, None] * aside[..., None, :]
-    seen = np.ones((5, 2), dtype=bool)
+    information = lateral[..., :, None] * lateral[..., None, :]
+    visible = np.ones((5, 2), dtype=bool)
     readings = rng.normal(size=(1, 3, 2))[:, row]
-    axes = Axes(station, configuration, seen, measured, 0 * u, readings, information)
-    found = in_base(axes, T)
-    np.testing.assert_array_equal(found.configuration, [4, 5, 7])
-    np.testing.assert_allclose(found.u[:, [0, 2]], truth[:, [0, 2]], atol=1e-9)
-    np.testing.assert_allclose(found.readings, readings[:, [0, 1, 2]], atol=0)
+    axes = Axes(station, configuration, visible, measured, 0 * u, readings, information)
+    values = in_base(axes, T)
+    np.testing.assert_array_equal(values.configuration, [4, 5, 7])
+    np.testing.assert_allclose(values.u[:, [0, 2]], truth[:, [0, 2]], atol=1e-9)
+    np.testing.assert_allclose(values.readings, readings[:, [0, 1, 2]], atol=0)
     alone = in_base(replace(axes, information=None), T)
     assert np.abs(alone.u - truth)[:, [0, 2]].max() > 1e-3
 
@@ -538,8 +540,8 @@ def test_three_centres_stay_the_frame_of_a_spatial_machine():
     from pkmcal.papers.four_step import four_step
 
     scene = make_scene("6-spu-passive", np.random.default_rng(24), 20)
-    found = four_step(scene.drawing, scene.measurements)
+    value = four_step(scene.drawing, scene.measurements)
     rows = ThreeCentres().constraints(scene.drawing)
     np.testing.assert_allclose(
-        rows @ (found.theta - scene.drawing.parameters.drawing), 0, atol=1e-9
+        rows @ (value.theta - scene.drawing.parameters.drawing), 0, atol=1e-9
     )

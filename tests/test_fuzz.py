@@ -34,9 +34,9 @@ def fuzzed(count, *options):
 
 def test_malformed_sessions_of_every_way():
     """Those of the first 90 that spoil a kind of file, or a command's file, as none before."""
-    said = fuzzed(FEW, "--telling")
-    assert int(said.split(" cases")[0].split()[-1]) > 60
-    assert "with faults 0" in said
+    text = fuzzed(FEW, "--telling")
+    assert int(text.split(" cases")[0].split()[-1]) > 60
+    assert "with faults 0" in text
 
 
 @pytest.mark.slow
@@ -77,4 +77,4 @@ def test_a_proper_refusal_has_no_faults():
     ],
 )
 def test_the_judge_sees(told, fault):
-    assert any(found.startswith(fault) for found in faults(**told)), faults(**told)
+    assert any(value.startswith(fault) for value in faults(**told)), faults(**told)

@@ -38,15 +38,15 @@ def test_rotation_vector_round_trip(omega):
 def test_quaternions():
     rng = np.random.default_rng(0)
     turns = rigid.rotation(rng.normal(size=(50, 3)) * 2)
-    found = rigid.quaternion(turns)
-    assert np.all(found[:, 0] >= 0)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-15)
-    np.testing.assert_allclose(rigid.from_quaternion(found), turns, atol=1e-12)
-    np.testing.assert_allclose(rigid.from_quaternion(-3 * found), turns, atol=1e-12)
+    count = rigid.quaternion(turns)
+    assert np.all(count[:, 0] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(count, axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(rigid.from_quaternion(count), turns, atol=1e-12)
+    np.testing.assert_allclose(rigid.from_quaternion(-3 * count), turns, atol=1e-12)
     np.testing.assert_allclose(rigid.quaternion(np.eye(3)), [1, 0, 0, 0])
     by_scipy = Rotation.from_matrix(turns).as_quat()[:, [3, 0, 1, 2]]
     by_scipy *= np.sign(by_scipy[:, :1])
-    np.testing.assert_allclose(found, by_scipy, atol=1e-14)
+    np.testing.assert_allclose(count, by_scipy, atol=1e-14)
 
 
 def test_a_quaternion_of_half_a_turn():
@@ -74,8 +74,8 @@ def test_inverse_and_apply(delta, point):
 @given(six, arrays(float, 6, elements=st.floats(-1, 1, allow_subnormal=False)))
 def test_pose_difference_undoes_perturb(start, delta):
     reference = rigid.perturb(np.eye(4), start)
-    moved = rigid.perturb(reference, delta)
-    np.testing.assert_allclose(rigid.pose_difference(moved, reference), delta, atol=1e-9)
+    shifted = rigid.perturb(reference, delta)
+    np.testing.assert_allclose(rigid.pose_difference(shifted, reference), delta, atol=1e-9)
 
 
 @given(seeds, six)
@@ -83,8 +83,8 @@ def test_register_finds_the_motion(seed, delta):
     rng = np.random.default_rng(seed)
     source = rng.normal(size=(5, 3))
     T = rigid.perturb(np.eye(4), delta)
-    found = rigid.register(source, rigid.apply(T, source), rng.uniform(0.1, 1, 5))
-    np.testing.assert_allclose(found, T, atol=1e-7)
+    values = rigid.register(source, rigid.apply(T, source), rng.uniform(0.1, 1, 5))
+    np.testing.assert_allclose(values, T, atol=1e-7)
 
 
 def test_register_never_mirrors():
@@ -141,9 +141,9 @@ def test_edge_derivatives_against_complex_steps(distance, side):
         exact = np.concatenate([e.dn_da, e.dn_db, (e.by_a + e.by_b)[:, None]], axis=1)
         step = 1e-30
         for k in range(7):
-            moved = x.astype(complex)
-            moved[k] += 1j * step
-            n = complex_normal(moved[:3], moved[3:6], moved[6], side)
+            shifted = x.astype(complex)
+            shifted[k] += 1j * step
+            n = complex_normal(shifted[:3], shifted[3:6], shifted[6], side)
             scale = np.abs(exact).max()
             np.testing.assert_allclose(n.imag / step, exact[:, k], atol=1e-10 * scale)
 
@@ -160,7 +160,7 @@ def complex_normal(a, b, radius, side):
 
 def test_a_camera_inside_a_leg_is_told():
     a, b, radius = leg(1, 0.8)
-    assert not cylinders.leg_is_seen(cylinders.line_through(a, b)[1], np.array(radius))
+    assert not cylinders.has_silhouette(cylinders.line_through(a, b)[1], np.array(radius))
     inside = cylinders.edge_normal_jacobians(a, b, np.array(radius), np.array(0))
     assert np.isnan(inside.n).all()
 

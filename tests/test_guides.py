@@ -23,8 +23,8 @@ from test_docs import blocks, text_of
 def recipe(heading: str) -> list[tuple[str, str]]:
     """The commands of a recipe in their order, each with what the page shows of it."""
     text = text_of("docs/howto.md").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
-    shown = [part for block in blocks(text, "console") for part in block.split("$ ")[1:]]
-    return [(part.partition("\n")[0], part.partition("\n")[2]) for part in shown]
+    display = [part for block in blocks(text, "console") for part in block.split("$ ")[1:]]
+    return [(part.partition("\n")[0], part.partition("\n")[2]) for part in display]
 
 
 def form(text: str, folder: object = None) -> str:
@@ -51,10 +51,10 @@ def test_a_delta_printer_with_its_probe(workplace):
     """Every command says what the page shows, figures aside."""
     commands = recipe("A delta printer with its probe")
     assert [command.split()[1] for command, _ in commands] == ["new", "calibrate", "export"]
-    for command, shown in commands:
+    for command, display in commands:
         done = typed(command)
         assert done.code == 0, done.out + done.err
-        assert form(done.out, workplace) == form(shown), command
+        assert form(done.out, workplace) == form(display), command
     text = text_of("docs/howto.md").partition("## A delta printer with its probe")[2]
     values = (workplace / "kit" / "export-klipper" / "pkmcal_printer.cfg").read_text()
     assert form(blocks(text, "ini")[0]) == form(re.sub(r"^#.*\n", "", values, flags=re.MULTILINE))
@@ -72,11 +72,13 @@ def photograph(board, camera, T_camera_board, rng):
     by_rays = np.array([[rays, 0, (rays - 1) / 2], [0, rays, (rays - 1) / 2], [0, 0, 1]])
     H = by_rays @ K @ T_camera_board[:3][:, [0, 1, 3]] @ on_print
     width, height = camera.image_size
-    seen = cv2.warpPerspective(np.where(black, 25, 225).astype(np.uint8), H,
+    in_view = cv2.warpPerspective(np.where(black, 25, 225).astype(np.uint8), H,
                                (rays * width, rays * height), borderValue=110)  # fmt: skip
-    seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-    seen = cv2.GaussianBlur(seen.astype(float), (0, 0), 0.7) + rng.normal(0, 1.5, seen.shape)
-    return np.clip(seen.round(), 0, 255).astype(np.uint8)
+    in_view = cv2.resize(in_view, (width, height), interpolation=cv2.INTER_AREA)
+    in_view = cv2.GaussianBlur(in_view.astype(float), (0, 0), 0.7) + rng.normal(
+        0, 1.5, in_view.shape
+    )
+    return np.clip(in_view.round(), 0, 255).astype(np.uint8)
 
 
 def photographed(kit):
@@ -107,17 +109,17 @@ def photographed(kit):
 
 def test_a_delta_kit_with_a_board(workplace):
     new, board, calibrate, export = recipe("A delta kit with a board")
-    for command, shown in (new, board):
+    for command, display in (new, board):
         done = typed(command)
         assert done.code == 0, done.out + done.err
-        assert form(done.out, workplace) == form(shown), command
+        assert form(done.out, workplace) == form(display), command
     kit = workplace / "kit"
     assert (kit / "board.pdf").read_bytes().startswith(b"%PDF")
     photographed(kit)
-    for command, shown in (calibrate, export):
+    for command, display in (calibrate, export):
         done = typed(command)
         assert done.code == 0, done.out + done.err
-        first = form(shown).partition(" #")[0]
+        first = form(display).partition(" #")[0]
         assert form(done.out, workplace).startswith(first), command
     text = (kit / "calibration" / "calibration.json").read_text()
     # the readings are rounded, and exact beside that; 0.004 mm is a step's deviation
@@ -155,6 +157,6 @@ def test_a_printers_drawing_is_what_its_firmware_holds(tmp_path, monkeypatch, ro
         ("arm_length", rod),
         ("position_endstop", endstop),
     ):
-        found = re.findall(rf"^{name}: ([\d.]+)", values.read_text(), re.MULTILINE)
-        assert [float(v) for v in found] == pytest.approx([value] * len(found), abs=2e-4)
-        assert found
+        count = re.findall(rf"^{name}: ([\d.]+)", values.read_text(), re.MULTILINE)
+        assert [float(v) for v in count] == pytest.approx([value] * len(count), abs=2e-4)
+        assert count

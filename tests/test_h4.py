@@ -7,12 +7,12 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb, rotation_vector
 from pkmcal.identify.assembly import assemble
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends, rod_lengths
-from pkmcal.report.photographed import posed_limbs
+from pkmcal.report.image_scene import posed_limbs
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,
@@ -106,9 +106,9 @@ def test_closure_is_model_12s():
         [np.cos(ALPHA) * np.cos(turn), np.sin(ALPHA) * np.cos(turn), -np.sin(turn)], axis=-1
     )
     rods = pa(poses, IDENTIFIED, ALPHA) - IDENTIFIED["a"] * e
-    found = closure(machine.layout, machine.values, q, poses).rows.value
+    values = closure(machine.layout, machine.values, q, poses).rows.value
     expected = np.linalg.norm(rods, axis=-1) - IDENTIFIED["f"]
-    np.testing.assert_allclose(found, expected, atol=3e-14)
+    np.testing.assert_allclose(values, expected, atol=3e-14)
 
 
 def test_inverse_kinematics_are_equation_2():
@@ -136,9 +136,9 @@ def test_model_31_forward_kinematics_converge_everywhere():
     poses = workspace(rng, 2000)
     poses[:, :2, 3] *= 1.5
     readings = machine.inverse(poses)
-    found = machine.forward_result(readings)
-    assert found.converged.all()
-    np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-10)
+    fk = machine.forward_result(readings)
+    assert fk.converged.all()
+    np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-10)
     assert machine.home()[2, 3] == -0.45
 
 
@@ -161,9 +161,9 @@ def test_rods_are_an_h4_as_long_as_they_are_alike():
     np.testing.assert_allclose(readings, design().inverse(poses), atol=1e-12)
     theta = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     np.testing.assert_allclose(internal, np.stack([-theta] * 2, axis=1), atol=1e-12)
-    found = machine.forward_result(readings)
-    assert found.converged.all()
-    np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-11)
+    fk = machine.forward_result(readings)
+    assert fk.converged.all()
+    np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-11)
 
 
 def test_rods_that_differ_tilt_the_nacelle():
@@ -173,9 +173,9 @@ def test_rods_that_differ_tilt_the_nacelle():
     tilt = rotation_vector(poses[:, :3, :3])[:, :2]
     assert 1e-3 < np.abs(tilt).max() < 0.05
     readings = machine.inverse(poses)
-    found = machine.forward_result(readings)
-    assert found.converged.all()
-    np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-10)
+    fk = machine.forward_result(readings)
+    assert fk.converged.all()
+    np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-10)
     # a pose that the rods do not allow is moved, and told as not theirs
     assert (
         not kinematics.forward(
@@ -225,7 +225,7 @@ def test_closure_derivatives_of_the_rods():
         (c.rows.by_internal, lambda d: closure(layout, theta, q, poses, phi + d), 2),
         (c.by_reading[:, None] * pick, lambda d: closure(layout, theta, q + d, poses, phi), 4),
     ]
-    for found, function, count in cases:
+    for item, function, count in cases:
         oracle = np.stack(
             [
                 sum(
@@ -237,7 +237,7 @@ def test_closure_derivatives_of_the_rods():
             ],
             axis=-1,
         )
-        np.testing.assert_allclose(found, oracle, atol=2e-11)
+        np.testing.assert_allclose(item, oracle, atol=2e-11)
 
 
 # What can be identified
@@ -283,13 +283,15 @@ def test_what_the_rods_can_tell():
     machine = load_mechanism("h4-rods")
     case = papers_case(with_rods(rng), rng)
     estimate = estimated(machine, case, rng)
-    told = identifiability(as_ended(case.measurements, estimate)[1], estimate.machine)
-    assert told.n_parameters - 4 == 78
-    assert told.n_frames == 12 + 4
-    assert told.rank == 66
-    assert told.unidentified == ()
+    values = identifiability(
+        linearize_at_solution(case.measurements, estimate)[1], estimate.machine
+    )
+    assert values.n_parameters - 4 == 78
+    assert values.n_frames == 12 + 4
+    assert values.rank == 66
+    assert values.unidentified == ()
     # as well or better known than a 1 mm, 2 degree drawing; errata has about 59 with the frames
-    assert 50 <= told.rank - len(told.weak) + 12 <= 66
+    assert 50 <= values.rank - len(values.weak) + 12 <= 66
 
 
 # Joint estimates from board poses (noise 0.2 mm, 0.03 degrees)
@@ -361,10 +363,10 @@ def test_truth_is_found_without_noise():
         (with_rods(rng), "rods"),
     ):
         case = papers_case(truth, rng, noise=1e-5)
-        found = estimated(load_mechanism("h4", model=model), case, rng, use_drawing=True)
+        value = estimated(load_mechanism("h4", model=model), case, rng, use_drawing=True)
         # the drawing pulls where the data are weak, by as little as they let it
-        assert score(found, truth, rng)[0] < 2e-5
-        camera = found.state.T_camera_base[0] @ case.poses @ found.state.T_mount[0]
+        assert score(value, truth, rng)[0] < 2e-5
+        camera = value.state.T_camera_base[0] @ case.poses @ value.state.T_mount[0]
         assert np.abs(camera - T_CAMERA_BASE @ case.poses @ T_PLATFORM_BOARD).max() < 0.2
 
 
@@ -382,11 +384,11 @@ def test_a_board_does_not_drift_away_along_the_axis():
     """
     rng = np.random.default_rng(5)
     case = papers_case(model_31(rng, 5e-3, 1e-2), rng)
-    found = estimated(load_mechanism("h4", model="rods"), case, rng, scale_noise=True)
-    assert found.statistics.stopped == "converged"
-    assert np.linalg.norm(found.state.T_mount[0, :3, 3]) < 3.0
-    assert found.statistics.steps < 120
-    assert score(found, case.truth, np.random.default_rng(1))[0] < 2e-4
+    value = estimated(load_mechanism("h4", model="rods"), case, rng, scale_noise=True)
+    assert value.statistics.stopped == "converged"
+    assert np.linalg.norm(value.state.T_mount[0, :3, 3]) < 3.0
+    assert value.statistics.steps < 120
+    assert score(value, case.truth, np.random.default_rng(1))[0] < 2e-4
 
 
 def test_where_a_board_sits_is_no_knowledge_of_the_machine():
@@ -400,5 +402,7 @@ def test_where_a_board_sits_is_no_knowledge_of_the_machine():
     places = np.flatnonzero(rows.any(axis=0)) - problem.unknowns.mounts.start
     assert places.tolist() == [3, 4, 5]
     estimate = estimated(machine, case, rng)
-    told = identifiability(as_ended(case.measurements, estimate)[1], estimate.machine)
-    assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames
+    values = identifiability(
+        linearize_at_solution(case.measurements, estimate)[1], estimate.machine
+    )
+    assert values.rank + len(values.unidentified) == values.n_parameters - values.n_frames

@@ -43,13 +43,13 @@ def platform_poses(machine, rng, count=30):
     reach = 0.15 * size_of(machine)
     motion = machine.layout.motion
     steps = rng.uniform(-1, 1, (count, 6)) * np.repeat([0.25, reach], 3)
-    found = on_manifold(
+    value = on_manifold(
         machine.layout, machine.values, perturb(machine.home(), steps @ motion @ motion.T)
     )
-    readings = machine.inverse(found.T_base_platform)
-    good = found.converged & np.isfinite(readings).all(axis=1)
+    readings = machine.inverse(value.T_base_platform)
+    good = value.converged & np.isfinite(readings).all(axis=1)
     assert good.sum() > count // 2
-    return found.T_base_platform[good], readings[good]
+    return value.T_base_platform[good], readings[good]
 
 
 def anywhere(rng, reach):
@@ -112,8 +112,8 @@ def test_the_right_drawing_leaves_the_noise(name):
     turn, shift = off(state, data.poses)
     assert turn < 2 * np.radians(0.03)
     assert shift < 1e-3
-    found = pose_difference(state.T_camera_base[0], camera)
-    assert np.linalg.norm(found[:3]) < 0.02
+    values = pose_difference(state.T_camera_base[0], camera)
+    assert np.linalg.norm(values[:3]) < 0.02
 
 
 def test_what_the_motion_does_not_tell_stays_zero():
@@ -142,9 +142,9 @@ def test_boards_that_slipped_do_not_lead_astray():
     wrong = poses.T_station_target.copy()
     wrong[:6] = wrong[:6] @ anywhere(rng, 0.1)
     state = start_from_poses(machine, measured(replace(poses, T_station_target=wrong), joints))
-    found = pose_difference(state.T_camera_base[0], camera)
-    assert np.linalg.norm(found[:3]) < 0.01
-    assert np.linalg.norm(found[3:]) < 0.01
+    values = pose_difference(state.T_camera_base[0], camera)
+    assert np.linalg.norm(values[:3]) < 0.01
+    assert np.linalg.norm(values[3:]) < 0.01
 
 
 def test_several_stations_and_mounts_are_chained():
@@ -166,9 +166,9 @@ def test_several_stations_and_mounts_are_chained():
         ]
     )
     kinds = (Mount("a", "platform"), Mount("b", "base"), Mount("c", "platform"))
-    known = np.full((3, 4, 4), np.nan)
-    known[2] = cameras[2]
-    state = start_from_poses(machine, measured(poses, joints, 3, kinds), known)
+    reference_values = np.full((3, 4, 4), np.nan)
+    reference_values[2] = cameras[2]
+    state = start_from_poses(machine, measured(poses, joints, 3, kinds), reference_values)
     assert np.array_equal(state.T_camera_base[2], cameras[2])
     error = pose_difference(state.T_camera_base, np.stack(cameras))
     assert np.abs(error).max() < 5e-3
@@ -190,9 +190,9 @@ def test_configurations_along_a_line_are_told():
     rng = np.random.default_rng(7)
     body = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
     body[:, 0, 3] = np.linspace(-0.1, 0.1, 12)
-    seen = anywhere(rng, 1.0) @ body @ anywhere(rng, 0.05)
+    in_view = anywhere(rng, 1.0) @ body @ anywhere(rng, 0.05)
     with pytest.raises(ResultError, match="do not tell how the camera stands"):
-        solve_pairs(body[None], seen[None], 0.4)
+        solve_pairs(body[None], in_view[None], 0.4)
 
 
 def test_runs_are_solved_together():
@@ -200,9 +200,9 @@ def test_runs_are_solved_together():
     body = perturb(np.eye(4), rng.normal(size=(4, 20, 6)) * np.repeat([0.2, 0.1], 3))
     cameras = np.stack([anywhere(rng, 1.0) for _ in range(4)])
     mounts = np.stack([anywhere(rng, 0.05) for _ in range(4)])
-    seen = cameras[:, None] @ body @ mounts[:, None]
-    together = solve_pairs(body, seen, 0.4)
+    in_view = cameras[:, None] @ body @ mounts[:, None]
+    together = solve_pairs(body, in_view, 0.4)
     for k in range(4):
-        alone = solve_pairs(body[k : k + 1], seen[k : k + 1], 0.4)
+        alone = solve_pairs(body[k : k + 1], in_view[k : k + 1], 0.4)
         np.testing.assert_allclose(together.T_camera_base[k], alone.T_camera_base[0], atol=1e-6)
     assert np.abs(pose_difference(together.T_camera_base, cameras)).max() < 2e-3

@@ -12,17 +12,22 @@ import pytest
 
 from faults import fault, replaced
 from pkmcal.boards.views import Boards
-from pkmcal.calibration import byhand, closely
-from pkmcal.calibration.byhand import (
+from pkmcal.calibration import handheld, pose_scoring
+from pkmcal.calibration.calibrate import better_refined, calibrate_session, worse_refined
+from pkmcal.calibration.case import Case, PriorScene
+from pkmcal.calibration.handheld import (
     CAMERA_TURNED_REASON,
     EDGES_DISAGREE_REASON,
-    misplaced,
+    inconsistent_poses,
     without_misplaced,
 )
-from pkmcal.calibration.calibrate import better_refined, calibrate_session, worse_refined
-from pkmcal.calibration.closely import AskedPlaces, ask, join, look_closer
-from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.recognise import platform_poses, read_photographs
+from pkmcal.calibration.localization import platform_poses, read_photographs
+from pkmcal.calibration.pose_scoring import (
+    ScoredPoses,
+    evaluate_pose,
+    register_images,
+    rescore_poses,
+)
 from pkmcal.calibration.results import calibration_document
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError, ResultError
@@ -33,14 +38,19 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import legs, surroundings
-from pkmcal.observe.alone import Alone, find_alone, finest_view, turned_about
-from pkmcal.observe.evidence import StationView, evidence_of
+from pkmcal.observe import background, legs
+from pkmcal.observe.background import Texture
+from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.image_localization import (
+    PoseHypotheses,
+    finest_view,
+    localize_image,
+    symmetric_poses,
+)
 from pkmcal.observe.images import decode
-from pkmcal.observe.stations import SECOND_PLACE_DOUBT
-from pkmcal.observe.surroundings import Texture
-from pkmcal.observe.tables import distance_tables
-from pkmcal.observe.tubes import PAIR_DIRECTIONS, RARITY_STEPS, tube_chart
+from pkmcal.observe.pose_likelihood import StationView, log_likelihood_of
+from pkmcal.observe.station_localization import RIVAL_POSE_PROBABILITY
+from pkmcal.observe.tubes import PAIR_DIRECTIONS, SURPRISAL_STEPS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
 from pkmcal.report.calibration import outcome_of
@@ -254,10 +264,10 @@ def test_simulated_photographs_say_how_they_were_held(simulated):
     """What EXIF asks viewers to do puts the platform above the base."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
-    asked = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # where up is in the stored picture
+    query = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # where up is in the stored picture
     for station, T in zip(session.stations, truth.T_camera_base, strict=True):
         exif = read_exif(station.photographs[0].path.read_bytes())
-        assert T[:2, 2] @ asked[exif.orientation] > np.cos(np.pi / 4) * np.linalg.norm(T[:2, 2])
+        assert T[:2, 2] @ query[exif.orientation] > np.cos(np.pi / 4) * np.linalg.norm(T[:2, 2])
         # of the lens, whatever it was focused at: 30.505, of which 0.02 % less would be 30
         assert exif.focal_35mm == round(705 / 1000 * np.hypot(36, 24))
 
@@ -283,10 +293,10 @@ def at_truth(monkeypatch, folder, off=2e-3):
     def place(session, photographs, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(len(truth), 6)))
-        known = KnownScene.as_drawn(session.machine, near, session.joints)
-        return SeenSession(session, photographs, boards, known)
+        scene = PriorScene.as_drawn(session.machine, near, session.joints)
+        return Case(session, photographs, boards, scene)
 
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.localize_case", place)
 
 
 @pytest.fixture(scope="module")
@@ -310,58 +320,58 @@ def test_a_rejected_photograph_is_counted_named_and_shown(breathed):
     session = calibration.session
     again = replace(session.stations[1], name="phone-0001-2")
     whole = replace(session, stations=(*session.stations, again))
-    found = outcome_of(replace(calibration, session=whole.without({3: EDGES_DISAGREE_REASON})))
-    (card,) = [card for card in found.figures if card.question == "What is it based on?"]
+    outcome = outcome_of(replace(calibration, session=whole.without({3: EDGES_DISAGREE_REASON})))
+    (card,) = [card for card in outcome.figures if card.question == "What is it based on?"]
     assert card.values == (("3 of 4", "photographs"),)
     file = "images/phone/0001-1.jpg"
-    (told,) = [one.text for one in found.findings]
-    assert told == f"{file}: left out, for {EDGES_DISAGREE_REASON}."
+    (rows,) = [one.text for one in outcome.findings]
+    assert rows == f"{file}: left out, for {EDGES_DISAGREE_REASON}."
     entry = {
         "file": file, "station": "phone-0001-2", "configuration": "0001",
         "reason": EDGES_DISAGREE_REASON,
     }  # fmt: skip
-    assert found.summary["photographs"] == 4
-    assert found.summary["rejected_photographs"] == [entry]
-    assert json.loads(found.texts["calibration.json"])["rejected_photographs"] == [entry]
-    (part,) = [part for part in found.parts if part.name == "photographs"]
-    shown = part.html.partition("Left out whole")[2]
-    assert "phone-0001-2" in shown
-    assert f"left out, for {EDGES_DISAGREE_REASON}" in shown
-    assert len(re.findall(r'href="data:image/jpeg;base64,[^"]{1000}', shown)) >= 1
+    assert outcome.summary["photographs"] == 4
+    assert outcome.summary["rejected_photographs"] == [entry]
+    assert json.loads(outcome.texts["calibration.json"])["rejected_photographs"] == [entry]
+    (part,) = [part for part in outcome.parts if part.name == "photographs"]
+    display = part.html.partition("Left out whole")[2]
+    assert "phone-0001-2" in display
+    assert f"left out, for {EDGES_DISAGREE_REASON}" in display
+    assert len(re.findall(r'href="data:image/jpeg;base64,[^"]{1000}', display)) >= 1
 
 
 def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
     """An option never makes a result worse: what may be used, keeps more, fits better."""
-    found, _ = breathed
-    found = replace(found, verdict=Verdict(True, "Good."))
-    fewer = replace(found, session=found.session.without({2: EDGES_DISAGREE_REASON}))
-    refused = replace(found, verdict=Verdict(False, "Bad."))
-    statistics = found.estimate.statistics
+    results, _ = breathed
+    results = replace(results, verdict=Verdict(True, "Good."))
+    fewer = replace(results, session=results.session.without({2: EDGES_DISAGREE_REASON}))
+    refused = replace(results, verdict=Verdict(False, "Bad."))
+    statistics = results.estimate.statistics
     worse = replace(statistics, chi2=10 * statistics.chi2, chi2_edges=10 * statistics.chi2_edges)
-    misfit = replace(found, estimate=replace(found.estimate, statistics=worse))
-    assert worse_refined(found, found) is None
-    rejects = worse_refined(fewer, found)
+    misfit = replace(results, estimate=replace(results.estimate, statistics=worse))
+    assert worse_refined(results, results) is None
+    rejects = worse_refined(fewer, results)
     assert rejects.code == "camera.refinement_rejects"
     assert (rejects.facts["kept"], rejects.facts["of"], rejects.facts["by_files"]) == (2, 3, 3)
     for bad in (fewer, refused, misfit):
-        assert worse_refined(bad, found)
-        assert worse_refined(found, bad) is None
-        taken = better_refined(lambda bad=bad: bad, lambda: found)
-        assert taken.session == found.session
-        assert taken.estimate is found.estimate
+        assert worse_refined(bad, results)
+        assert worse_refined(results, bad) is None
+        taken = better_refined(lambda bad=bad: bad, lambda: results)
+        assert taken.session == results.session
+        assert taken.estimate is results.estimate
         (warning,) = taken.verdict.findings
         assert warning.code.startswith("camera.refinement_")
         assert "--refine-camera" in warning.text
-        assert better_refined(lambda: found, lambda bad=bad: bad) is found
+        assert better_refined(lambda: results, lambda bad=bad: bad) is results
     assert better_refined(lambda: fewer, lambda: refused) is fewer  # first of all, it may be used
 
     def failed():
         raise ResultError("the search has diverged")
 
-    (warning,) = better_refined(failed, lambda: found).verdict.findings
+    (warning,) = better_refined(failed, lambda: results).verdict.findings
     assert warning.code == "camera.refinement_failed"
     assert "the search has diverged" in warning.text
-    (remark,) = better_refined(lambda: found, failed).verdict.findings
+    (remark,) = better_refined(lambda: results, failed).verdict.findings
     assert (remark.code, remark.level) == ("camera.files_intrinsics_failed", Level.NOTE)
     with pytest.raises(ResultError, match="diverged"):
         better_refined(failed, failed)
@@ -383,11 +393,11 @@ def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
 def test_focal_lengths_are_found_within_their_deviations(breathed):
     calibration, truth = breathed
     stations = calibration_document(calibration)["stations"]
-    found = np.array([station["focal_scale"] for station in stations])
+    values = np.array([station["focal_scale"] for station in stations])
     sigma = np.array([station["sigma_focal_scale"] for station in stations])
     assert np.all(sigma <= BREATHING_SIGMA)  # no data take away what is known beforehand
     assert sigma.min() < 0.99 * BREATHING_SIGMA
-    assert np.all(np.abs(found - truth.focal_scale) < 3.5 * sigma)
+    assert np.all(np.abs(values - truth.focal_scale) < 3.5 * sigma)
 
 
 def test_normals_turn_with_the_focal_length_as_stated(looked):
@@ -434,8 +444,8 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
     for s in range(3):
         change = np.zeros((1, u.count))
         change[0, u.breathing.start + s] = step
-        moved = problem.moved(state, change, np.zeros((1, 3, 6)))
-        slope = (problem.residuals(moved).value - problem.residuals(state).value) / step
+        shifted = problem.retract(state, change, np.zeros((1, 3, 6)))
+        slope = (problem.residuals(shifted).value - problem.residuals(state).value) / step
         here = linear.by_shared[..., u.breathing.start + s]
         np.testing.assert_allclose(slope[linear.usable], here[linear.usable], atol=1e-6)
         assert np.abs(here).max() > 0.1
@@ -477,29 +487,29 @@ def view_of(session, p, poses):
     return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
-def found_with(monkeypatch, truth, doubts, textured=False):
+def found_with(monkeypatch, truth, faults, textured=False):
     """Photographs are found where they were taken, with doubts; textured: the room tells too."""
 
-    def look(_session, photograph, _before, _found, _others, _asked):
-        T, doubt = truth.T_camera_base[photograph.station], doubts[photograph.station]
-        lead = np.log(1 / doubt - 1)
-        places = Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
-        return places, AskedPlaces.nothing()
+    def measure(_session, photograph, _before, _found, _others, _asked):
+        T, fault = truth.T_camera_base[photograph.station], faults[photograph.station]
+        lead = np.log(1 / fault - 1)
+        places = PoseHypotheses(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
+        return places, ScoredPoses.nothing()
 
-    nowhere = Alone(np.eye(4)[None], np.zeros(1), 1.0)
-    monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)
-    monkeypatch.setattr(byhand, "look_closer", look)
-    monkeypatch.setattr(byhand, "THREADS", 1)
+    nowhere = PoseHypotheses(np.eye(4)[None], np.zeros(1), 1.0)
+    monkeypatch.setattr(handheld, "localize_image", lambda _view, _image: nowhere)
+    monkeypatch.setattr(handheld, "rescore_poses", measure)
+    monkeypatch.setattr(handheld, "THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
-        monkeypatch.setattr(surroundings, "texture_of", lambda _image, _camera: empty)
+        monkeypatch.setattr(background, "texture_of", lambda _image, _camera: empty)
 
 
-def placed(looked, monkeypatch, doubts, textured=False):
+def placed(remeasured, monkeypatch, faults, textured=False):
     """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
-    session, photographs, _, truth = looked
-    found_with(monkeypatch, truth, doubts, textured)
-    return byhand.place(session, photographs, Boards(), np.random.default_rng(0))
+    session, photographs, _, truth = remeasured
+    found_with(monkeypatch, truth, faults, textured)
+    return handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
 
 
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
@@ -511,15 +521,15 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
 
     def texture(image, camera):
         k = next(k for k, p in enumerate(photographs) if p.images[0] is image)
-        seen = apply(truth.T_camera_base[k], world)
-        pixel = camera.project(np.where(seen[:, 2:] > 0.1, seen, np.nan))
+        visible = apply(truth.T_camera_base[k], world)
+        pixel = camera.project(np.where(visible[:, 2:] > 0.1, visible, np.nan))
         with np.errstate(invalid="ignore"):
             inside = ((pixel > 0) & (pixel < camera.image_size)).all(axis=1)
         return Texture(camera.ray(pixel[inside]), pixel[inside], names[inside])
 
-    monkeypatch.setattr(surroundings, "texture_of", texture)
-    found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
-    assert [s.name for s in found.session.stations] == [s.name for s in looked[0].stations]
+    monkeypatch.setattr(background, "texture_of", texture)
+    results = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
+    assert [s.name for s in results.session.stations] == [s.name for s in looked[0].stations]
 
 
 def test_a_board_on_the_base_serves_photographs_by_hand(folder):
@@ -528,18 +538,18 @@ def test_a_board_on_the_base_serves_photographs_by_hand(folder):
     text = board + "board: {file: board.yaml, fixed_to: base}\n"
     (folder / "session.yaml").write_text(text)
     (folder / "board.yaml").write_text("type: charuco\n")
-    assert not any("board" in told for told in load_session(folder).warnings)
+    assert not any("board" in values for values in load_session(folder).warnings)
 
 
 def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
-    found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
-    assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
-    assert [p.station for p in found.photographs] == [0, 1]
-    off = pose_difference(found.known.T_camera_base, looked[3].T_camera_base[[0, 2]])
+    results = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
+    assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    assert [p.station for p in results.photographs] == [0, 1]
+    off = pose_difference(results.scene.T_camera_base, looked[3].T_camera_base[[0, 2]])
     # as the joint estimate has them: two photographs tell little of a machine
     assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
-    (warning,) = found.session.warnings
+    (warning,) = results.session.warnings
     assert warning.startswith(
         "images/phone/0001-1.jpg: left out, for its edges fit the legs nearly"
     )
@@ -549,50 +559,52 @@ def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
 def test_places_are_believed_while_all_together_leave_little_doubt():
     """Of those that are asked, their share of the doubt that a session may leave."""
     one = {
-        k: Alone(np.stack([np.eye(4)] * 2), np.array([np.log(1 / doubt - 1), 0.0]), 1.0)
-        for k, doubt in enumerate([0.02, 0.3, 0.001, 0.02, 0.012])
+        k: PoseHypotheses(np.stack([np.eye(4)] * 2), np.array([np.log(1 / fault - 1), 0.0]), 1.0)
+        for k, fault in enumerate([0.02, 0.3, 0.001, 0.02, 0.012])
     }
-    assert byhand._sure(one, 5) == [2, 4, 0]
-    assert byhand._sure(one, 10) == [2, 4]
-    assert byhand._sure({}, 5) == []
+    assert handheld._sure(one, 5) == [2, 4, 0]
+    assert handheld._sure(one, 10) == [2, 4]
+    assert handheld._sure({}, 5) == []
 
 
 def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
     """However well its silhouettes lie on something: it tells no machine."""
-    told = []
+    rows = []
 
     def bare(scene, photograph):
-        told.append(sorted(scene.edges))
+        rows.append(sorted(scene.edges))
         return photograph.station == 1
 
-    monkeypatch.setattr(byhand, "_is_bare", bare)
-    found = placed(looked, monkeypatch, [1e-4, 1e-4, 1e-4])
-    assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
-    assert sorted(found.known.edges) == [0, 1]
-    (warning,) = found.session.warnings
+    monkeypatch.setattr(handheld, "_too_few_edges", bare)
+    results = placed(looked, monkeypatch, [1e-4, 1e-4, 1e-4])
+    assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    assert sorted(results.scene.edges) == [0, 1]
+    (warning,) = results.session.warnings
     assert warning.startswith("images/phone/0001-1.jpg: left out, for too few of its edges agree")
-    assert len(told) < 12  # it is not asked for ever
+    assert len(rows) < 12  # it is not asked for ever
 
 
 def test_legs_are_measured_where_a_photograph_is_and_not_elsewhere(looked):
     session, photographs, poses, truth = looked
     p = photographs[EASIEST]
-    there = KnownScene(session.machine, truth.T_camera_base, poses)
-    assert not byhand._is_bare(there, p)
+    there = PriorScene(session.machine, truth.T_camera_base, poses)
+    assert not handheld._too_few_edges(there, p)
     turn = pose(rotation(np.array([0.0, 0.0, np.radians(40.0)])), np.zeros(3))
     elsewhere = there._replace(T_camera_base=truth.T_camera_base @ turn)
-    assert byhand._is_bare(elsewhere, p)
+    assert handheld._too_few_edges(elsewhere, p)
 
 
 def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
     found_with(monkeypatch, looked[3], [1e-4, 0.3, 1e-4])
-    found = check_session(simulated)
-    assert [station.recognised for station in found.stations] == [True, False, True]
-    assert found.stations[0].legs > 2
-    said = [finding.text for finding in found.findings]
-    assert any(text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in said)
-    assert not any("not recognised" in text for text in said)
-    assert found.forecast is None
+    check = check_session(simulated)
+    assert [station.recognised for station in check.stations] == [True, False, True]
+    assert check.stations[0].legs > 2
+    words = [finding.text for finding in check.findings]
+    assert any(
+        text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in words
+    )
+    assert not any("not recognised" in text for text in words)
+    assert check.forecast is None
 
 
 def test_no_photograph_by_hand_is_recognised(looked, monkeypatch):
@@ -610,34 +622,38 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     calibration, _ = breathed
     session, measurements = calibration.session, calibration.measurements
     estimate, T = calibration.estimate, calibration.estimate.state.T_camera_base
-    assert misplaced(session, measurements, estimate, T) == {}
+    assert inconsistent_poses(session, measurements, estimate, T) == {}
     weights = estimate.edge_weights.copy()
     weights[measurements.edges.station == 1] *= 0.4
     given_up = replace(estimate, edge_weights=weights)
-    wrong = misplaced(session, measurements, given_up, T)
+    wrong = inconsistent_poses(session, measurements, given_up, T)
     assert wrong == {1: EDGES_DISAGREE_REASON}
     # nor do three legs, none of which another one contradicts
     edges = measurements.edges
     fewer = edges.select((edges.station != 2) | (edges.leg < 3))
     mine = (edges.station != 2) | (edges.leg < 3)
     of_three = replace(estimate, edge_weights=estimate.edge_weights[mine])
-    assert misplaced(session, replace(measurements, edges=fewer), of_three, T) == {
+    assert inconsistent_poses(session, replace(measurements, edges=fewer), of_three, T) == {
         2: EDGES_DISAGREE_REASON
     }
     # a board that agrees tells its place
-    shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
+    visible = SimpleNamespace(
+        edges=measurements.edges, poses=SimpleNamespace(station=np.array([1]))
+    )
     with_board = replace(given_up, pose_weights=np.ones(1))
-    assert misplaced(session, shown, with_board, T) == {}
+    assert inconsistent_poses(session, visible, with_board, T) == {}
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
-    assert misplaced(session, measurements, estimate, perturb(T, turn)) == {2: CAMERA_TURNED_REASON}
+    assert inconsistent_poses(session, measurements, estimate, perturb(T, turn)) == {
+        2: CAMERA_TURNED_REASON
+    }
     photographs = read_photographs(session)
-    known = KnownScene.as_drawn(session.machine, T, session.joints)
-    seen = SeenSession(session, photographs, Boards(), known)
-    rest = without_misplaced(seen, wrong, edges, estimate)
+    scene = PriorScene.as_drawn(session.machine, T, session.joints)
+    case = Case(session, photographs, Boards(), scene)
+    rest = without_misplaced(case, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     # the others are where the estimate has them, by the edges that it was made from
-    np.testing.assert_array_equal(rest.known.T_camera_base, T[[0, 2]])
-    assert {k: len(found) for k, found in rest.known.edges.items()} == {
+    np.testing.assert_array_equal(rest.scene.T_camera_base, T[[0, 2]])
+    assert {k: len(results) for k, results in rest.scene.edges.items()} == {
         k: (edges.station == old).sum() for k, old in enumerate([0, 2])
     }
     assert "too few of its edges agree" in rest.session.warnings[-1]
@@ -648,10 +664,10 @@ def test_tubes_stand_out_of_a_chart():
     image = np.full((300, 400), 60, np.uint8)
     cv2.line(image, (100, 220), (300, 80), 200, 10, cv2.LINE_AA)
     chart = tube_chart(image, camera_of_size((400, 300)))
-    clear = chart.rarity.max(axis=(2, 3))
+    clear = chart.surprisal.max(axis=(2, 3))
     wide = int(chart.width_number(np.array(10.0)))
     normal = round(np.arctan2(200, 140) % np.pi * PAIR_DIRECTIONS / np.pi)
-    assert clear[wide, normal] > RARITY_STEPS * np.log(20)
+    assert clear[wide, normal] > SURPRISAL_STEPS * np.log(20)
     assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
 
 
@@ -661,9 +677,9 @@ def test_one_photograph_is_found_from_nothing(looked):
     k = EASIEST
     p = photographs[k]
     view = view_of(session, p, poses)
-    found = find_alone(view, p.images[0])
-    off = pose_difference(found.T_camera_base[0], truth.T_camera_base[k])
-    assert found.doubt < SECOND_PLACE_DOUBT
+    value = localize_image(view, p.images[0])
+    off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
+    assert value.rival_probability < RIVAL_POSE_PROBABILITY
     assert np.degrees(np.linalg.norm(off[:3])) < 4
     assert np.linalg.norm(off[3:]) < 0.1
 
@@ -673,12 +689,12 @@ def test_turns_of_a_machine_onto_itself(looked):
     session, photographs, poses, truth = looked
     p = photographs[0]
     view = view_of(session, p, poses)
-    alike = turned_about(view, truth.T_camera_base[:1])
-    assert len(alike) == 2
+    same = symmetric_poses(view, truth.T_camera_base[:1])
+    assert len(same) == 2
     base = session.machine.base_centers()
-    seen = apply(alike[:, None], base)
+    points = apply(same[:, None], base)
     first = apply(truth.T_camera_base[0], base)
-    for turned in seen:
+    for turned in points:
         apart = np.linalg.norm(turned[:, None] - first, axis=-1)
         assert np.all(apart.min(axis=1) < 0.06)
         assert np.all(apart.argmin(axis=1) != np.arange(6))
@@ -690,32 +706,36 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     p = photographs[1]
     view = view_of(session, p, poses)
     true = truth.T_camera_base[1]
-    places = np.concatenate([turned_about(view, true[None]), true[None]])
-    equal = Alone(places, np.full(len(places), 20.0), 1.0)
-    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    found, _ = look_closer(session, p, drawn, equal, NONE)
-    assert equal.doubt == 0.5
-    assert found.doubt < 1e-3
-    assert np.degrees(angle_between(found.T_camera_base[0], true)) < 4
+    places = np.concatenate([symmetric_poses(view, true[None]), true[None]])
+    equal = PoseHypotheses(places, np.full(len(places), 20.0), 1.0)
+    drawn = PriorScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    count, _ = rescore_poses(session, p, drawn, equal, NONE)
+    assert equal.rival_probability == 0.5
+    assert count.rival_probability < 1e-3
+    assert np.degrees(angle_between(count.T_camera_base[0], true)) < 4
     # one place alone is weighed against chance
-    one = Alone(true[None], np.array([20.0]), equal.unit)
-    alone, _ = look_closer(session, p, drawn, one, NONE)
+    one = PoseHypotheses(true[None], np.array([20.0]), equal.unit)
+    alone, _ = rescore_poses(session, p, drawn, one, NONE)
     # a place that others tell of is asked about as well
-    told, _ = look_closer(
+    values, _ = rescore_poses(
         session,
         p,
         drawn,
-        Alone(equal.T_camera_base[1:], equal.evidence[1:], equal.unit),
+        PoseHypotheses(equal.T_camera_base[1:], equal.log_likelihood_ratio[1:], equal.unit),
         true[None],
     )
-    assert np.degrees(angle_between(told.T_camera_base[0], true)) < 2
-    assert alone.doubt < 1e-3
+    assert np.degrees(angle_between(values.T_camera_base[0], true)) < 2
+    assert alone.rival_probability < 1e-3
 
 
-def evidence_there(known, view):
+def evidence_there(reference_values, view):
     """Evidence of the third photograph's place by what is known."""
-    here = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-    return evidence_of(here, known.T_camera_base[[2]], np.zeros(1, dtype=int), 16).sum()
+    here = replace(
+        view, machine=reference_values.machine, all_poses=reference_values.T_base_platform
+    )
+    return log_likelihood_of(
+        here, reference_values.T_camera_base[[2]], np.zeros(1, dtype=int), 16
+    ).sum()
 
 
 def test_photographs_join_what_is_known(looked):
@@ -723,22 +743,22 @@ def test_photographs_join_what_is_known(looked):
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
-    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    known = join(session, at, drawn, places, Boards())
-    assert sorted(known.edges) == [0, 1]
+    drawn = PriorScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    names = register_images(session, at, drawn, places, Boards())
+    assert sorted(names.edges) == [0, 1]
     T = truth.T_camera_base[2]
     view = finest_view(session.machine, at[2], session.joints, poses)
-    right, paid = ask(session, known, 2, T, view)
+    right, paid = evaluate_pose(session, names, 2, T, view)
     assert sorted(right.edges) == [2]
     assert len(right.edges[2]) > 6
     # half the squares of what its edges tell, two numbers each
     assert paid < len(right.edges[2])
     other = replace(view, configuration=at[0].configuration)
-    wrong, _ = ask(session, known, 2, T, other)
+    wrong, _ = evaluate_pose(session, names, 2, T, other)
     assert evidence_there(right, view) > 3 * evidence_there(wrong, other)
     nowhere = perturb(np.eye(4), np.array([np.pi, 0, 0, 0, 0, 0])) @ T
     with pytest.raises(InputError, match="neither an edge"):
-        ask(session, known, 2, nowhere, view)
+        evaluate_pose(session, names, 2, nowhere, view)
 
 
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
@@ -751,16 +771,18 @@ def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
         estimated.append(measurements.n_stations)
         return bundle(machine, measurements, start, **options)
 
-    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    known = join(session, at, drawn, dict(enumerate(truth.T_camera_base[:2])), Boards())
+    drawn = PriorScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    numbers = register_images(
+        session, at, drawn, dict(enumerate(truth.T_camera_base[:2])), Boards()
+    )
     true = truth.T_camera_base[2:]
-    found = Alone(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
-    monkeypatch.setattr(closely, "bundle", counted)
-    one, asked = look_closer(session, at[2], known, found, true)
-    assert estimated == [1] * closely.LOOKS_BY_TOLD_MACHINE
-    again, both = look_closer(session, at[2], known, found, true, asked)
-    assert estimated == [1] * closely.LOOKS_BY_TOLD_MACHINE
-    assert len(both.paid) == len(asked.paid)
+    hypotheses = PoseHypotheses(np.concatenate([true, true]), np.array([20.0, 20.0]), 1.0)
+    monkeypatch.setattr(pose_scoring, "bundle", counted)
+    one, queries = rescore_poses(session, at[2], numbers, hypotheses, true)
+    assert estimated == [1] * pose_scoring.PASSES_FROM_PRIOR
+    again, both = rescore_poses(session, at[2], numbers, hypotheses, true, queries)
+    assert estimated == [1] * pose_scoring.PASSES_FROM_PRIOR
+    assert len(both.paid) == len(queries.paid)
     np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 
 
@@ -770,8 +792,8 @@ def test_a_board_on_the_base_weighs_places_together(looked):
     turns = [
         pose(rotation(np.radians(a) * np.array([0.0, 0.0, 1.0])), np.zeros(3)) for a in (120, 240)
     ]
-    found = {
-        k: Alone(np.stack([T @ turn, T]), np.array([20.0, 19.0]), 1.0)
+    hypotheses = {
+        k: PoseHypotheses(np.stack([T @ turn, T]), np.array([20.0, 19.0]), 1.0)
         for k, (T, turn) in enumerate(zip(truth, (*turns, turns[0]), strict=True))
     }
     T_base_board = perturb(np.eye(4), np.array([0.1, 0.2, 0.3, 0.05, 0.0, 0.02]))
@@ -779,12 +801,14 @@ def test_a_board_on_the_base_weighs_places_together(looked):
         k: SimpleNamespace(stood=SimpleNamespace(T_camera_board=T @ T_base_board))
         for k, T in enumerate(truth[:2])
     })  # fmt: skip
-    told = byhand._on_board(found, boards)
-    assert sorted(told) == [0, 1]  # the third does not show it
-    for k, one in told.items():
-        assert one.doubt < 1e-6
+    rows = handheld._on_board(hypotheses, boards)
+    assert sorted(rows) == [0, 1]  # the third does not show it
+    for k, one in rows.items():
+        assert one.rival_probability < 1e-6
         assert angle_between(one.T_camera_base[0], truth[k]) < 1e-6
     # a photograph in which nothing was found gets its place from the board
-    found[1] = Alone(truth[1:2] @ turns[0], np.array([-5.0]), 1.0)
-    assert angle_between(byhand._on_board(found, boards)[1].T_camera_base[1], truth[1]) < 1e-6
-    assert byhand._on_board(found, boards.of(np.array([2]))) == {}
+    hypotheses[1] = PoseHypotheses(truth[1:2] @ turns[0], np.array([-5.0]), 1.0)
+    assert (
+        angle_between(handheld._on_board(hypotheses, boards)[1].T_camera_base[1], truth[1]) < 1e-6
+    )
+    assert handheld._on_board(hypotheses, boards.of(np.array([2]))) == {}

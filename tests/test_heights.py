@@ -13,8 +13,8 @@ import printers
 from conftest import run
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.saved import load
-from pkmcal.calibration.source import MachineSource, load_source
+from pkmcal.calibration.machine_source import MachineSource, load_source
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.export import reprap
 from pkmcal.export.contract import make_export
@@ -56,22 +56,22 @@ def kit(true, tmp_path_factory):
     return folder / "kit"
 
 
-def flat(true, told, says=SAYS):
+def flat(true, values, describe=SAYS):
     """Heights (n,) mm over places that nobody probed, where a firmware with values commands Z 0."""
     rng = np.random.default_rng(9)
     r, a = 90 * np.sqrt(rng.uniform(size=200)), rng.uniform(0, 2 * np.pi, 200)
     points = np.column_stack([r * np.cos(a), r * np.sin(a), np.zeros(200)])
-    readings = says.homed - (told.homed - told.carriages(points))
+    readings = describe.homed - (values.homed - values.carriages(points))
     return 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
 
 
 def pasted(text):
     """Settings of an exported text."""
-    found = klipper.sections(text, "x")
-    rows = [found[f"stepper_{s}"] for s in "abc"]
+    config = klipper.sections(text, "x")
+    rows = [config[f"stepper_{s}"] for s in "abc"]
     names = ("angle", "arm_length", "position_endstop")
     each = [tuple(float(row[name][0]) for row in rows) for name in names]
-    return printers.Settings(float(found["printer"]["delta_radius"][0]), *each)
+    return printers.Settings(float(config["printer"]["delta_radius"][0]), *each)
 
 
 def test_the_session_says_what_the_printer_felt(kit, true):
@@ -117,8 +117,8 @@ def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
 
 
 def test_a_level_bed_stays_level(kit):
-    found = calibrate_session(kit)
-    up = found.estimate.state.T_camera_base[0, :3, 2]
+    calibration = calibrate_session(kit)
+    up = calibration.estimate.state.T_camera_base[0, :3, 2]
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
     text = (kit / "session.yaml").read_text()
     other = kit.parent / "tilted"
@@ -146,14 +146,14 @@ def test_deviations_of_the_bed_hold(tmp_path):
         readings = printers.felt(true, printers.bed(13), 0.02, rng)
         (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
         write_printer_session(tmp_path / str(run_), tmp_path / "printer.cfg")
-        found = calibrate_session(tmp_path / str(run_))
-        bed = found.findings.bed
-        (text,) = Klipper().files(MachineSource(found.machine, bed=bed.z)).values()
+        calibration = calibrate_session(tmp_path / str(run_))
+        bed = calibration.findings.bed
+        (text,) = Klipper().files(MachineSource(calibration.machine, bed=bed.z)).values()
         z = 1e-3 * flat(true, pasted(text))
         bend.append(np.std(z) / bed.sigma)
         xy = printers.bed(30)
         T = pose(np.eye(3), 1e-3 * np.column_stack([xy, np.zeros(30)]))
-        there = true.forward(found.machine.inverse(T))[:, :2, 3]
+        there = true.forward(calibration.machine.inverse(T))[:, :2, 3]
         plane = np.column_stack([1e-3 * xy, np.ones(30)])
         slope = np.linalg.lstsq(plane, there, rcond=None)[0]
         size.append((np.trace(slope[:2]) / 2 - 1) / bed.size)
@@ -168,12 +168,12 @@ def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
     readings[9] += 0.3
     (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
     write_printer_session(tmp_path / "kit", tmp_path / "printer.cfg")
-    found = calibrate_session(tmp_path / "kit")
-    assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [9]
-    bed = found.findings.bed
-    (text,) = Klipper().files(MachineSource(found.machine, bed=bed.z)).values()
+    calibration = calibrate_session(tmp_path / "kit")
+    assert np.flatnonzero(calibration.estimate.pose_weights < 0.5).tolist() == [9]
+    bed = calibration.findings.bed
+    (text,) = Klipper().files(MachineSource(calibration.machine, bed=bed.z)).values()
     assert np.std(flat(true, pasted(text))) < 2.2e3 * bed.sigma
-    assert found.verdict.usable
+    assert calibration.verdict.usable
 
 
 def test_heights_that_are_no_gain_are_refused(true, tmp_path):
@@ -262,12 +262,12 @@ def test_a_rejection_that_nothing_confirms_is_refused_and_named(tmp_path):
     """
     for n, usable in ((7, False), (19, True)):
         kit = session_of(tmp_path / str(n), 0.3, n, wrong=[(3, 2.0)])
-        found = calibrate_session(kit)
-        assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [3]
-        assert found.verdict.usable == usable
-        (named,) = found.verdict.of("rejected.units")
+        calibration = calibrate_session(kit)
+        assert np.flatnonzero(calibration.estimate.pose_weights < 0.5).tolist() == [3]
+        assert calibration.verdict.usable == usable
+        (named,) = calibration.verdict.of("rejected.units")
         assert (named.facts["of"], named.facts["names"]) == (f"{n} heights", ["004"])
-        unconfirmed = found.verdict.of("rejected.unconfirmed")
+        unconfirmed = calibration.verdict.of("rejected.unconfirmed")
         assert len(unconfirmed) == (not usable)
         assert all("004" in one.subject for one in unconfirmed)
     done = run("calibrate", tmp_path / "7" / "kit")
@@ -286,20 +286,20 @@ def test_an_uneven_bed_is_no_population_of_outliers(tmp_path):
         49,
         bed=lambda xy: 0.1 * np.sin(xy[:, 0] / 20) * np.cos(xy[:, 1] / 17),
     )
-    found = calibrate_session(kit)
-    assert np.mean(found.estimate.pose_weights < 0.5) < 0.05
-    assert found.estimate.statistics.pose_scale > 2
-    bent = np.std(flat_of_small(-1.0, found))
-    assert not found.verdict.usable or bent < 3e3 * found.findings.bed.sigma
+    calibration = calibrate_session(kit)
+    assert np.mean(calibration.estimate.pose_weights < 0.5) < 0.05
+    assert calibration.estimate.statistics.pose_scale > 2
+    bent = np.std(flat_of_small(-1.0, calibration))
+    assert not calibration.verdict.usable or bent < 3e3 * calibration.findings.bed.sigma
 
 
-def flat_of_small(off, found):
+def flat_of_small(off, value):
     """Heights (n,) mm over the bed of such a printer with what is exported of a result."""
     true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
-    (text,) = Klipper().files(MachineSource(found.machine, bed=found.findings.bed.z)).values()
+    (text,) = Klipper().files(MachineSource(value.machine, bed=value.findings.bed.z)).values()
     points = np.column_stack([printers.bed(60, 75.0), np.zeros(60)])
-    told = pasted(text)
-    readings = SMALL.homed - (told.homed - told.carriages(points))
+    values = pasted(text)
+    readings = SMALL.homed - (values.homed - values.carriages(points))
     return 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
 
 
@@ -314,12 +314,16 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
         readings[n // 2] += 0.3
         (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
         write_printer_session(tmp_path / str(n), tmp_path / "printer.cfg")
-        found = calibrate_session(tmp_path / str(n))
-        (text,) = Klipper().files(MachineSource(found.machine, bed=found.findings.bed.z)).values()
+        calibration = calibrate_session(tmp_path / str(n))
+        (text,) = (
+            Klipper()
+            .files(MachineSource(calibration.machine, bed=calibration.findings.bed.z))
+            .values()
+        )
         bent[n] = float(np.std(flat(true, pasted(text))))
-        assert found.verdict.usable
-        assert (found.estimate.pose_weights < 0.5).sum() == (n == 13)
-        warned = found.verdict.of("bed.height_unnoticed")
+        assert calibration.verdict.usable
+        assert (calibration.estimate.pose_weights < 0.5).sum() == (n == 13)
+        warned = calibration.verdict.of("bed.height_unnoticed")
         assert len(warned) == (n == 7)
         if n == 7:
             assert (warned[0].facts["touches"], warned[0].facts["more"]) == (7, 8)
@@ -442,8 +446,8 @@ def test_points_of_reprapfirmware(tmp_path):
     lines[-1] += " S-1"
     heights = " ".join(f"{z:.3f}" for z in Z)
     text = "\n".join([*lines, f"G32 bed probe heights: {heights}, mean 0.05, deviation 0.2"])
-    found = read_touches(said(tmp_path, text), printer)
-    np.testing.assert_allclose(found.carriages, want, atol=2e-3)
+    values = read_touches(said(tmp_path, text), printer)
+    np.testing.assert_allclose(values.carriages, want, atol=2e-3)
 
 
 def test_points_of_a_height_map(tmp_path):
@@ -455,11 +459,11 @@ def test_points_of_a_height_map(tmp_path):
         "X,Y,-40.00,40.00,-30.00,30.00,50.00,40.00,30.00,3,3\n"
         "      0,  0.010,      0\n  0.020,  0.000, -0.030\n  0.040,  0.050,      0\n"
     )
-    found = read_touches(said(tmp_path, text, "heightmap.csv"), printer)
+    results = read_touches(said(tmp_path, text, "heightmap.csv"), printer)
     points = [(0, -30, 0.01), (-40, 0, 0.02), (0, 0, 0), (40, 0, -0.03), (-40, 30, 0.04),
               (0, 30, 0.05)]  # fmt: skip
     want = reprap_settings().carriages(np.array(points, dtype=float))
-    np.testing.assert_allclose(found.carriages, want, atol=1e-9)
+    np.testing.assert_allclose(results.carriages, want, atol=1e-9)
     old = text.replace("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1",
                        "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum")  # fmt: skip
     old = old.replace("X,Y,-40", "-40")
@@ -487,8 +491,8 @@ def test_a_step_is_what_the_motor_makes_of_it(true, tmp_path):
     head, tail = text.split("[stepper_b]", 1)
     first = head + "[stepper_b]" + tail.replace("microsteps: 16\nrotation_distance: 40\n", "")
     for kind in (text, geared, fine, first):
-        found = read_printer(said(tmp_path, kind, "printer.cfg"))
-        np.testing.assert_allclose(found.touches.carriages, readings, atol=1e-5)
+        printer = read_printer(said(tmp_path, kind, "printer.cfg"))
+        np.testing.assert_allclose(printer.touches.carriages, readings, atol=1e-5)
 
 
 def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
@@ -517,8 +521,8 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
     (path,) = (tmp_path / "kit" / "export-reprap").iterdir()
     words = reprap.read_words(path.read_text())
     assert words["665B"].tolist() == [90.0]  # the printer's own
-    told = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
-    travel = reprap.homed_carriages(words) - reprap.reprap_carriage_heights(words, told)
+    values = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
+    travel = reprap.homed_carriages(words) - reprap.reprap_carriage_heights(words, values)
     there = 1e3 * true.forward(1e-3 * (SAYS.homed - travel))[:, 2, 3]
     assert np.abs(z).max() > 0.3
     assert np.sqrt(np.mean(there**2)) < NOISE

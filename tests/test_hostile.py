@@ -49,14 +49,14 @@ def tree(root, but=()):
     for folder, folders, files in os.walk(root):
         folders[:] = [name for name in folders if Path(folder, name) not in but]
         for path in {Path(folder, name) for name in (*folders, *files)} - {*but}:
-            told = path.lstat()
+            values = path.lstat()
             if path.is_symlink():
                 content = str(path.readlink())
-            elif stat.S_ISREG(told.st_mode):
-                content = hashlib.sha256(path.read_bytes()).hexdigest(), told.st_mtime_ns
+            elif stat.S_ISREG(values.st_mode):
+                content = hashlib.sha256(path.read_bytes()).hexdigest(), values.st_mtime_ns
             else:
                 content = ""
-            out[str(path.relative_to(root))] = stat.S_IFMT(told.st_mode), told.st_mode, content
+            out[str(path.relative_to(root))] = stat.S_IFMT(values.st_mode), values.st_mode, content
     return out
 
 

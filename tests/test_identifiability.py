@@ -14,12 +14,12 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
 from pkmcal.identify.start import start_state
-from pkmcal.identify.unidentified import explain, seen_legs
+from pkmcal.identify.unidentified import explain, observed_legs
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
@@ -58,27 +58,27 @@ def told(machine, measurements, state):
     return identifiability(info, machine)
 
 
-def surprise(machine, found, state):
+def surprise(machine, value, state):
     """Squared errors by the whole covariance, per freedom: 1 is expected, frames left out."""
     truth = in_gauge(machine, state, default_gauge(machine))
-    error = found.machine.values - machine.parameters.unit_axes(truth.theta)
-    sigma = np.sqrt(np.diag(found.covariance))
+    error = value.machine.values - machine.parameters.unit_axes(truth.theta)
+    sigma = np.sqrt(np.diag(value.covariance))
     free = sigma > 1e-9
-    correlation = found.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    correlation = value.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     values, vectors = np.linalg.eigh(correlation)
-    known = values > 1e-9 * values[-1]
-    z = vectors[:, known].T @ (error[free] / sigma[free])
-    return float(np.mean(z**2 / values[known]))
+    above_limit = values > 1e-9 * values[-1]
+    z = vectors[:, above_limit].T @ (error[free] / sigma[free])
+    return float(np.mean(z**2 / values[above_limit]))
 
 
-def verdict(measurements, found):
+def verdict(measurements, value):
     nothing = np.zeros((0, 2)), np.zeros(0, dtype=int)
-    observation = Observation(measurements.edges, (), *nothing, found.state.T_camera_base)
-    seen = seen_legs(
-        measurements.edges, found.edge_weights, measurements.n_stations, found.machine.n_legs
+    observation = Observation(measurements.edges, (), *nothing, value.state.T_camera_base)
+    observed = observed_legs(
+        measurements.edges, value.edge_weights, measurements.n_stations, value.machine.n_legs
     )
-    told = identifiability(as_ended(measurements, found)[1], found.machine)
-    return judge(observation, found, explain(told, found, seen))
+    values = identifiability(linearize_at_solution(measurements, value)[1], value.machine)
+    return judge(observation, value, explain(values, value, observed))
 
 
 def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
@@ -91,13 +91,13 @@ def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
     for radii, lost in ((False, 6), (True, 7)):
         drawn = machine if radii else without_radii(machine)
         session = Session(drawn, settings=Settings(stations=2, configurations=8, tolerance=0.0))
-        found = told(drawn, session.measurements, session.state())
-        assert len(found.unidentified) == lost
+        count = told(drawn, session.measurements, session.state())
+        assert len(count.unidentified) == lost
         frames = generators(machine.layout, machine.values) @ freedoms(drawn)
-        unknown = np.linalg.qr(np.concatenate([frames, found.basis.T], axis=1))[0]
+        unknown = np.linalg.qr(np.concatenate([frames, count.basis.T], axis=1))[0]
         common = common_turns(machine)
-        left = common - unknown @ (unknown.T @ common)
-        assert np.abs(left).max() < 1e-6
+        residual = common - unknown @ (unknown.T @ common)
+        assert np.abs(residual).max() < 1e-6
         # six more than the frames: with the radii known, these are all
         assert np.linalg.matrix_rank(np.concatenate([frames, common], axis=1)) == 12 + 6
 
@@ -119,10 +119,10 @@ def test_one_camera_sees_four_legs_of_six():
     machine = hexapod()
     session = Session(machine, stations=1, configurations=20)
     measurements = seen_by(session, [[0, 1, 2, 3]])
-    found = told(machine, measurements, session.state())
+    value = told(machine, measurements, session.state())
     # of the two legs in no photograph only the tubes are unknown, two each
-    names = {n for d in found.unidentified for n in d.names}
-    assert len(found.unidentified) == 4
+    names = {n for d in value.unidentified for n in d.names}
+    assert len(value.unidentified) == 4
     assert names == {f"legs[{j}].tubes[{t}].radius" for j in (5, 6) for t in (1, 2)}
     estimate = bundle(machine, measurements, session.guess(np.random.default_rng(0), measurements))
     assert surprise(machine, estimate, session.state()) < LARGEST
@@ -136,8 +136,8 @@ def test_three_cameras_that_share_no_leg(board):
     boards = ("base",) if board else ()
     session = Session(machine, stations=3, configurations=2, boards=boards)
     measurements = seen_by(session, [[0, 1], [2, 3], [4, 5]])
-    found = told(machine, measurements, session.state())
-    assert len(found.unidentified) == (0 if board else 12)
+    count = told(machine, measurements, session.state())
+    assert len(count.unidentified) == (0 if board else 12)
     estimate = bundle(machine, measurements, session.guess(np.random.default_rng(0), measurements))
     if not board:
         refused = verdict(measurements, estimate)
@@ -169,8 +169,8 @@ def normalised_steps(machine, state, truth):
     """RMS (m) of the base centres by the four steps."""
     gauge = default_gauge(machine)
     index = np.concatenate([g.index[:, :3] for g in machine.layout.base])
-    found, true = (in_gauge(machine, s, gauge).theta[index] for s in (state, truth))
-    return np.sqrt(np.mean((found - true) ** 2))
+    values, true = (in_gauge(machine, s, gauge).theta[index] for s in (state, truth))
+    return np.sqrt(np.mean((values - true) ** 2))
 
 
 def measured(machine, poses, T_camera_base, seed=0):
@@ -242,8 +242,8 @@ def test_poor_data_give_large_deviations_or_a_refusal(poses, places, seed):
     measurements, truth = measured(machine, poses(machine), places(machine), seed)
     rough = np.random.default_rng(seed).normal(size=(len(truth.T_camera_base), 6))
     rough = perturb(truth.T_camera_base, rough * np.repeat([0.02, 0.01], 3))
-    found = bundle(machine, measurements, start_state(machine, measurements, rough))
-    assert surprise(machine, found, truth) < LARGEST
+    fit = bundle(machine, measurements, start_state(machine, measurements, rough))
+    assert surprise(machine, fit, truth) < LARGEST
 
 
 def test_upright_legs_that_only_heave_are_refused(tmp_path):
@@ -256,8 +256,8 @@ def test_upright_legs_that_only_heave_are_refused(tmp_path):
     target, up = np.array([0, 0, 0.2]), np.array([0, 0, 1.0])
     stations = np.stack([look_at(place, target, up) for place in places])
     measurements, _ = measured(machine, heave(machine), stations)
-    found = bundle(machine, measurements, start_state(machine, measurements, stations))
-    refused = verdict(measurements, found)
+    fit = bundle(machine, measurements, start_state(machine, measurements, stations))
+    refused = verdict(measurements, fit)
     assert not refused.usable
     (singular,) = refused.of("configurations.singular")
     assert (singular.facts["number"], singular.facts["of"]) == (12, 12)
@@ -267,5 +267,5 @@ def test_upright_legs_that_only_heave_are_refused(tmp_path):
 def test_one_configuration_is_refused():
     machine = hexapod()
     measurements, truth = measured(machine, one_configuration(machine), around(machine))
-    found = bundle(machine, measurements, start_state(machine, measurements, truth.T_camera_base))
-    assert not verdict(measurements, found).usable
+    fit = bundle(machine, measurements, start_state(machine, measurements, truth.T_camera_base))
+    assert not verdict(measurements, fit).usable

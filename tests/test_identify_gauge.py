@@ -11,7 +11,7 @@ from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import Information, machine_covariance
-from pkmcal.identify.estimate import told_unknowns
+from pkmcal.identify.estimate import estimated_unknowns
 from pkmcal.identify.gauge import (
     BestFit,
     ThreeCentres,
@@ -42,16 +42,16 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     scene = make_scene(rng)
     machine = scene.machine
     state = moved_state(rng, scene, 0.2)
-    told = in_gauge(machine, state, gauge)
+    values = in_gauge(machine, state, gauge)
     c = gauge.constraints(machine)
-    np.testing.assert_allclose(c @ told.theta, c @ machine.parameters.drawing, atol=1e-14)
-    legs = closure(machine.layout, told.theta, scene.joints[0], told.T_base_platform)
+    np.testing.assert_allclose(c @ values.theta, c @ machine.parameters.drawing, atol=1e-14)
+    legs = closure(machine.layout, values.theta, scene.joints[0], values.T_base_platform)
     np.testing.assert_allclose(legs.rows.value, 0, atol=1e-13)
     base, _ = centre_index(machine.layout)
-    seen = [move(s.T_camera_base[:, None], s.theta[base]) for s in (state, told)]
-    np.testing.assert_allclose(seen[0], seen[1], atol=1e-13)
-    again = in_gauge(machine, told, gauge)
-    np.testing.assert_allclose(again.theta, told.theta, atol=1e-14)
+    in_view = [move(s.T_camera_base[:, None], s.theta[base]) for s in (state, values)]
+    np.testing.assert_allclose(in_view[0], in_view[1], atol=1e-13)
+    again = in_gauge(machine, values, gauge)
+    np.testing.assert_allclose(again.theta, values.theta, atol=1e-14)
 
 
 def test_three_centres_as_the_design_says():
@@ -71,11 +71,11 @@ def test_best_fit_is_the_least_squares_fit():
     """No small motion of either frame brings the centres nearer to the drawing."""
     rng = np.random.default_rng(2)
     scene = make_scene(rng)
-    told = in_gauge(scene.machine, moved_state(rng, scene), BestFit())
+    values = in_gauge(scene.machine, moved_state(rng, scene), BestFit())
     drawing = scene.machine.parameters.drawing
 
     def cost(e, f):
-        theta = changed_frames(scene.machine.layout, told, e, f).theta
+        theta = changed_frames(scene.machine.layout, values, e, f).theta
         return sum(np.sum((theta - drawing)[i] ** 2) for i in centre_index(scene.machine.layout))
 
     least = cost(np.eye(4), np.eye(4))
@@ -94,8 +94,8 @@ def test_generators_against_small_motions():
     change = generators(scene.machine.layout, state.theta) @ y
     np.testing.assert_allclose(after.theta - state.theta, change, atol=1e-11)
     change = station_generators(state.T_camera_base) @ y
-    found = pose_difference(after.T_camera_base, state.T_camera_base)
-    np.testing.assert_allclose(found, change, atol=1e-11)
+    values = pose_difference(after.T_camera_base, state.T_camera_base)
+    np.testing.assert_allclose(values, change, atol=1e-11)
 
 
 def with_mounts(state, rng):
@@ -106,12 +106,12 @@ def with_mounts(state, rng):
 
 def off(state, errors):
     """The state with errors (n,) of parameters, stations and mounts."""
-    told = told_unknowns(state)
+    unknowns = estimated_unknowns(state)
     return replace(
         state,
-        theta=state.theta + errors[told.machine],
-        T_camera_base=perturb(state.T_camera_base, errors[told.stations].reshape(-1, 6)),
-        T_mount=perturb(state.T_mount, errors[told.mounts].reshape(-1, 6)),
+        theta=state.theta + errors[unknowns.machine],
+        T_camera_base=perturb(state.T_camera_base, errors[unknowns.stations].reshape(-1, 6)),
+        T_mount=perturb(state.T_mount, errors[unknowns.mounts].reshape(-1, 6)),
     )
 
 
@@ -120,17 +120,17 @@ def test_errors_are_carried_by_a_finite_frame_change():
     scene = make_scene(rng)
     machine, state = scene.machine, with_mounts(scene.state(), rng)
     e, f = (perturb(np.eye(4), 0.4 * rng.normal(size=6)) for _ in range(2))
-    told = told_unknowns(state)
-    small = 1e-6 * rng.normal(size=told.count)
+    unknowns = estimated_unknowns(state)
+    small = 1e-6 * rng.normal(size=unknowns.count)
     wrong = off(state, small)
     right_after, wrong_after = (changed_frames(machine.layout, s, e, f) for s in (state, wrong))
     carried = carried_errors(machine.layout, state, e, f) @ small
     np.testing.assert_allclose(
-        wrong_after.theta - right_after.theta, carried[told.machine], atol=1e-11
+        wrong_after.theta - right_after.theta, carried[unknowns.machine], atol=1e-11
     )
-    for part, after in ((told.stations, "T_camera_base"), (told.mounts, "T_mount")):
-        found = pose_difference(getattr(wrong_after, after), getattr(right_after, after))
-        np.testing.assert_allclose(found.ravel(), carried[part], atol=1e-11)
+    for part, after in ((unknowns.stations, "T_camera_base"), (unknowns.mounts, "T_mount")):
+        values = pose_difference(getattr(wrong_after, after), getattr(right_after, after))
+        np.testing.assert_allclose(values.ravel(), carried[part], atol=1e-11)
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
@@ -140,7 +140,7 @@ def test_transformation_is_the_derivative_of_apply(gauge):
     scene = make_scene(rng)
     machine = scene.machine
     state = in_gauge(machine, with_mounts(scene.state(), rng), gauge)
-    unknowns = told_unknowns(state)
+    unknowns = estimated_unknowns(state)
     s = transformation(machine, state, gauge)
     for _ in range(5):
         d = 1e-6 * rng.normal(size=s.shape[1])
@@ -162,17 +162,17 @@ def test_covariance_transformed_equals_covariance_recomputed(first, second):
     rng = np.random.default_rng(6)
     scene = make_scene(rng, configurations=8)
     machine, m = scene.machine, scene.measurements(np.random.default_rng(7))
-    told = []
+    values = []
     for rows in (first, second):
         assembled = assemble(machine, m, rows, use_drawing=False)
         state = in_gauge(machine, scene.state(), rows)
         info = Information(assembled.problem, batch_of(machine, assembled, state))
-        told.append(
+        values.append(
             machine_covariance(assembled.problem, machine, state, info.covariance[0], second)
         )
-    scale = np.sqrt(np.diag(told[1])) + 1e-9
+    scale = np.sqrt(np.diag(values[1])) + 1e-9
     np.testing.assert_allclose(
-        told[0] / np.outer(scale, scale), told[1] / np.outer(scale, scale), atol=1e-5
+        values[0] / np.outer(scale, scale), values[1] / np.outer(scale, scale), atol=1e-5
     )
 
 
@@ -182,9 +182,9 @@ def test_end_effector_does_not_depend_on_the_gauge():
     scene = make_scene(rng)
     poses = []
     for gauge in GAUGES:
-        told = in_gauge(scene.machine, scene.state(), gauge)
-        machine = scene.machine.with_values(told.theta)
-        T = machine.forward(scene.joints[0], told.T_base_platform)
+        values = in_gauge(scene.machine, scene.state(), gauge)
+        machine = scene.machine.with_values(values.theta)
+        T = machine.forward(scene.joints[0], values.T_base_platform)
         b = machine.platform_centers()
         points = move(T[:, None], b)
         poses.append(np.linalg.norm(points[1:] - points[:-1], axis=-1))
@@ -195,17 +195,17 @@ def test_end_effector_does_not_depend_on_the_gauge():
 def test_fixed_parameters_take_frames_away():
     machine = make_scene(np.random.default_rng(9)).machine
     assert freedoms(machine).shape == (12, 12)
-    for fixed, left in (
+    for fixed, remainder in (
         (("legs[1].base.center.x",), 11),
         (tuple(f"legs[2].platform.center.{a}" for a in "xyz"), 9),
         (tuple(f"legs[{j}].base.center.{a}" for j in (1, 3, 5) for a in "xyz"), 6),
     ):
         held = replace(machine, parameters=machine.parameters.with_roles(fixed=fixed))
         basis = freedoms(held)
-        assert basis.shape == (12, left)
-        moved = generators(held.layout, held.parameters.drawing) @ basis
+        assert basis.shape == (12, remainder)
+        shifted = generators(held.layout, held.parameters.drawing) @ basis
         rows = [held.parameters.index(name) for name in fixed]
-        np.testing.assert_allclose(moved[rows], 0, atol=1e-12)
+        np.testing.assert_allclose(shifted[rows], 0, atol=1e-12)
 
 
 def test_alignment_of_a_state_already_in_the_gauge_is_nothing():

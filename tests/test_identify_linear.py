@@ -53,9 +53,9 @@ def test_uncertainty_of_the_centres(method):
     squares = []
     for seed in range(12):
         _, machine, truth, m = setup(seed)
-        found = centres(machine, m, method)
-        error = found.centres - truth
-        inverse = np.linalg.inv(found.covariance)
+        value = centres(machine, m, method)
+        error = value.centres - truth
+        inverse = np.linalg.inv(value.covariance)
         squares.append(np.einsum("sli,slij,slj->sl", error, inverse, error))
     n = np.size(squares)
     assert np.mean(squares) == pytest.approx(3, abs=4 * np.sqrt(6 / n))
@@ -104,10 +104,10 @@ def test_legs_that_were_not_seen_are_nan():
     once = (m.edges.station == 1) & (m.edges.leg == 3) & (m.edges.configuration > 0)
     m = replace(m, edges=m.edges.select(~hidden & ~once))
     for method in METHODS:
-        found = centres(machine, m, method)
-        assert np.isnan(found.centres[0, 2]).all()
-        assert np.isnan(found.centres[1, 3]).all()
-        assert np.isfinite(found.centres[2]).all()
+        values = centres(machine, m, method)
+        assert np.isnan(values.centres[0, 2]).all()
+        assert np.isnan(values.centres[1, 3]).all()
+        assert np.isfinite(values.centres[2]).all()
 
 
 def test_scale_of_the_radius():
@@ -116,43 +116,43 @@ def test_scale_of_the_radius():
     radius = machine.parameters.of_kind("radius")
     values = machine.values.copy()
     values[radius] *= 1.02
-    found = centres(machine.with_values(values), m, "plain").centres[0]
-    np.testing.assert_allclose(found, 1.02 * truth[0], rtol=1e-9)
+    value = centres(machine.with_values(values), m, "plain").centres[0]
+    np.testing.assert_allclose(value, 1.02 * truth[0], rtol=1e-9)
     base = scene.theta[0][centre_index(machine.layout)[0]]
-    assert scale_ratio(found, base) == pytest.approx(1.02)
-    assert procrustes_scale(found, base) == pytest.approx(1.02)
+    assert scale_ratio(value, base) == pytest.approx(1.02)
+    assert procrustes_scale(value, base) == pytest.approx(1.02)
     # the pairs 40 mm apart dominate the mean of ratios once the drawing is a little wrong
     rng = np.random.default_rng(6)
     drawings = base + 5e-4 * rng.normal(size=(200, 6, 3))
-    spread = [np.std([f(found, d) for d in drawings]) for f in (scale_ratio, procrustes_scale)]
+    spread = [np.std([f(value, d) for d in drawings]) for f in (scale_ratio, procrustes_scale)]
     assert spread[0] > 1.5 * spread[1]
 
 
-def four_step_error(scene, found):
+def four_step_error(scene, value):
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
-    return np.abs(found.theta - truth.theta)[scene.machine.parameters.of_kind("center")].max()
+    return np.abs(value.theta - truth.theta)[scene.machine.parameters.of_kind("center")].max()
 
 
 def test_four_steps_are_exact_without_noise():
     scene, machine, _, m = setup(7, noise=0)
-    found = four_step(machine, m)
+    value = four_step(machine, m)
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
-    np.testing.assert_allclose(found.theta, truth.theta, atol=1e-9)
-    np.testing.assert_allclose(found.T_camera_base, truth.T_camera_base, atol=1e-9)
-    np.testing.assert_allclose(found.T_base_platform, truth.T_base_platform, atol=1e-9)
+    np.testing.assert_allclose(value.theta, truth.theta, atol=1e-9)
+    np.testing.assert_allclose(value.T_camera_base, truth.T_camera_base, atol=1e-9)
+    np.testing.assert_allclose(value.T_base_platform, truth.T_base_platform, atol=1e-9)
 
 
 def test_products_of_distances_leave_depth_open():
     """Errata, A 9 and 16: as printed, the noise-free answer keeps the drawing's error in z."""
     scene, machine, _, m = setup(8, noise=0)
-    found = four_step(machine, m, form="printed")
+    value = four_step(machine, m, form="printed")
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
     for index in centre_index(machine.layout):
-        error = np.abs((found.theta - truth.theta)[index])
+        error = np.abs((value.theta - truth.theta)[index])
         assert error[:, 2].max() > 5e-4
         assert error[:, :2].max() < 0.2 * error[:, 2].max()
     np.testing.assert_allclose(
-        found.theta[machine.layout.rod], truth.theta[machine.layout.rod], atol=1e-8
+        value.theta[machine.layout.rod], truth.theta[machine.layout.rod], atol=1e-8
     )
 
 
@@ -162,10 +162,10 @@ def test_four_steps_start_the_bundle(wrong):
     scene, machine, _, m = setup(9, wrong=wrong)
     start = four_step(machine, m)
     assert four_step_error(scene, start) < 0.03
-    found = bundle(scene.machine, m, start)
+    fit = bundle(scene.machine, m, start)
     best = bundle(scene.machine, m, scene.state())
-    np.testing.assert_allclose(found.state.theta, best.state.theta, atol=5e-6)
-    assert found.statistics.chi2 / found.statistics.dof == pytest.approx(1, abs=0.05)
+    np.testing.assert_allclose(fit.state.theta, best.state.theta, atol=5e-6)
+    assert fit.statistics.chi2 / fit.statistics.dof == pytest.approx(1, abs=0.05)
 
 
 def test_four_steps_with_four_legs_a_station_and_one_station_a_configuration():
@@ -180,8 +180,8 @@ def test_four_steps_with_four_legs_a_station_and_one_station_a_configuration():
     exact = setup(10, configurations=60, noise=0)[3]
     exact = replace(exact, edges=exact.edges.select(keep))
     assert four_step_error(scene, four_step(machine, exact)) < 1e-8
-    found = bundle(scene.machine, part, start)
-    assert found.statistics.stopped == "converged"
+    fit = bundle(scene.machine, part, start)
+    assert fit.statistics.stopped == "converged"
 
 
 def test_a_station_with_two_legs_needs_its_pose():
@@ -191,9 +191,9 @@ def test_a_station_with_two_legs_needs_its_pose():
     with pytest.raises(ResultError, match="station 2 sees too few legs"):
         four_step(machine, part)
     rough = guess(np.random.default_rng(0), scene.T_camera_base, 0.01, 0.01)
-    found = four_step(machine, part, T_camera_base_guess=rough)
-    np.testing.assert_array_equal(found.T_camera_base[1], rough[1])
-    assert four_step_error(scene, found) < 0.03
+    values = four_step(machine, part, T_camera_base_guess=rough)
+    np.testing.assert_array_equal(values.T_camera_base[1], rough[1])
+    assert four_step_error(scene, values) < 0.03
 
 
 def test_a_leg_that_no_station_sees_is_told():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.gather import measurements_of
+from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
@@ -32,8 +32,8 @@ def derivatives(problem, state, shared, own, h=1e-4):
     weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
     total = 0.0
     for k, w in weights.items():
-        up = problem.residuals(problem.moved(state, k * h * shared, k * h * own))
-        down = problem.residuals(problem.moved(state, -k * h * shared, -k * h * own))
+        up = problem.residuals(problem.retract(state, k * h * shared, k * h * own))
+        down = problem.residuals(problem.retract(state, -k * h * shared, -k * h * own))
         flat = np.concatenate([(up.value - down.value).ravel(), (up[1] - down[1]).ravel()])
         total = total + w * flat
     return total / h
@@ -70,12 +70,12 @@ def test_jacobian_at_random_points():
     rng = np.random.default_rng(1)
     assembled, truth = make_scene(rng, runs=3, configurations=4, tolerance=3.0).batch(rng)
     step = 0.02 * rng.normal(size=(3, 4, 6))
-    moved = replace(
+    shifted = replace(
         truth,
         T_base_platform=perturb(truth.T_base_platform, step),
         optics=rng.normal(size=(3, 1, 1)),
     )
-    check(assembled.problem, moved, rng)
+    check(assembled.problem, shifted, rng)
 
 
 def test_jacobian_near_a_singular_pose_and_beside_a_leg():
@@ -88,8 +88,8 @@ def test_jacobian_near_a_singular_pose_and_beside_a_leg():
     ends = problem.closure(truth)
     a, b = ends.a[0, 0, 0], ends.b[0, 0, 0]
     u = (b - a) / np.linalg.norm(b - a)
-    aside = np.cross(u, [0, 0, 1.0])
-    beside = 0.5 * (a + b) + 0.017 * aside / np.linalg.norm(aside)
+    lateral = np.cross(u, [0, 0, 1.0])
+    beside = 0.5 * (a + b) + 0.017 * lateral / np.linalg.norm(lateral)
     rot = truth.T_camera_base[0, 0, :3, :3]
     near = replace(truth, T_camera_base=pose(rot, -rot @ beside)[None, None])
     linear = problem.linearize(near)
@@ -130,13 +130,13 @@ def test_jacobian_of_stations_whose_focal_lengths_breathe():
     """Each by an unknown of its own, which its edges alone answer to."""
     rng = np.random.default_rng(5)
     scene = make_scene(rng, configurations=3)
-    seen = scene.measurements(rng)
-    edges = replace(seen.edges, by_focal=rng.normal(size=(len(seen.edges), 2)))
-    seen = replace(seen, edges=edges, breathing_at=np.zeros(seen.n_stations))
-    assembled = assemble(scene.machine, seen, ThreeCentres())
+    case = scene.measurements(rng)
+    edges = replace(case.edges, by_focal=rng.normal(size=(len(case.edges), 2)))
+    case = replace(case, edges=edges, breathing_at=np.zeros(case.n_stations))
+    assembled = assemble(scene.machine, case, ThreeCentres())
     stations = guess(rng, scene.T_camera_base)
-    state = batch_of(scene.machine, assembled, start_state(scene.machine, seen, stations))
-    assert assembled.problem.unknowns.n_breathing == seen.n_stations == 3
+    state = batch_of(scene.machine, assembled, start_state(scene.machine, case, stations))
+    assert assembled.problem.unknowns.n_breathing == case.n_stations == 3
     check(assembled.problem, state, rng)
 
 
@@ -194,9 +194,9 @@ def test_sign_of_the_edge_shift():
     )
     measurements = replace(clean, edges=edges)
     start = start_state(scene.machine, measurements, scene.T_camera_base)
-    found = bundle(scene.machine, measurements, start, robust=False, scale_noise=False)
-    assert found.state.edge_shift[0] == pytest.approx(0.4, abs=0.02)
-    assert found.state.edge_shift[0] / found.edge_shift_sigma[0] > 10
+    fit = bundle(scene.machine, measurements, start, robust=False, scale_noise=False)
+    assert fit.state.edge_shift[0] == pytest.approx(0.4, abs=0.02)
+    assert fit.state.edge_shift[0] / fit.edge_shift_sigma[0] > 10
 
 
 def moved_outward(normal, middle, pixels):
@@ -261,8 +261,8 @@ def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():
     step = -np.linalg.lstsq(rows, value, rcond=None)[0]
     whole, _ = damped_step(problem.linearize(state), np.zeros(1))
     np.testing.assert_allclose(step, whole[0, machine], atol=1e-7)
-    asked, _ = reduced_rows(info, ("machine",))
-    assert len(asked) == len(rows) - problem.prior[:, machine].any(axis=1).sum()
+    queries, _ = reduced_rows(info, ("machine",))
+    assert len(queries) == len(rows) - problem.prior[:, machine].any(axis=1).sum()
 
 
 @pytest.mark.parametrize("way", [0.02, 1e-5])
@@ -275,11 +275,11 @@ def test_a_long_step_ends_where_the_readings_allow_it(way):
     before = problem.closure(state).rows
     meant = before.value + (before.by_pose @ own[..., None])[..., 0]
     straight = replace(state, T_base_platform=perturb(state.T_base_platform, own))
-    moved = problem.moved(state, np.zeros((1, problem.unknowns.count)), own)
+    shifted = problem.retract(state, np.zeros((1, problem.unknowns.count)), own)
     bent = np.abs(problem.closure(straight).rows.value - meant).max() > 100 * noise
     assert bent == (way > 1e-3)
-    assert np.abs(problem.closure(moved).rows.value - meant).max() < noise
-    assert np.array_equal(moved.T_base_platform, straight.T_base_platform) == (not bent)
+    assert np.abs(problem.closure(shifted).rows.value - meant).max() < noise
+    assert np.array_equal(shifted.T_base_platform, straight.T_base_platform) == (not bent)
 
 
 def test_rows_by_held_parameters():

@@ -81,8 +81,8 @@ class Scene:
         chol = np.linalg.cholesky(self.covariance)
         draw = rng.normal(size=(*self.normal.shape[:2], 2, 1))
         move = move + noise * (chol @ draw)[..., 0]
-        moved = self.normal + (basis @ move[..., None])[..., 0]
-        return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+        shifted = self.normal + (basis @ move[..., None])[..., 0]
+        return shifted / np.linalg.norm(shifted, axis=-1, keepdims=True)
 
     def _with_wrong(self, rng, normal, share, run):
         station, configuration, leg = self.index[:3]
@@ -136,7 +136,7 @@ def make_scene(
     runs: int = 1,
     configurations: int = 12,
     n_stations: int = 3,
-    seen: float = 0.7,
+    in_view: float = 0.7,
     tolerance: float = 1.0,
     machine: Machine | None = None,
     noise: float = 1.0,
@@ -155,7 +155,7 @@ def make_scene(
     ends = limb_ends(machine.layout, theta[:, None], np.zeros((configurations, 6)), poses)
     length = np.linalg.norm(ends.b - ends.a, axis=-1)
     scale_of = scales(machine.layout, theta[:, None])
-    index = _index(rng, machine, configurations, n_stations, seen)
+    index = _index(rng, machine, configurations, n_stations, in_view)
     normal, middle = _edges(machine, theta, stations(n_stations), ends, index)
     n = index.shape[1]
     scale = noise * rng.uniform(0.5, 2.0, (n, 2)) * np.array([0.05, 0.2]) / FOCAL
@@ -178,7 +178,7 @@ def make_scene(
     )
 
 
-def _index(rng, machine, configurations, n_stations, seen):
+def _index(rng, machine, configurations, n_stations, in_view):
     legs = machine.n_legs
     grid = np.meshgrid(
         np.arange(n_stations),
@@ -189,7 +189,7 @@ def _index(rng, machine, configurations, n_stations, seen):
         indexing="ij",
     )
     index = np.stack([g.ravel() for g in grid])
-    keep = (rng.random((n_stations, configurations, legs)) < seen)[index[0], index[1], index[2]]
+    keep = (rng.random((n_stations, configurations, legs)) < in_view)[index[0], index[1], index[2]]
     return index[:, keep]
 
 

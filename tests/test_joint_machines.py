@@ -69,10 +69,10 @@ class Session:
         rows = [(s, k, m) for s, k in truth.photographs for m in range(len(on_platform))]
         s, k, m = np.array(rows, dtype=int).reshape(-1, 3).T
         body = np.where(on_platform[m][:, None, None], truth.T_base_platform[k], np.eye(4))
-        seen = truth.T_camera_base[s] @ body @ self.T_mount[m]
-        seen = perturb(seen, noise * POSE_SIGMA * rng.normal(size=(len(m), 6)))
+        in_view = truth.T_camera_base[s] @ body @ self.T_mount[m]
+        in_view = perturb(in_view, noise * POSE_SIGMA * rng.normal(size=(len(m), 6)))
         whiten = np.broadcast_to(np.diag(1 / POSE_SIGMA), (len(m), 6, 6))
-        return PoseSet(s, k, m, seen, whiten)
+        return PoseSet(s, k, m, in_view, whiten)
 
     def state(self):
         truth = self.truth
@@ -98,13 +98,13 @@ def test_jacobian_with_boards(name):
     assembled = assemble(session.drawing, session.measurements, default_gauge(session.drawing))
     state = batch_of(session.drawing, assembled, session.state())
     check(assembled.problem, state, rng)
-    moved = replace(
+    shifted = replace(
         state,
         T_base_platform=perturb(state.T_base_platform, 0.02 * rng.normal(size=(1, 6, 6))
                                 @ session.drawing.layout.motion @ session.drawing.layout.motion.T),
         T_mount=perturb(state.T_mount, 0.3 * rng.normal(size=(1, 2, 6))),
     )  # fmt: skip
-    check(assembled.problem, moved, rng)
+    check(assembled.problem, shifted, rng)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -112,7 +112,7 @@ def test_truth_is_found_without_noise(name):
     # of a platform that only translates, readings and radii tell what is far: the drawing decides
     machine = exact(name) if name == "3-upu" else load_mechanism(name)
     session = Session(machine, boards=("base",), noise=1e-4)
-    found = bundle(
+    fit = bundle(
         session.drawing,
         session.measurements,
         session.guess(np.random.default_rng(2)),
@@ -120,13 +120,13 @@ def test_truth_is_found_without_noise(name):
         scale_noise=False,
     )
     truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
-    error = found.machine.values - session.drawing.parameters.unit_axes(truth.theta)
-    sigma = np.sqrt(np.diag(found.covariance))
+    error = fit.machine.values - session.drawing.parameters.unit_axes(truth.theta)
+    sigma = np.sqrt(np.diag(fit.covariance))
     # micrometres where photographs leave tens of them; the drawing pulls on what they do not tell
     assert np.all(np.abs(error) < 1e-5 + 4 * sigma)
-    told = found.data_share > 0.9
-    assert told.sum() > 0.5 * len(error)
-    assert np.median(np.abs(error[told])) < 3e-6
+    values = fit.data_share > 0.9
+    assert values.sum() > 0.5 * len(error)
+    assert np.median(np.abs(error[values])) < 3e-6
 
 
 @pytest.mark.parametrize(
@@ -138,17 +138,17 @@ def test_errors_are_as_large_as_they_say(name):
     squares, shares = [], []
     for seed in range(6):
         session = Session(load_mechanism(name), seed=seed)
-        found = bundle(
+        fit = bundle(
             session.drawing, session.measurements, session.guess(np.random.default_rng(seed))
         )
         truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
         table = session.drawing.parameters
         # an axis by its two turns: along itself it changes by squares of small angles only
-        error = table.to_free(found.machine.values) - table.to_free(truth.theta)
+        error = table.to_free(fit.machine.values) - table.to_free(truth.theta)
         by = np.linalg.pinv(table.free_matrix())
-        sigma = np.sqrt(np.maximum(np.diag(by @ found.covariance @ by.T), 0.0))
+        sigma = np.sqrt(np.maximum(np.diag(by @ fit.covariance @ by.T), 0.0))
         free = sigma > 1e-9
         squares.append(np.mean((error[free] / sigma[free]) ** 2))
-        shares.append(found.statistics.chi2 / found.statistics.dof)
+        shares.append(fit.statistics.chi2 / fit.statistics.dof)
     assert 0.6 < np.mean(squares) < 1.5, squares
     assert 0.8 < np.mean(shares) < 1.25, shares

@@ -111,19 +111,19 @@ def workspace(machine, count, seed):
         # bars that only theta turns; from a tilt one comes to assemblies that home is not in
         spread[:2], spread[2:3], spread[3:], tries = 0.0, 0.35, 0.1, 4 * count
     freedoms = machine.layout.motion
-    kept = np.zeros((0, 4, 4))
-    while len(kept) < count:
+    retained_rows = np.zeros((0, 4, 4))
+    while len(retained_rows) < count:
         assert tries > 0
         steps = rng.uniform(-1, 1, (2 * count, 6)) * spread
         tries -= len(steps)
         poses = perturb(machine.home(), steps @ freedoms @ freedoms.T)
         # only poses that the constant rods and the axes allow
-        found = kinematics.on_manifold(machine.layout, machine.values, poses)
-        poses = found.T_base_platform[found.converged]
+        value = kinematics.on_manifold(machine.layout, machine.values, poses)
+        poses = value.T_base_platform[value.converged]
         readings = machine.inverse(poses)
         allowed = ~((readings < low) | (readings > high)).any(axis=-1)
-        kept = np.concatenate([kept, poses[allowed]])
-    return kept[:count]
+        retained_rows = np.concatenate([retained_rows, poses[allowed]])
+    return retained_rows[:count]
 
 
 @given(seeds)
@@ -135,12 +135,12 @@ def test_forward_undoes_inverse(machine, seed):
     """
     poses = workspace(machine, 40, seed)
     readings = machine.inverse(poses)
-    found = machine.forward_result(readings)
-    assert found.converged.all()
-    assert found.singularity.min() > 0.1
-    np.testing.assert_allclose(found.T_base_platform, poses, atol=1e-11)
+    fk = machine.forward_result(readings)
+    assert fk.converged.all()
+    assert fk.singularity.min() > 0.1
+    np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-11)
     np.testing.assert_allclose(
-        machine.inverse(found.T_base_platform), readings, atol=CONVERGED_CLOSURE_ERROR
+        machine.inverse(fk.T_base_platform), readings, atol=CONVERGED_CLOSURE_ERROR
     )
 
 
@@ -201,11 +201,11 @@ def assert_exact_derivatives(machine, readings, T, step=1e-3):
     oracle = differences(
         lambda d: closure(layout, theta, readings + d, T).rows.value, machine.n_joints, step
     )
-    found = np.zeros(oracle.shape)
-    found[layout.driven_rows, layout.row_motor[layout.driven_rows]] = c.by_reading[
+    values = np.zeros(oracle.shape)
+    values[layout.driven_rows, layout.row_motor[layout.driven_rows]] = c.by_reading[
         layout.driven_rows
     ]
-    np.testing.assert_allclose(found, oracle, **tight)
+    np.testing.assert_allclose(values, oracle, **tight)
 
 
 def test_closure_derivatives_at_home_and_at_random(machine):
@@ -248,8 +248,8 @@ def scaled_inverse_jacobian(machine, T):
 def test_singularity_is_the_least_gain_from_platform_to_readings(degrees):
     machine, T = hexapod(), yawed(degrees)
     least = np.linalg.svd(scaled_inverse_jacobian(machine, T), compute_uv=False)[-1]
-    found = machine.forward_result(machine.inverse(T), T).singularity
-    assert found == pytest.approx(least, rel=1e-8)
+    fk = machine.forward_result(machine.inverse(T), T).singularity
+    assert fk == pytest.approx(least, rel=1e-8)
 
 
 @pytest.mark.parametrize("degrees", [90, -90])
@@ -279,15 +279,15 @@ def test_forward_near_a_singular_pose_is_honest(short):
     machine, T = hexapod(), yawed(90 - short)
     readings = machine.inverse(T)
     steps = 0.02 * np.random.default_rng(0).normal(size=(30, 6))
-    found = machine.forward_result(readings, perturb(T, steps))
-    assert found.converged.any()
-    assert np.all(found.singularity < NEAR_SINGULAR)
-    closed = np.abs(machine.inverse(found.T_base_platform) - readings).max(axis=-1)
-    np.testing.assert_array_equal(found.converged, found.error < CONVERGED_CLOSURE_ERROR)
-    np.testing.assert_allclose(found.error, closed, atol=1e-15)
+    fk = machine.forward_result(readings, perturb(T, steps))
+    assert fk.converged.any()
+    assert np.all(fk.singularity < NEAR_SINGULAR)
+    closed = np.abs(machine.inverse(fk.T_base_platform) - readings).max(axis=-1)
+    np.testing.assert_array_equal(fk.converged, fk.error < CONVERGED_CLOSURE_ERROR)
+    np.testing.assert_allclose(fk.error, closed, atol=1e-15)
     # the two yaws that belong to these readings are 90 -+ short; where they merge, an error of
     # 1e-12 m in the readings is one of its root in the pose
-    yaws = np.degrees(rotation_vector(found.T_base_platform[:, :3, :3])[found.converged, 2])
+    yaws = np.degrees(rotation_vector(fk.T_base_platform[:, :3, :3])[fk.converged, 2])
     np.testing.assert_allclose(np.abs(yaws - 90), short, atol=1e-3)
 
 
@@ -298,9 +298,9 @@ def test_beyond_the_singular_pose_there_is_no_pose():
     outward = np.sign(longest - machine.inverse(yawed(60)))
     for more in (1e-4, 1e-8):
         readings = longest + more * outward
-        found = machine.forward_result(readings, yawed(89))
-        assert not found.converged
-        assert more / 10 < found.error < more
+        fk = machine.forward_result(readings, yawed(89))
+        assert not fk.converged
+        assert more / 10 < fk.error < more
         with pytest.raises(GeometryError):
             machine.forward(readings, yawed(89))
 
@@ -391,19 +391,21 @@ def test_a_planar_machine_stays_in_its_plane():
     assert np.ptp(rotation_vector(truth[:, :3, :3])[:, 2]) > 0.5
     # readings in error, so that the solver has every reason to leave the plane
     readings = machine.inverse(truth) + 1e-3 * np.random.default_rng(1).normal(size=(50, 3))
-    found = machine.forward(readings)
-    np.testing.assert_array_equal(found[:, 2], np.tile([0, 0, 1, 0], (50, 1)))
-    np.testing.assert_array_equal(found[:, :2, 2], 0)
-    np.testing.assert_allclose(machine.inverse(found), readings, atol=CONVERGED_CLOSURE_ERROR)
+    forward_kinematics = machine.forward(readings)
+    np.testing.assert_array_equal(forward_kinematics[:, 2], np.tile([0, 0, 1, 0], (50, 1)))
+    np.testing.assert_array_equal(forward_kinematics[:, :2, 2], 0)
+    np.testing.assert_allclose(
+        machine.inverse(forward_kinematics), readings, atol=CONVERGED_CLOSURE_ERROR
+    )
 
 
 def test_a_translational_machine_does_not_turn_and_its_rods_keep_their_length():
     machine = tripod()
     readings = machine.inverse(workspace(machine, 50, 0))
     readings += 1e-3 * np.random.default_rng(1).normal(size=readings.shape)
-    found = machine.forward(readings)
-    np.testing.assert_array_equal(found[:, :3, :3], np.tile(np.eye(3), (50, 1, 1)))
-    lengths = np.array([joint_distances(machine, T) for T in found])
+    forward_kinematics = machine.forward(readings)
+    np.testing.assert_array_equal(forward_kinematics[:, :3, :3], np.tile(np.eye(3), (50, 1, 1)))
+    lengths = np.array([joint_distances(machine, T) for T in forward_kinematics])
     np.testing.assert_allclose(lengths[:, 1], 0.45, atol=CONVERGED_CLOSURE_ERROR)
     np.testing.assert_allclose(
         lengths[:, [0, 2]] - [0, -0.02], readings, atol=CONVERGED_CLOSURE_ERROR
@@ -420,21 +422,23 @@ def test_a_batch_is_the_same_as_a_loop(machine):
     # several rods a motor are settled by iteration; a rod's reading is one formula
     tight = {"rtol": 0, "atol": 1e-13 if machine.layout.shares_motors else 0.0}
     np.testing.assert_allclose(readings, looped, **tight)
-    found = machine.forward(readings)
+    forward_kinematics = machine.forward(readings)
     # rows differ by the rounding of batched matrix products only
-    np.testing.assert_allclose(found, [machine.forward(q) for q in readings], atol=1e-13)
+    np.testing.assert_allclose(
+        forward_kinematics, [machine.forward(q) for q in readings], atol=1e-13
+    )
     again = machine.forward(readings.reshape(3, 4, -1), poses.reshape(3, 4, 4, 4)[:, :1])
-    np.testing.assert_allclose(again.reshape(12, 4, 4), found, atol=1e-11)
+    np.testing.assert_allclose(again.reshape(12, 4, 4), forward_kinematics, atol=1e-11)
 
 
 def test_a_hard_row_does_not_disturb_its_neighbours():
     machine = hexapod()
     readings = np.stack([machine.inverse(yawed(10)), [0.4] * 5 + [3.0], machine.inverse(yawed(90))])
-    found = machine.forward_result(readings)
-    assert found.converged.tolist() == [True, False, True]
+    fk = machine.forward_result(readings)
+    assert fk.converged.tolist() == [True, False, True]
     alone = machine.forward_result(readings[0])
-    np.testing.assert_allclose(found.T_base_platform[0], alone.T_base_platform, atol=1e-13)
-    assert found.error[1] > 1.0
+    np.testing.assert_allclose(fk.T_base_platform[0], alone.T_base_platform, atol=1e-13)
+    assert fk.error[1] > 1.0
 
 
 def test_machines_broadcast_too(machine):
@@ -449,14 +453,14 @@ def test_machines_broadcast_too(machine):
     assert readings.shape == (3, 5, machine.n_joints)
     tight = {"rtol": 0, "atol": 1e-13 if machine.layout.shares_motors else 0.0}
     np.testing.assert_allclose(readings, [m.inverse(poses) for m in machines], **tight)
-    found = kinematics.forward(machine.layout, theta, readings, poses)
-    assert found.T_base_platform.shape == (3, 5, 4, 4)
-    assert found.converged.shape == found.error.shape == found.singularity.shape == (3, 5)
-    assert found.converged.all()
+    fk = kinematics.forward(machine.layout, theta, readings, poses)
+    assert fk.T_base_platform.shape == (3, 5, 4, 4)
+    assert fk.converged.shape == fk.error.shape == fk.singularity.shape == (3, 5)
+    assert fk.converged.all()
     looped = [m.forward_result(q, poses) for m, q in zip(machines, readings, strict=True)]
     for name in ("T_base_platform", "error", "singularity"):
         expected = np.stack([getattr(result, name) for result in looped])
-        np.testing.assert_allclose(getattr(found, name), expected, atol=1e-12)
+        np.testing.assert_allclose(getattr(fk, name), expected, atol=1e-12)
 
 
 # Errors

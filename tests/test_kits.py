@@ -9,7 +9,7 @@ import pytest
 
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.contract import make_export
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
@@ -33,81 +33,81 @@ def by_heights(tmp_path_factory):
 
 
 def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
-    kit, found = by_board
-    error = tool(kit, found)
+    kit, value = by_board
+    error = tool(kit, value)
     assert error.before > 3e-4
     assert error.after < 0.2 * error.before
     assert error.after < 1e-4
     assert 0.3 < error.after / error.expected < 2.2
-    assert found.verdict.usable
-    assert found.verdict.warnings == ()
-    s = found.estimate.statistics
+    assert value.verdict.usable
+    assert value.verdict.warnings == ()
+    s = value.estimate.statistics
     assert s.stopped == "converged"
     assert abs(s.chi2_poses / s.dof_poses - 1) < 4 * np.sqrt(2 / s.dof_poses)
 
 
 def test_the_report_promises_what_is_kept(by_board):
     """The card about the platform's pose, by the poses and not by joints that nobody saw."""
-    kit, found = by_board
-    cards = report_of(found).figures
+    kit, result = by_board
+    cards = report_of(result).figures
     questions = [card.question for card in cards]
     assert "How well are the joint centres known?" not in questions
     card = cards[questions.index("How well is the platform's pose known?")]
     ((value, unit),) = card.values  # a delta does not turn, so there is no angle
     assert unit == "mm"
-    error = tool(kit, found)
+    error = tool(kit, result)
     assert 0.5 < 1e-3 * float(value) / error.expected < 1.5
     off = cards[questions.index("What did the drawing do to the platform's pose?")]
     assert 0.5 < 1e-3 * float(off.values[0][0]) / error.before < 1.5
 
 
 def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
-    kit, found = by_heights
-    error = tool(kit, found)
-    assert flatness(kit, found.machine) < 0.3 * flatness(kit, kit.drawing)
-    assert flatness(kit, found.machine) < 3e-5
+    kit, value = by_heights
+    error = tool(kit, value)
+    assert flatness(kit, value.machine) < 0.3 * flatness(kit, kit.drawing)
+    assert flatness(kit, value.machine) < 3e-5
     assert error.after < error.before
     assert error.after > 1e-4  # a flat bed is no proof
     assert 0.2 < error.after / error.expected < 2.2
     assert error.sideways > 0.7 * error.after
-    assert found.verdict.usable
-    bed = found.findings.bed
-    assert 0.2 < flatness(kit, found.machine) / bed.sigma < 2.2
-    assert f"height above it to {bed.sigma * 1e3:.2g} mm" in found.verdict.headline
-    assert "Along x and y nothing is promised" in found.verdict.headline
-    (told,) = found.verdict.of("bed.sideways")
-    assert (told.facts["sigma"], told.facts["size_sigma"]) == (bed.sideways, bed.size)
+    assert value.verdict.usable
+    bed = value.findings.bed
+    assert 0.2 < flatness(kit, value.machine) / bed.sigma < 2.2
+    assert f"height above it to {bed.sigma * 1e3:.2g} mm" in value.verdict.headline
+    assert "Along x and y nothing is promised" in value.verdict.headline
+    (values,) = value.verdict.of("bed.sideways")
+    assert (values.facts["sigma"], values.facts["size_sigma"]) == (bed.sideways, bed.size)
 
 
 def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     """As few as the bed's four bends, which leave little over: warned of, and explained."""
-    found = probe_kit(tmp_path / "session", n=7).calibrated()
-    assert found.verdict.usable
-    assert found.verdict.of("bed.height_unnoticed")
-    assert found.findings.bed.unnoticed is None or (
-        found.findings.bed.unnoticed > 0.5 * found.findings.bed.by_drawing
+    value = probe_kit(tmp_path / "session", n=7).calibrated()
+    assert value.verdict.usable
+    assert value.verdict.of("bed.height_unnoticed")
+    assert value.findings.bed.unnoticed is None or (
+        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_drawing
     )
-    told = found.findings.told
-    assert told.rank == 4
-    assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames
-    open_ = (*found.findings.unidentified, *found.findings.weak)
-    said = " ".join(f"{s.text} {s.advice}" for s in open_)
-    assert max(open_, key=lambda s: s.moves_platform).text in " ".join(found.verdict.advice)
-    assert "The base radius and the rod length" in said
-    assert "cannot be told apart by heights" in said
-    assert "How the guides of legs 1 to 3 lean cannot be told from where they stand" in said
-    assert "Measure x and y too, by a board on the platform" in said
+    ranks = value.findings.identifiability
+    assert ranks.rank == 4
+    assert ranks.rank + len(ranks.unidentified) == ranks.n_parameters - ranks.n_frames
+    open_ = (*value.findings.unidentified, *value.findings.weak)
+    text = " ".join(f"{s.text} {s.advice}" for s in open_)
+    assert max(open_, key=lambda s: s.moves_platform).text in " ".join(value.verdict.advice)
+    assert "The base radius and the rod length" in text
+    assert "cannot be told apart by heights" in text
+    assert "How the guides of legs 1 to 3 lean cannot be told from where they stand" in text
+    assert "Measure x and y too, by a board on the platform" in text
     for word in ("camera", "tube", "hotograph", "caliper", "extreme leg lengths"):
-        assert word not in said
-    assert not found.verdict.of("configurations.few")
+        assert word not in text
+    assert not value.verdict.of("configurations.few")
 
 
 def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
     """Rods and radius changed as told: the heights stay, x and y stretch as told."""
-    _, found = by_heights
+    _, value = by_heights
     text = next(
         s.text
-        for s in found.findings.unidentified
+        for s in value.findings.unidentified
         if "and the rod length, of all legs alike" in s.text
     )
     numbers = re.search(
@@ -122,8 +122,8 @@ def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
     other = sized(drawing, 1e-3, radius)
     assert flatness(kit_of(drawing), other) < 3e-6
     xy = drawing.forward(joints := bed_readings(drawing))[:, :2, 3]
-    moved = other.forward(joints)[:, :2, 3] - xy
-    assert np.sum(moved * xy) / np.sum(xy**2) == pytest.approx(share, rel=0.1)
+    shifted = other.forward(joints)[:, :2, 3] - xy
+    assert np.sum(shifted * xy) / np.sum(xy**2) == pytest.approx(share, rel=0.1)
     # the other way round they bend the bed
     assert flatness(kit_of(drawing), sized(drawing, 1e-3, -radius)) > 2e-5
     # 6 mm wrong, and a bed flat to 0.01 mm: what users of printers met
@@ -154,15 +154,15 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
     """Of a kit whose towers lean by a third of a degree: the bed flat all the same, all deviations
     larger by what the model leaves out, and nothing lost in the firmware's values."""
     kit = probe_kit(tmp_path / "session", n=25)
-    found = calibrate_session(load_session(tmp_path / "session", model="firmware"))
-    table = found.machine.parameters
+    calibration = calibrate_session(load_session(tmp_path / "session", model="firmware"))
+    table = calibration.machine.parameters
     held = [
         table.index(f"legs[{j}].{what}") for j in (1, 2, 3) for what in ("scale", "base.axis.x")
     ]
-    assert np.array_equal(found.machine.values[held], table.drawing[held])
-    assert found.verdict.usable
-    assert flatness(kit, found.machine) < 0.2 * flatness(kit, kit.drawing)
-    source = MachineSource(found.machine, bed=found.findings.bed.z)
+    assert np.array_equal(calibration.machine.values[held], table.drawing[held])
+    assert calibration.verdict.usable
+    assert flatness(kit, calibration.machine) < 0.2 * flatness(kit, kit.drawing)
+    source = MachineSource(calibration.machine, bed=calibration.findings.bed.z)
     (note, *_) = make_export(source, "klipper").notes
     off = re.search(r"off by ([\d.]+) mm at most", note.text)
     assert off
@@ -172,8 +172,8 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
 def test_more_heights_of_one_bed_do_not_help(tmp_path):
     """25 points: the same sentence."""
     kit = probe_kit(tmp_path / "session", n=25)
-    found = kit.calibrated()
-    texts = [s.text for s in (*found.findings.unidentified, *found.findings.weak)]
+    results = kit.calibrated()
+    texts = [s.text for s in (*results.findings.unidentified, *results.findings.weak)]
     assert any("of all legs alike, cannot be told apart by heights" in text for text in texts)
 
 
@@ -195,5 +195,5 @@ def test_errors_are_as_large_as_promised(tmp_path, make):
 def test_registration_is_rigid():
     """The measure of the tests: no scale is taken out with the frame."""
     points = np.random.default_rng(0).normal(size=(20, 3))
-    left = apply(register(1.01 * points, points), 1.01 * points) - points
-    assert np.sqrt(np.mean(left**2)) == pytest.approx(0.01 * points.std(), rel=0.1)
+    remainder = apply(register(1.01 * points, points), 1.01 * points) - points
+    assert np.sqrt(np.mean(remainder**2)) == pytest.approx(0.01 * points.std(), rel=0.1)

@@ -33,14 +33,16 @@ def parsed(path: Path) -> ast.Module:
 
 def imports(path: Path) -> set[Path]:
     """Files of the package that a file imports, at its top or inside its functions."""
-    found: set[Path | None] = set()
+    actual_names: set[Path | None] = set()
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
-            found |= {file_of(alias.name) for alias in node.names}
+            actual_names |= {file_of(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
             whole = file_of(node.module)
-            found |= {file_of(f"{node.module}.{alias.name}") or whole for alias in node.names}
-    return {other for other in found if other is not None}
+            actual_names |= {
+                file_of(f"{node.module}.{alias.name}") or whole for alias in node.names
+            }
+    return {other for other in actual_names if other is not None}
 
 
 @cache
@@ -71,11 +73,11 @@ def test_packages_import_only_from_rows_above():
 
 
 def test_no_files_import_each_other_in_a_circle():
-    left = {path: set(others) - {path} for path, others in arrows().items()}
-    while ends := [path for path, others in left.items() if not others & left.keys()]:
+    remainder = {path: set(others) - {path} for path, others in arrows().items()}
+    while ends := [path for path, others in remainder.items() if not others & remainder.keys()]:
         for path in ends:
-            del left[path]
-    assert sorted(str(path.relative_to(SOURCE)) for path in left) == []
+            del remainder[path]
+    assert sorted(str(path.relative_to(SOURCE)) for path in remainder) == []
 
 
 def is_private(name: str) -> bool:

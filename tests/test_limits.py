@@ -12,8 +12,8 @@ from pkmcal.cameras import load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, limits, read_csv, read_json, read_yaml, validated_document
 from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.session.image_files import photograph_header
 from pkmcal.session.load import load_session
-from pkmcal.session.photographs import photograph_header
 from pkmcal.session.schema import session_schema
 from pkmcal.session.starter import write_session
 

@@ -52,21 +52,21 @@ def seen(machine, rng, noise, configurations=12, shading=0.0):
 
 def shifted(edges, pixels):
     """Edges that lie outwards by some pixels (N, 1)."""
-    moved = edges.normal + (edges.basis @ (edges.shift * pixels)[..., None])[..., 0]
-    moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
-    basis = edges.basis - moved[..., None] * (moved[:, None] @ edges.basis)
-    return replace(edges, normal=moved, basis=basis)
+    shifted = edges.normal + (edges.basis @ (edges.shift * pixels)[..., None])[..., 0]
+    shifted /= np.linalg.norm(shifted, axis=-1, keepdims=True)
+    basis = edges.basis - shifted[..., None] * (shifted[:, None] @ edges.basis)
+    return replace(edges, normal=shifted, basis=basis)
 
 
-def missed(found, truth):
+def missed(value, truth):
     """Root mean square (m) of what base centres (L, 3) miss, laid on the truth."""
-    return float(np.sqrt(np.mean((found - apply(register(truth, found), truth)) ** 2)))
+    return float(np.sqrt(np.mean((value - apply(register(truth, value), truth)) ** 2)))
 
 
 def leg_by_leg(measurements):
     """The paper's own: each leg alone, then the scale (16)."""
-    found = linear.centres(DRAWING, measurements, "robust").centres[0]
-    return found / linear.procrustes_scale(found, DRAWING.base_centers())
+    value = linear.centres(DRAWING, measurements, "robust").centres[0]
+    return value / linear.procrustes_scale(value, DRAWING.base_centers())
 
 
 def together(measurements):
@@ -100,11 +100,11 @@ def test_exact_edges_give_the_base_and_the_edge_shift():
     measurements = seen(truth, rng, sharp)
     stated = replace(measurements.edges, covariance=1e6 * measurements.edges.covariance)
     measurements = replace(measurements, edges=stated, shaded=False)
-    found = base_together(machine, measurements)
-    base = machine.with_values(found.theta).base_centers()
+    value = base_together(machine, measurements)
+    base = machine.with_values(value.theta).base_centers()
     # the shift counts to first order, and what is known of it beforehand draws a little
     assert missed(base, truth.base_centers()) < 1e-6
-    assert found.edge_shift[0] == pytest.approx(0.2, abs=1e-4)
+    assert value.edge_shift[0] == pytest.approx(0.2, abs=1e-4)
     alone = linear.centres(machine, measurements, "robust").centres[0]
     assert missed(alone, truth.base_centers()) > 1e-3
 
@@ -148,18 +148,18 @@ def test_one_side_of_a_tube_two_pixels_off():
     assert missed(together(measurements), machine.base_centers()) < 1.5e-3
 
 
-def chi2(values, found, covariance, machine):
+def chi2(values, value, covariance, machine):
     """Sum of squares of an error by its covariance (P, P), frames taken out of both, and how many
     numbers it holds.
     """
     layout = machine.layout
     keep = np.concatenate([i.ravel() for i in centre_index(layout)] + [layout.rod[layout.rod >= 0]])
-    frames = np.linalg.qr(generators(layout, found)[keep])[0]
+    frames = np.linalg.qr(generators(layout, value)[keep])[0]
     project = np.eye(len(keep)) - frames @ frames.T
-    error = project @ (found - values)[keep]
+    error = project @ (value - values)[keep]
     spread, axes = np.linalg.eigh(project @ covariance[np.ix_(keep, keep)] @ project)
-    known = spread > 1e-9 * spread[-1]
-    return np.sum((axes.T @ error)[known] ** 2 / spread[known]), int(known.sum())
+    above_limit = spread > 1e-9 * spread[-1]
+    return np.sum((axes.T @ error)[above_limit] ** 2 / spread[above_limit]), int(above_limit.sum())
 
 
 def test_deviations_are_true_for_base_platform_and_lengths(scenes):
@@ -177,13 +177,13 @@ def test_deviations_are_true_for_base_platform_and_lengths(scenes):
     assert np.sum(squares) / count == pytest.approx(1, abs=4 * np.sqrt(2 / count))
 
 
-def _laid_on(machine, found):
+def _laid_on(machine, value):
     """The machine's values (P,) told in the frames that lay its centres on those found."""
     values = machine.values.copy()
     for index, old, new in zip(
         centre_index(machine.layout),
         (machine.base_centers(), machine.platform_centers()),
-        (found.base_centers(), found.platform_centers()),
+        (value.base_centers(), value.platform_centers()),
         strict=True,
     ):
         values[index] = apply(register(old, new), old)
@@ -201,8 +201,8 @@ def test_verdict_says_how_far_the_method_goes(scenes):
         np.zeros(0, dtype=int),
         estimate.state.T_camera_base,
     )
-    told = Identifiability(0, 0, 0, (), (), np.zeros(0))
-    verdict = judge(observation, estimate, Findings(told, (), (), 1.0), "linear")
+    information = Identifiability(0, 0, 0, (), (), np.zeros(0))
+    verdict = judge(observation, estimate, Findings(information, (), (), 1.0), "linear")
     assert not verdict.usable
     (base,) = verdict.of("estimate.base_only")
     both, edges, drawing = (

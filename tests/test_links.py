@@ -56,12 +56,12 @@ def measured(machine, poses, pairs, rng, noise=1.0, target=True):
     joints = joints + noise * READING_NOISE * rng.normal(size=joints.shape)
     none = np.zeros(n if target else 0, dtype=int)
     error = noise * POSE_SIGMA * rng.normal(size=(len(none), 6))
-    seen = perturb(T_TRACKER_BASE @ poses[: len(none)], error)
+    in_view = perturb(T_TRACKER_BASE @ poses[: len(none)], error)
     whiten = np.broadcast_to(np.diag(1 / POSE_SIGMA), (len(none), 6, 6))
     mounts = (Mount("target", "platform"), Mount("distances", "platform"))[1 - int(target) :]
     return Measurements(
         EdgeSet.empty(), joints, READING_NOISE, int(target), np.zeros(int(target), dtype=int),
-        poses=PoseSet(none, np.arange(len(none)), none, seen, whiten), mounts=mounts,
+        poses=PoseSet(none, np.arange(len(none)), none, in_view, whiten), mounts=mounts,
         links=(links,),
     )  # fmt: skip
 
@@ -85,7 +85,7 @@ def case(machine):
     step[:, u.mounts] = 1e-2 * rng.normal(size=(1, u.mounts.stop - u.mounts.start))
     step[:, u.linked] = 1e-3 * rng.normal(size=(1, u.n_linked))
     own = 1e-3 * rng.normal(size=(1, 12, 6))
-    return assembled, assembled.problem.moved(batch, step, own), data
+    return assembled, assembled.problem.retract(batch, step, own), data
 
 
 def test_the_residual_is_the_distance_of_the_marks(case):
@@ -94,8 +94,8 @@ def test_the_residual_is_the_distance_of_the_marks(case):
     at = marks(T, state.T_mount[0, 1, :3, 3])
     apart = np.linalg.norm(at[links.configuration[:, 1]] - at[links.configuration[:, 0]], axis=1)
     rows = assembled.problem.unweighted(state).links[0]
-    found = assembled.places.links.taken(rows)[:, 0]
-    np.testing.assert_allclose(found, (apart - links.value) / SIGMA, rtol=1e-9, atol=1e-7)
+    values = assembled.places.links.taken(rows)[:, 0]
+    np.testing.assert_allclose(values, (apart - links.value) / SIGMA, rtol=1e-9, atol=1e-7)
 
 
 def test_jacobian_against_differences(case):
@@ -107,7 +107,7 @@ def test_jacobian_against_differences(case):
 
     def value(step):
         shared, own = step[:na][None], step[na:].reshape(1, count, d)
-        return problem.residuals(problem.moved(state, shared, own)).value[0]
+        return problem.residuals(problem.retract(state, shared, own)).value[0]
 
     # a linked configuration's own unknowns are shared, and no others
     linked = problem.link_blocks.linked
@@ -138,8 +138,8 @@ def test_links_of_every_machine(name):
     joints = machine.inverse(machine.home()[None]) + reach * rng.normal(size=(7, machine.n_joints))
     if machine.redundancy:  # whose readings have to agree
         joints = machine.inverse(machine.forward(joints))
-    found = machine.forward_result(joints)
-    joints, poses = joints[found.converged][:5], found.T_base_platform[found.converged][:5]
+    fk = machine.forward_result(joints)
+    joints, poses = joints[fk.converged][:5], fk.T_base_platform[fk.converged][:5]
     assert len(joints) == 5
     data = measured(machine, poses, [(0, 3), (3, 1), (4, 0)], rng, noise=0.0, target=False)
     data = replace(data, joints=joints)
@@ -152,10 +152,10 @@ def test_links_of_every_machine(name):
     own = np.zeros((1, 5, problem.layout.own_motion.shape[1]))
     step = np.zeros((1, u.count))
     step[:, u.mounts.start : u.linked.stop] = 1e-4 * rng.normal(size=u.linked.stop - u.mounts.start)
-    here = problem.moved(state, step, own)
+    here = problem.retract(state, step, own)
     step = 1e-3 * step[:, ::-1].copy() + 1e-3 * step
     ahead, back = (
-        problem.residuals(problem.moved(here, sign * step, own)).value[0] for sign in (1, -1)
+        problem.residuals(problem.retract(here, sign * step, own)).value[0] for sign in (1, -1)
     )
     expected = (ahead - back)[:, rows] / 2
     by = (problem.linearize(here).by_shared[0] @ step[0])[:, rows]
@@ -197,14 +197,14 @@ def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
     freedom = components(info, weight).freedom[0]
     _, count, r, _ = problem.linearize(state).by_own.shape
-    left = (1 - hat[: count * r]).reshape(count, r)
+    remainder = (1 - hat[: count * r]).reshape(count, r)
     links = problem.kinds.links
-    expected = left[:, links.rows][links.present].sum()
+    expected = remainder[:, links.rows][links.present].sum()
     assert 0 < expected < len(data.links[0])
     assert freedom[3] == pytest.approx(expected, rel=1e-5)
-    poses = left[:, problem.kinds.poses.rows].sum()
+    poses = remainder[:, problem.kinds.poses.rows].sum()
     assert freedom[1] == pytest.approx(poses, rel=1e-5)
-    assert freedom[2] == pytest.approx(left[:, problem.closure_rows].sum(), rel=1e-4)
+    assert freedom[2] == pytest.approx(remainder[:, problem.closure_rows].sum(), rel=1e-4)
 
 
 def test_pieces_say_what_the_whole_says(case, monkeypatch):
@@ -256,24 +256,24 @@ def test_edges_of_linked_configurations(with_edges):
     na = len(shared)
     j, own = whole[:, :na], whole[:, na:]
     q = np.linalg.qr(own)[0]
-    left = j - q @ (q.T @ j)
-    matrix, size = normal.matrix[0][np.ix_(shared, shared)], np.linalg.norm(left, axis=0)
+    residual = j - q @ (q.T @ j)
+    matrix, size = normal.matrix[0][np.ix_(shared, shared)], np.linalg.norm(residual, axis=0)
     scale = np.outer(size, size)
-    np.testing.assert_allclose(matrix / scale, left.T @ left / scale, atol=1e-9)
+    np.testing.assert_allclose(matrix / scale, residual.T @ residual / scale, atol=1e-9)
     gradient = normal.gradient[0][shared]
-    np.testing.assert_allclose(gradient / size, left.T @ value / size, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(gradient / size, residual.T @ value / size, rtol=1e-6, atol=1e-5)
     info = Information(problem, state)
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
     unit = whole / np.linalg.norm(whole, axis=0)
     inverse = np.linalg.inv(unit.T @ unit)
     hat = np.einsum("ij,jk,ik->i", unit, inverse, unit)
     _, count, r, _ = linear.by_own.shape
-    left = (1 - hat[: count * r]).reshape(count, r)
+    residual = (1 - hat[: count * r]).reshape(count, r)
     freedom = components(info, weight).freedom[0]
     edges, links = problem.kinds.edges, problem.kinds.links
-    of_edges = left[:, edges.rows][np.repeat(edges.present, 2, axis=1)].sum()
+    of_edges = residual[:, edges.rows][np.repeat(edges.present, 2, axis=1)].sum()
     assert freedom[0] == pytest.approx(of_edges, rel=1e-5)
-    of_links = left[:, links.rows][links.present].sum()
+    of_links = residual[:, links.rows][links.present].sum()
     assert freedom[3] == pytest.approx(of_links, rel=1e-4, abs=1e-6)
     taken = sum(
         float(np.sum(piece.own**2)) + sum(float(np.sum(t**2)) for _, t in piece.shared(info.root))
@@ -318,8 +318,8 @@ def test_two_kinds_of_links_stand_side_by_side(machine):
     np.testing.assert_allclose(
         assembled.places.links.taken(rows)[:, 0], [0, 0, 0, 0, -20], atol=1e-3
     )
-    found, number = data.link_at(4)
-    assert found.kind == "steps"
+    value, number = data.link_at(4)
+    assert value.kind == "steps"
     assert number == 1
     estimate = bundle(machine, data, start)
     assert estimate.link_residuals.shape == estimate.link_weights.shape == (5,)
@@ -343,10 +343,10 @@ def test_the_tool_point_of_a_machine_that_turns_is_estimated(machine):
     assert estimate.statistics.link_scale < 1.3
     assert np.sqrt(np.diag(estimate.mount_covariance[1])[3:]).max() < 5e-4
     T = perturb(machine.home(), rng.normal(size=(20, 6)) * np.repeat([0.1, 0.03], 3))
-    found = estimate.machine.forward(machine.inverse(T))
-    at, expected = marks(found, estimate.state.T_mount[1, :3, 3]), marks(T)
-    apart, known = (np.linalg.norm(x[1:] - x[:-1], axis=1) for x in (at, expected))
-    assert np.sqrt(np.mean((apart - known) ** 2)) < SIGMA
+    forward_kinematics = estimate.machine.forward(machine.inverse(T))
+    at, expected = marks(forward_kinematics, estimate.state.T_mount[1, :3, 3]), marks(T)
+    apart, above_limit = (np.linalg.norm(x[1:] - x[:-1], axis=1) for x in (at, expected))
+    assert np.sqrt(np.mean((apart - above_limit) ** 2)) < SIGMA
 
 
 def test_without_links_a_configuration_is_eliminated(machine, case):

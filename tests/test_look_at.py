@@ -27,8 +27,8 @@ def test_look_at_gives_a_rotation_that_sees_the_target_upright(position, look_at
     assert np.linalg.det(rotation) == pytest.approx(1)
     np.testing.assert_array_equal(T_camera_base[3], [0, 0, 0, 1])
     np.testing.assert_allclose((T_camera_base @ [*eye, 1])[:3], 0, atol=1e-12 * 100)
-    seen = (T_camera_base @ [*target, 1])[:3]
-    np.testing.assert_allclose(seen, [0, 0, np.linalg.norm(view)], atol=1e-9)
+    in_view = (T_camera_base @ [*target, 1])[:3]
+    np.testing.assert_allclose(in_view, [0, 0, np.linalg.norm(view)], atol=1e-9)
     # y points down, and up has no part across the image's vertical.
     assert rotation[1] @ above < 0
     assert abs(rotation[0] @ above) < 1e-9 * np.linalg.norm(above)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.control.loop import GoalPhotograph, Status, VisualServo
-from pkmcal.control.seen import seen_machine, true_edges
+from pkmcal.control.machine_view import machine_view, true_edges
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose_difference
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -19,7 +19,7 @@ MACHINE = load_mechanism("gough-stewart")
 HOME = MACHINE.home()
 READINGS = MACHINE.inverse(HOME[None])[0]
 GOAL = perturb(HOME, np.array([0.05, -0.04, 0.08, 0.012, -0.01, 0.015]))
-SEEN = seen_machine(MACHINE, BESIDE)
+SEEN = machine_view(MACHINE, BESIDE)
 WITH_TUBES = [n for n in catalogue() if any(g.tubes for g in load_mechanism(n).document.legs)]
 
 
@@ -56,12 +56,12 @@ def test_every_machine_with_tubes_arrives(name, law):
     readings = machine.inverse(home[None])[0]
     ranges = machine.joint_ranges
     span = np.where(np.isfinite(ranges).all(axis=1), np.ptp(ranges, axis=1), 0.1)
-    way = 0.08 * span * np.random.default_rng(1).uniform(-1, 1, machine.n_joints)
-    goal = machine.forward((readings + way)[None], home)[0]
+    direction = 0.08 * span * np.random.default_rng(1).uniform(-1, 1, machine.n_joints)
+    goal = machine.forward((readings + direction)[None], home)[0]
     loop = VisualServo(machine, None, camera_before(machine, readings), goal, law=law, gain=0.5)
     pose, errors = home, []
     for _ in range(24):
-        step = loop.step_edges(true_edges(loop.seen, pose, readings), readings)
+        step = loop.step_edges(true_edges(loop.view, pose, readings), readings)
         errors.append(step.error)
         readings = readings + step.joint_velocities
         pose = machine.forward(readings[None], pose)[0]
@@ -106,10 +106,10 @@ def test_a_lost_leg_is_done_without():
     loop = servo(gain=0.5)
     pose, readings = HOME, READINGS.copy()
     for k in range(24):
-        seen = true_edges(SEEN, pose)
+        in_view = true_edges(SEEN, pose)
         if k > 2:
-            seen[1] = np.nan
-        step = loop.step_edges(seen, readings)
+            in_view[1] = np.nan
+        step = loop.step_edges(in_view, readings)
         assert step.status.moves
         readings = readings + step.joint_velocities
         pose = MACHINE.forward(readings[None], pose)[0]
@@ -123,17 +123,17 @@ def test_a_lost_leg_is_done_without():
 
 def test_too_few_legs_stop_it_and_their_return_goes_on():
     loop = servo()
-    seen = edges()
-    assert loop.step_edges(seen, READINGS).status is Status.RUNNING
-    few = np.where(np.arange(6)[:, None, None] < 2, seen, np.nan)
+    in_view = edges()
+    assert loop.step_edges(in_view, READINGS).status is Status.RUNNING
+    few = np.where(np.arange(6)[:, None, None] < 2, in_view, np.nan)
     step = loop.step_edges(few, READINGS)
     assert stopped(step)
     assert step.status is Status.LOST
     assert "legs 1 and 2 alone cannot show every motion" in step.sentence
-    step = loop.step_edges(np.full_like(seen, np.nan), READINGS)
+    step = loop.step_edges(np.full_like(in_view, np.nan), READINGS)
     assert step.status is Status.LOST
     assert stopped(step)
-    assert loop.step_edges(seen, READINGS).status is Status.RUNNING
+    assert loop.step_edges(in_view, READINGS).status is Status.RUNNING
 
 
 def other_assembly():
@@ -174,9 +174,9 @@ def test_a_goal_on_the_other_side_is_too_far():
 def test_a_motor_at_its_end_stops_what_leads_further_and_not_what_leads_back():
     moving = servo().step_edges(edges(), READINGS)
     k = int(np.argmax(np.abs(moving.joint_velocities)))
-    way = np.sign(moving.joint_velocities[k])
+    direction = np.sign(moving.joint_velocities[k])
     readings = READINGS.copy()
-    readings[k] = MACHINE.joint_ranges[k, 0 if way < 0 else 1] - 1e-4 * way
+    readings[k] = MACHINE.joint_ranges[k, 0 if direction < 0 else 1] - 1e-4 * direction
     # the photograph is another one's, but what is asked here is the reading
     loop = servo(period=0.1)
     loop._started = True
@@ -184,7 +184,7 @@ def test_a_motor_at_its_end_stops_what_leads_further_and_not_what_leads_back():
     assert stopped(step)
     assert step.status is Status.OUT_OF_RANGE
     assert f"leg {k + 1} reads" in step.sentence
-    readings[k] = MACHINE.joint_ranges[k, 1 if way < 0 else 0] + 1e-3 * -way
+    readings[k] = MACHINE.joint_ranges[k, 1 if direction < 0 else 0] + 1e-3 * -direction
     step = loop.step_edges(edges(), readings)
     assert step.status is Status.RUNNING
     assert any(f"leg {k + 1} is outside its range" in w for w in step.warnings)
@@ -304,7 +304,7 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
     elsewhere = perturb(HOME, np.array([0.1, 0.1, 0.3, 0.03, 0, 0.03]))
     step = loop.step_image(image, MACHINE.inverse(elsewhere[None])[0])
     assert stopped(step)
-    assert step.status is Status.NOT_FOUND
+    assert step.status is Status.NOT_AT_READINGS
     assert "camera that was moved" in step.sentence
     step = loop.step_image(image, READINGS * [2, 1, 1, 0.2, 1, 1])
     assert step.status is Status.UNREACHABLE
@@ -320,14 +320,14 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
 
 
 def test_a_calibration_gives_machine_camera_and_place(demo):
-    from pkmcal.calibration.saved import load
+    from pkmcal.calibration.saved_calibration import load
 
     saved = load(demo.calibration)
     goal = saved.T_base_platform[0]
     loop = VisualServo.from_calibration(demo.calibration, saved.stations[0].name, goal, gain=0.5)
     np.testing.assert_array_equal(loop.machine.values, saved.machine.values)
     there = saved.stations[0].T_base_camera
-    np.testing.assert_allclose(inverse(loop.seen.T_camera_base), there, atol=1e-12)
+    np.testing.assert_allclose(inverse(loop.view.T_camera_base), there, atol=1e-12)
     assert loop._sight.edge_shift == saved.document["cameras"][0]["edge_shift"]
     assert loop._sight.binning == saved.document["stations"][0]["binning"]
     with pytest.raises(InputError, match="no such station"):

@@ -53,4 +53,4 @@ def test_a_wrong_size_is_told_with_the_right_one(paths, tmp_path, marker):
 
 @pytest.mark.parametrize("marker", [0.021, 0.022, 0.0235])
 def test_what_a_ruler_may_be_off_is_accepted(paths, tmp_path, marker):
-    assert all(detection.found for detection in detect_boards(paths, described(tmp_path, marker)))
+    assert all(detection.success for detection in detect_boards(paths, described(tmp_path, marker)))

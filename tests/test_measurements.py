@@ -215,14 +215,14 @@ def test_derivatives_agree_with_differences(example):
     rows = rows_of(kind, problem)
     for _ in range(3):
         shared, own = size * rng.normal(size=(1, na)), 1e-4 * rng.normal(size=(1, count, d))
-        here = problem.moved(state, shared, own)
+        here = problem.retract(state, shared, own)
         linear = problem.linearize(here)
         step = 1e-3 * size * rng.normal(size=(1, na)), 1e-7 * rng.normal(size=(1, count, d))
         ahead, back = (
-            problem.residuals(problem.moved(here, s * step[0], s * step[1])).value[0]
+            problem.residuals(problem.retract(here, s * step[0], s * step[1])).value[0]
             for s in (1.0, -1.0)
         )
-        found = (linear.by_shared[0] @ step[0][0]) + np.einsum(
+        values = (linear.by_shared[0] @ step[0][0]) + np.einsum(
             "krd,kd->kr", linear.by_own[0], step[1][0]
         )
         linked = problem.link_blocks.linked
@@ -230,7 +230,7 @@ def test_derivatives_agree_with_differences(example):
         expected = (ahead - back) / 2
         scale = np.abs(expected[:, rows]).max()
         assert scale > 0
-        np.testing.assert_allclose(found[:, rows], expected[:, rows], atol=2e-5 * scale)
+        np.testing.assert_allclose(values[:, rows], expected[:, rows], atol=2e-5 * scale)
 
 
 def test_residuals_stand_in_standard_deviations(example):
@@ -244,7 +244,7 @@ def test_residuals_stand_in_standard_deviations(example):
     )
     shared = np.zeros((1, u.count))
     shared[:, u.linked] = 1e-4 * rng.normal(size=(1, u.n_linked))
-    away = problem.moved(state, shared, own)
+    away = problem.retract(state, shared, own)
     poses, edges = data.poses, data.edges
     noisy = replace(
         data,
@@ -255,9 +255,9 @@ def test_residuals_stand_in_standard_deviations(example):
     )
     other = assemble(machine, noisy, default_gauge(machine)).problem
     rows = rows_of(kind, problem)
-    found, expected = (p.residuals(away).value[0][:, rows] for p in (other, problem))
+    values, expected = (p.residuals(away).value[0][:, rows] for p in (other, problem))
     assert np.abs(expected).max() > 0.1
-    np.testing.assert_allclose(2 * found, expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(2 * values, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_an_estimate_that_starts_at_exact_data_ends_there(example):

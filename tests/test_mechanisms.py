@@ -45,10 +45,10 @@ def test_catalogue_machines_can_be_assembled(machine):
     """Home closes at readings in range, far from a singular pose."""
     home = machine.home()
     readings = machine.inverse(home)
-    found = machine.forward_result(readings)
-    assert found.converged
-    assert found.singularity > 0.1
-    np.testing.assert_allclose(found.T_base_platform, home, atol=1e-11)
+    fk = machine.forward_result(readings)
+    assert fk.converged
+    assert fk.singularity > 0.1
+    np.testing.assert_allclose(fk.T_base_platform, home, atol=1e-11)
     low, high = machine.joint_ranges.T
     assert not ((readings < low) | (readings > high)).any()
 
@@ -214,8 +214,8 @@ def test_tied_parameters_change_by_the_same_amount():
     matrix = table.free_matrix()
     assert matrix.shape == (len(table), len(table) - 1)
     values = table.drawing + matrix @ np.arange(1.0, matrix.shape[1] + 1)
-    moved = values - table.drawing
-    a, b, c = (moved[table.index(name)] for name in NAMES)
+    shifted = values - table.drawing
+    a, b, c = (shifted[table.index(name)] for name in NAMES)
     assert a == pytest.approx(b)
     assert a != pytest.approx(c)
     assert np.linalg.matrix_rank(matrix) == matrix.shape[1]
@@ -278,7 +278,7 @@ def test_carriers_have_exact_derivatives(side, carrier):
     parameters = rng.normal(size=(5, len(carrier.parameters)))
     motion = rng.normal(size=(4, 1)) if side == "base" else perturb(np.eye(4), rng.normal(size=6))
     by_parameters = carrier.by_parameters(parameters, motion)
-    moved = np.broadcast_to(carrier.place(parameters, motion)[1], by_parameters.shape[:-1])
+    shifted = np.broadcast_to(carrier.place(parameters, motion)[1], by_parameters.shape[:-1])
 
     def differences(of, step=1e-3):
         weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
@@ -289,11 +289,11 @@ def test_carriers_have_exact_derivatives(side, carrier):
         np.testing.assert_allclose(by_parameters[..., k] - oracle, 0.0, atol=1e-11)
     if side == "base":
         oracle = differences(lambda d: carrier.place(parameters, motion + d))
-        np.testing.assert_allclose(moved - oracle, 0.0, atol=1e-11)
+        np.testing.assert_allclose(shifted - oracle, 0.0, atol=1e-11)
         return
     for k, by in enumerate(np.eye(6)):
         oracle = differences(lambda d, by=by: carrier.place(parameters, perturb(motion, d * by)))
-        np.testing.assert_allclose(by_pose(moved)[..., k], oracle, atol=1e-11)
+        np.testing.assert_allclose(by_pose(shifted)[..., k], oracle, atol=1e-11)
 
 
 @pytest.mark.parametrize(("side", "carrier"), CARRIERS)
@@ -308,13 +308,13 @@ def test_carriers_broadcast(side, carrier):
         else np.stack([perturb(np.eye(4), d) for d in rng.normal(size=(4, 6))])[:, None]
     )
 
-    def told(parameters, motion):
+    def report(parameters, motion):
         return (*carrier.place(parameters, motion), carrier.by_parameters(parameters, motion))
 
-    batch = told(parameters, motion)
+    batch = report(parameters, motion)
     spread = np.broadcast_to(motion, (4, 3, *tail))
     for r, k, leg in np.ndindex(2, 4, 3):
-        one = told(parameters[r, 0, leg], np.asarray(spread[k, leg]))
+        one = report(parameters[r, 0, leg], np.asarray(spread[k, leg]))
         for got, single in zip(batch, one, strict=True):
             full = np.broadcast_to(got, (2, 4, 3, *got.shape[3:]))
             np.testing.assert_allclose(full[r, k, leg], single, atol=1e-15)

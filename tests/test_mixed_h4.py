@@ -39,9 +39,9 @@ def estimates(machine, seed):
     noise = EdgeNoise(shift=0.1, tilt=0.1)
     edges, joints = simulate_edges(true, T, camera(), poses, noise, rng, joint_noise=READING)
     T_mount = perturb(np.eye(4), np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.05]))
-    seen = perturb(T[0] @ poses @ T_mount, POSE * rng.normal(size=(n, 6)))
+    in_view = perturb(T[0] @ poses @ T_mount, POSE * rng.normal(size=(n, 6)))
     whiten = np.broadcast_to(np.diag(1 / POSE), (n, 6, 6))
-    board = PoseSet(np.zeros(n, int), np.arange(n), np.zeros(n, int), seen, whiten)
+    board = PoseSet(np.zeros(n, int), np.arange(n), np.zeros(n, int), in_view, whiten)
     rough = perturb(T, 0.01 * rng.normal(size=(1, 6)))
     for legs, targets in ((edges, None), (EdgeSet.empty(), board), (edges, board)):
         measurements = Measurements(

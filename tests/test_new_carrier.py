@@ -229,8 +229,8 @@ def test_its_defaults_meet_the_contract(folder, name):
     np.testing.assert_allclose(carrier.place(parameters, q)[1], oracle[..., 0], atol=1e-9)
     n = parameters.shape[-1]
     oracle = test_carriers.differences(lambda d: carrier.place(parameters + d, q)[0], n, 1e-3)
-    found = carrier.by_parameters(parameters, q)
-    np.testing.assert_allclose(found, oracle, atol=1e-7 * np.abs(oracle).max())
+    values = carrier.by_parameters(parameters, q)
+    np.testing.assert_allclose(values, oracle, atol=1e-7 * np.abs(oracle).max())
 
 
 def test_defaults_are_what_the_package_s_carriers_give_themselves():
@@ -242,9 +242,9 @@ def test_defaults_are_what_the_package_s_carriers_give_themselves():
         if carrier.driven:
             b, near = rng.normal(size=(4, 3)), q + 0.01
             length = np.linalg.norm(b - carrier.place(parameters, q)[0], axis=1)
-            found = super(carrier, carrier).reading(parameters, b, length, near)
+            values = super(carrier, carrier).reading(parameters, b, length, near)
             np.testing.assert_allclose(
-                found, carrier.reading(parameters, b, length, near), atol=1e-7
+                values, carrier.reading(parameters, b, length, near), atol=1e-7
             )
     T = perturb(np.eye(4), rng.normal(size=(4, 6)))
     for carrier in test_carriers.PLATFORM:
@@ -322,17 +322,19 @@ def calibrated(machine):
 
 
 def test_a_session_calibrates_to_the_truth(machine, calibrated):
-    truth, _, found = calibrated
-    z = test_catalogue.whitened(machine, found, truth)
+    truth, _, value = calibrated
+    z = test_catalogue.whitened(machine, value, truth)
     assert np.mean(z**2) == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))
 
-    def neighbours(known):
+    def neighbours(reference_values):
         """Lengths (K, 6) between the arms' ends of one leg and the next, which need no frame, m."""
-        ends = limb_ends(known.layout, known.values, truth.joints, np.eye(4)).a
+        ends = limb_ends(
+            reference_values.layout, reference_values.values, truth.joints, np.eye(4)
+        ).a
         return np.linalg.norm(ends - np.roll(ends, 1, axis=-2), axis=-1)
 
     true = neighbours(truth.machine)
-    before, after = (np.abs(neighbours(m) - true).max() for m in (machine, found.machine))
+    before, after = (np.abs(neighbours(m) - true).max() for m in (machine, value.machine))
     assert after < before / 5
 
 
@@ -341,8 +343,8 @@ def test_what_data_leave_open_is_said(machine, calibrated):
     _, measurements, estimate = calibrated
     assembled = assemble(machine, measurements, default_gauge(machine))
     info = Information(assembled.problem, batch_of(machine, assembled, estimate.state))
-    told = identifiability(info, machine)
-    findings = explain(told, estimate, np.ones((3, 6), dtype=bool))
+    values = identifiability(info, machine)
+    findings = explain(values, estimate, np.ones((3, 6), dtype=bool))
     slides = [sentence for sentence in findings.unidentified if not sentence.matters]
     assert sum(sentence.dimensions for sentence in slides) == 6
     (slide,) = slides
@@ -379,9 +381,9 @@ def test_it_is_drawn(machine, calibrated):
 def test_a_way_that_bends_is_drawn_in_pieces(arcs):
     drives = drives_of(arcs)
     assert drives.guides.all()
-    for j, way in enumerate(drives.ways):
-        assert len(way) == BENT_GUIDE_PIECES + 1
-        from_axis = way - arcs.base_centers()[j]
+    for j, attempt in enumerate(drives.ways):
+        assert len(attempt) == BENT_GUIDE_PIECES + 1
+        from_axis = attempt - arcs.base_centers()[j]
         assert np.ptp(np.linalg.norm(from_axis[:, :2], axis=1)) > 1e-3
     rails = [box for box in boxes_of(arcs) if box.half[1] == box.half[2]]
     assert len(rails) == 3 * BENT_GUIDE_PIECES

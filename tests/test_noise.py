@@ -54,7 +54,7 @@ def test_variances_are_as_their_shares_say(factor):
     machine = exact("gough-stewart")
     problem, truth = batch(1, factor * 4e-5, 4e-5, runs=100, machine=machine)
     result = solve_batch(problem, truth, robust=False, scale_noise=False)
-    found, shares = components(result.info, result.weight), result.reading_noise
+    value, shares = components(result.info, result.weight), result.reading_noise
     real = shares.fixed < 1  # no padding
     assert np.sum(shares.own**2, axis=1).mean() > LEAST_NOISE_FREEDOM  # something is told
     u = shares.z / np.sqrt(factor**2 * shares.own + shares.others + shares.fixed)
@@ -64,16 +64,16 @@ def test_variances_are_as_their_shares_say(factor):
         assert np.mean(u[some] ** 2) == pytest.approx(1, abs=4 * np.sqrt(2 / some.sum()))
     assert np.mean(u[:, 1:] * u[:, :-1]) == pytest.approx(0, abs=4 / np.sqrt(real.sum()))
     if factor == 1:
-        expected = found.freedom[:, READING_ROWS_KIND]
-        assert np.mean(found.chi2[:, READING_ROWS_KIND] / expected) == pytest.approx(1, abs=0.1)
+        expected = value.freedom[:, READING_ROWS_KIND]
+        assert np.mean(value.chi2[:, READING_ROWS_KIND] / expected) == pytest.approx(1, abs=0.1)
 
 
 def coverage(configurations, true, chance, runs):
     """Shares of runs in which the interval of the readings' noise holds the truth, and in which
     each of its ends is told."""
     problem, truth = batch(7, true, true, runs=runs, configurations=configurations)
-    found = solve_batch(problem, truth, robust=False, scale_noise=False)
-    low, high = found.reading_noise.interval(chance)
+    value = solve_batch(problem, truth, robust=False, scale_noise=False)
+    low, high = value.reading_noise.interval(chance)
     return np.mean((low <= 1) & (high >= 1)), np.mean(low > 0), np.mean(np.isfinite(high))
 
 
@@ -117,32 +117,32 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     honest, and edges are not blamed."""
     problem, truth = batch(2, true, stated)
     right = replace(problem, joint_noise=np.array([true]))
-    found, best = (solve_batch(p, truth) for p in (problem, right))
-    low, high = found.reading_noise.interval()
-    scale = found.reading_scale * stated / true  # of the noise in use, to the true one
+    value, best = (solve_batch(p, truth) for p in (problem, right))
+    low, high = value.reading_noise.interval()
+    scale = value.reading_scale * stated / true  # of the noise in use, to the true one
     assert np.all((low * scale < 1) & (high * scale > 1))
-    assert np.all(found.reading_scale != 1)
-    np.testing.assert_array_less(found.noise_scale, 1.1)
-    error, least = ((r.solution.state.z - truth.z) ** 2 for r in (found, best))
+    assert np.all(value.reading_scale != 1)
+    np.testing.assert_array_less(value.noise_scale, 1.1)
+    error, least = ((r.solution.state.z - truth.z) ** 2 for r in (value, best))
     assert error.sum() == pytest.approx(least.sum(), rel=0.1)
-    promised, honest = (np.einsum("bii->bi", r.info.covariance).sum() for r in (found, best))
+    promised, honest = (np.einsum("bii->bi", r.info.covariance).sum() for r in (value, best))
     assert promised == pytest.approx(honest, rel=0.1)  # which test_bundle holds against repeats
 
 
 def test_a_noise_that_is_stated_right_is_left_alone():
     """One in a hundred may be doubted; among forty no more than two."""
     problem, truth = batch(3, JOINT_NOISE, JOINT_NOISE, runs=40)
-    found = solve_batch(problem, truth)
-    assert np.sum(found.reading_scale != 1) <= 2
+    values = solve_batch(problem, truth)
+    assert np.sum(values.reading_scale != 1) <= 2
 
 
 def test_where_the_data_cannot_tell_nothing_is_claimed():
     """Edges see the platform to some ten micrometres: whether readings are off by three or by three
     hundredths, they do not know, and it makes no difference."""
     problem, truth = batch(4, 3e-6, 3e-8)
-    found = solve_batch(problem, truth)
-    np.testing.assert_array_equal(found.reading_scale, 1.0)
-    low, high = found.reading_noise.interval()
+    values = solve_batch(problem, truth)
+    np.testing.assert_array_equal(values.reading_scale, 1.0)
+    low, high = values.reading_noise.interval()
     assert np.all(low == 0)
     assert np.all(high > 100)
 
@@ -163,12 +163,12 @@ def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
         "rotation: 0.0001", "rotation: 0.001"
     )
     assert wrong != text
-    for content, told in ((text, 0), (wrong, 1)):
+    for content, values in ((text, 0), (wrong, 1)):
         (folder / "session.yaml").write_text(content, encoding="utf-8")
-        found = calibrate_session(folder)
-        said = found.verdict.of("poses.noise")
-        assert [one.facts["keys"] for one in said] == [["stations.tracker.tracker.noise"]] * told
-        assert found.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
+        calibration = calibrate_session(folder)
+        words = calibration.verdict.of("poses.noise")
+        assert [one.facts["keys"] for one in words] == [["stations.tracker.tracker.noise"]] * values
+        assert calibration.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
 
 
 def pose_problem(name, pairs=()):
@@ -224,17 +224,17 @@ def test_traces_are_those_of_the_hat_matrix(name):
     used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]
     weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
-    found = components(Information(problem, state), weight)
-    left = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
-    freedom = np.array([np.trace(left[i][i]) for i in range(4)])
-    np.testing.assert_allclose(found.freedom[0], freedom, atol=1e-5)
+    results = components(Information(problem, state), weight)
+    residual = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
+    freedom = np.array([np.trace(residual[i][i]) for i in range(4)])
+    np.testing.assert_allclose(results.freedom[0], freedom, atol=1e-5)
     for kind in (READING_ROWS_KIND, POSE_ROWS_KIND, LINK_ROWS_KIND):
         part = of[kind]
         shares = noise_shares(Information(problem, state), kind)
         if not part.size:
             assert not shares.z.size
             continue
-        size, turn = np.linalg.eigh(left[kind][kind])
+        size, turn = np.linalg.eigh(residual[kind][kind])
         some = size > 1e-9
         # R is idempotent: what is left of a direction is its own part of the variance
         np.testing.assert_allclose(np.sort(shares.own[0])[-some.sum() :], size[some], atol=1e-5)

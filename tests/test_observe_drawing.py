@@ -106,8 +106,8 @@ def pixel_rays(distorted):
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     pixel = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
     corners = [camera.ray(pixel + d) for d in ([0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5])]
-    middle, right, left, down, up = (ray / ray[:, 2:] for ray in corners)
-    return middle, right - left, down - up
+    middle, right, remainder, down, up = (ray / ray[:, 2:] for ray in corners)
+    return middle, right - remainder, down - up
 
 
 def shown(tubes):

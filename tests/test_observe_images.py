@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
-from pkmcal.observe.complaints import decoded_and_fault
+from pkmcal.observe.codec_stderr import decoded_and_fault
 from pkmcal.observe.images import Pictures, Selected, decode
 
 SIZE = (64, 48)
@@ -142,12 +142,12 @@ def test_what_decoders_say_is_told_in_a_sentence_of_ours_alone(tmp_path, capfd):
     )
     at = len(JPEG) * 2 // 3
     short = JPEG[:at] + b"\xff\xd9"
-    for data, found in (
+    for data, item in (
         (odd, "a PNG file that is damaged (bad adaptive filter value)"),
         (cut, "a PNG file that is damaged (Not enough image data)"),
         (short, "a JPEG file that is damaged (premature end of data segment)"),
     ):
-        assert sentence(tmp_path, data) == CUT.format(found=found)
+        assert sentence(tmp_path, data) == CUT.format(found=item)
     assert capfd.readouterr() == ("", "")
 
 

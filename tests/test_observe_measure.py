@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from pkmcal.observe import legs as looks
+from pkmcal.observe.grey_levels import levels_at
+from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed
 from pkmcal.observe.legs import (
     EDGE_SEGMENTS,
     FEWEST_PROFILES_A_POINT,
@@ -16,8 +18,6 @@ from pkmcal.observe.legs import (
     _segment_profiles,
     measure,
 )
-from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import (
     EDGE_SIGMA_FLOOR,
@@ -70,8 +70,8 @@ def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
     0.03 px an edge, of which 0.02 are common to all: blur and edge shift stand for one another,
     and the identification has an edge shift for what is left.
     """
-    found = measure(taken(), redrawn(seed, spread), FRONT, poses())
-    edges = found.edges
+    value = measure(taken(), redrawn(seed, spread), FRONT, poses())
+    edges = value.edges
     assert len(edges) > 95
     shift, turn, chi = errors(edges)
     assert abs(shift.mean()) < 0.03
@@ -82,7 +82,7 @@ def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
     assert np.mean(chi > 4.5) < 0.03
     np.testing.assert_allclose(np.linalg.norm(edges.normal, axis=1), 1, atol=1e-12)
     # the blur of lens, pixel and interpolation
-    assert 0.62 < found.blur < 0.78
+    assert 0.62 < value.blur < 0.78
     assert np.all(np.abs(turn[:, 1]) < 5 * np.sqrt(edges.covariance[:, 1, 1]))
 
 
@@ -91,11 +91,11 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     makes the rest no poorer.
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
-    seen = PhotographWindow.of([Placed(taken(), FRONT, poses())])
-    tubes, points, clear = looks.predicted(seen, mechanism, EDGE_SEGMENTS * POINTS_A_SEGMENT)
+    visible = PhotographWindow.of([Placed(taken(), FRONT, poses())])
+    tubes, points, clear = looks.predicted(visible, mechanism, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     clear[:, :, 7] = False
     width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 1::POINTS_A_SEGMENT]
-    full, across = _segment_profiles(seen, points, clear, width)
+    full, across = _segment_profiles(visible, points, clear, width)
     pitch = np.linalg.norm(np.diff(points.pixel, axis=2), axis=-1)
     kinds: set[int] = set()
     for n in np.random.default_rng(0).choice(full.sum(), 40, replace=False):
@@ -111,7 +111,7 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
         outward = np.repeat(points.outward[k, e, mine], each, axis=0)
         pixel = camera.project(np.array(place))[:, None]
         pixel = pixel + sampled_offsets()[:, None] * outward[:, None]
-        grey = levels_at(seen.images[k], pixel[..., 0], pixel[..., 1], cubic=True).mean(axis=0)
+        grey = levels_at(visible.images[k], pixel[..., 0], pixel[..., 1], cubic=True).mean(axis=0)
         assert across.count[n] == len(place)
         # OpenCV 4 rounds places to a 32nd of a pixel
         np.testing.assert_allclose(across.grey[n], grey[-len(across.grey[n]) :], atol=1.0)
@@ -121,37 +121,37 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     pixel = points.pixel.copy()
     pixel[:, :, 0] = np.nan
     clear[:, :, 0] = False
-    nearer = _segment_profiles(seen, replace(points, pixel=pixel), clear, width)[1]
+    nearer = _segment_profiles(visible, replace(points, pixel=pixel), clear, width)[1]
     _, _, segment = np.nonzero(full)
     np.testing.assert_array_equal(nearer.count[segment > 0], across.count[segment > 0])
 
 
 def test_every_edge_is_measured_or_has_a_reason():
-    found = measure(taken(), redrawn(0, 0.0005), FRONT, poses())
-    edges = found.edges
+    value = measure(taken(), redrawn(0, 0.0005), FRONT, poses())
+    edges = value.edges
     keys = (edges.configuration, edges.leg, edges.tube, edges.side)
     measured = set(zip(*(key.tolist() for key in keys), strict=True))
-    rejected = {(r.configuration, r.leg, r.tube, r.side) for r in found.rejected}
+    rejected = {(r.configuration, r.leg, r.tube, r.side) for r in value.rejected}
     assert len(measured) == len(edges)
     assert not measured & rejected
     assert len(measured | rejected) == 6 * len(tubes_of(machine()))
-    hidden = sum("hidden" in r.reason for r in found.rejected)
+    hidden = sum("hidden" in r.reason for r in value.rejected)
     assert hidden > 0.5 * len(rejected)
 
 
 def test_the_points_lie_on_the_true_edges():
     """Each point supports its edge's number; all are within a tenth of a pixel or two."""
-    found = measure(taken(), redrawn(1, 0.0005), FRONT, poses())
-    edges, camera = found.edges, camera_of()
-    assert found.points.shape == (len(found.point_edge), 2)
-    assert set(found.point_edge) == set(range(len(edges)))
+    value = measure(taken(), redrawn(1, 0.0005), FRONT, poses())
+    edges, camera = value.edges, camera_of()
+    assert value.points.shape == (len(value.point_edge), 2)
+    assert set(value.point_edge) == set(range(len(edges)))
     truth = true_normals(edges.leg, edges.tube, edges.side, edges.configuration)
-    normal = truth[found.point_edge]
+    normal = truth[value.point_edge]
     # across the edge: along the image of its normal
-    ray = camera.ray(found.points)
-    moved = camera.project(ray + 1e-4 * normal) - found.points
-    outward = moved / np.linalg.norm(moved, axis=1, keepdims=True)
-    off = outward_to(normal, found.points[:, None], outward[:, None], camera)[:, 0]
+    ray = camera.ray(value.points)
+    shifted = camera.project(ray + 1e-4 * normal) - value.points
+    outward = shifted / np.linalg.norm(shifted, axis=1, keepdims=True)
+    off = outward_to(normal, value.points[:, None], outward[:, None], camera)[:, 0]
     assert rms(off) < 0.06
     # a place supports an edge within three of its sigmas, which reach FAINT_EDGE_SIGMA
     assert np.abs(off).max() < 3 * FAINT_EDGE_SIGMA
@@ -161,10 +161,10 @@ def test_a_photograph_that_shows_no_leg_leaves_the_others_as_they_are():
     beside = poses().copy()
     beside[2] = np.nan  # readings that the drawing cannot take have no pose
     usual = measure(taken(), machine(), FRONT, poses(), 0.7).edges
-    found = measure(taken(), machine(), FRONT, beside, 0.7)
-    assert 2 not in found.edges.configuration
+    value = measure(taken(), machine(), FRONT, beside, 0.7)
+    assert 2 not in value.edges.configuration
     np.testing.assert_allclose(
-        found.edges.normal, usual.normal[usual.configuration != 2], atol=1e-9
+        value.edges.normal, usual.normal[usual.configuration != 2], atol=1e-9
     )
 
 
@@ -178,17 +178,17 @@ def test_spans_lie_on_the_tubes():
 
 
 def test_a_known_blur_is_used_and_told():
-    found = measure(taken(), machine(), FRONT, poses(), blur=0.7)
-    assert found.blur == 0.7
-    assert rms(errors(found.edges)[0]) < 0.05
+    count = measure(taken(), machine(), FRONT, poses(), blur=0.7)
+    assert count.blur == 0.7
+    assert rms(errors(count.edges)[0]) < 0.05
 
 
 def test_overexposed_photographs_give_no_edges_rather_than_wrong_ones():
     """The wall at 290 of 255 levels, the tubes before it at 190 and less: no edge is left."""
     bright = [draw(tubes_at(machine(), T), background=290.0)[0] for T in poses()[:2]]
-    found = measure(taken(bright), machine(), FRONT, poses()[:2])
-    assert len(found.edges) == 0
-    assert len(found.rejected) == 2 * len(tubes_of(machine()))
+    count = measure(taken(bright), machine(), FRONT, poses()[:2])
+    assert len(count.edges) == 0
+    assert len(count.rejected) == 2 * len(tubes_of(machine()))
 
 
 def test_photographs_of_nothing_give_no_edges():
@@ -207,10 +207,10 @@ def predicted():
     return tubes, edge_points(machine(), camera_of(), legs, tubes, SAMPLES)
 
 
-def fitted(position, sigma=0.1, found=None):
+def fitted(position, sigma=0.1, value=None):
     tubes, points = predicted()
-    found = np.ones(position.shape, dtype=bool) if found is None else found
-    fits = fit_edges(points, position, np.full(position.shape, sigma), found)
+    value = np.ones(position.shape, dtype=bool) if value is None else value
+    fits = fit_edges(points, position, np.full(position.shape, sigma), value)
     station = np.zeros(6, dtype=int)
     return fits, edge_set(points, fits, tubes, station, np.arange(6), fits.good)
 
@@ -238,8 +238,8 @@ def test_a_common_shift_of_all_points_is_what_shift_says():
     """The plane's change by a pixel outward at every point, for a lens with distortion."""
     tubes, points = predicted()
     still = fitted(np.zeros(points.along.shape))[1]
-    moved = fitted(np.full(points.along.shape, 0.1))[1]
-    turn = np.einsum("nij,ni->nj", still.basis, moved.normal - still.normal)
+    shifted = fitted(np.full(points.along.shape, 0.1))[1]
+    turn = np.einsum("nij,ni->nj", still.basis, shifted.normal - still.normal)
     scale = np.abs(still.shift[:, :1])
     np.testing.assert_allclose(turn / 0.1 / scale, still.shift / scale, atol=2e-3)
     np.testing.assert_allclose(still.normal, points.normal.reshape(-1, 3), atol=1e-15)
@@ -253,24 +253,24 @@ def test_turns_are_those_of_weighted_least_squares():
     rng = np.random.default_rng(0)
     _, points = predicted()
     shape = points.along.shape
-    found = rng.random(shape) < rng.uniform(0, 1, shape[:2])[..., None]
+    values = rng.random(shape) < rng.uniform(0, 1, shape[:2])[..., None]
     basis = fitted(np.zeros(shape))[0].basis
     rows = points.by_normal() @ basis
     turn = 1e-3 * rng.normal(size=(*shape[:2], 2))
-    fits = fit_edges(points, np.einsum("kenj,kej->ken", rows, turn), np.full(shape, 0.1), found)
-    count = found.sum(axis=-1)
+    fits = fit_edges(points, np.einsum("kenj,kej->ken", rows, turn), np.full(shape, 0.1), values)
+    count = values.sum(axis=-1)
     assert set(count.ravel()) == set(range(SAMPLES + 1))
     np.testing.assert_array_equal(fits.good, count > 2)
     assert np.isfinite(fits.turn).all()
     variance = 0.1**2 + EDGE_SIGMA_FLOOR**2
     for k, e in zip(*np.nonzero(fits.good), strict=True):
-        seen = found[k, e]
-        mine = rows[k, e, seen]
+        visible = values[k, e]
+        mine = rows[k, e, visible]
         np.testing.assert_allclose(fits.turn[k, e], turn[k, e], rtol=1e-6, atol=1e-11)
         solution = np.linalg.pinv(mine)
         scale = np.abs(solution).max()
-        np.testing.assert_allclose(fits.operator[k, e][:, seen], solution, atol=1e-6 * scale)
-        assert not fits.operator[k, e][:, ~seen].any()
+        np.testing.assert_allclose(fits.operator[k, e][:, visible], solution, atol=1e-6 * scale)
+        assert not fits.operator[k, e][:, ~visible].any()
         expected = solution @ solution.T * variance * max(count[k, e] / MEASUREMENTS_AN_EDGE, 1)
         np.testing.assert_allclose(fits.covariance[k, e], expected, rtol=1e-6)
 
@@ -307,17 +307,17 @@ def test_an_edge_counts_as_two_measurements_however_many_its_places():
 
 def test_scatter_beyond_the_stated_sigmas_widens_the_covariance():
     noise = np.random.default_rng(2).normal(size=(6, 24, SAMPLES))
-    told = fitted(0.02 * noise, 0.05)[1]
+    values = fitted(0.02 * noise, 0.05)[1]
     worse = fitted(0.10 * noise, 0.05)[1]
-    wider = worse.covariance[:, 0, 0] / told.covariance[:, 0, 0]
+    wider = worse.covariance[:, 0, 0] / values.covariance[:, 0, 0]
     assert np.median(wider) > 1.5
 
 
 def test_edges_with_too_few_places_are_not_good():
-    found = np.zeros((6, 24, SAMPLES), dtype=bool)
-    found[..., :2] = True
-    found[0] = True
-    fits, edges = fitted(np.zeros(found.shape), found=found)
+    valid = np.zeros((6, 24, SAMPLES), dtype=bool)
+    valid[..., :2] = True
+    valid[0] = True
+    fits, edges = fitted(np.zeros(valid.shape), value=valid)
     assert fits.good[0].all()
     assert not fits.good[1:].any()
     assert set(edges.configuration) == {0}

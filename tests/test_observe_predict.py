@@ -83,8 +83,8 @@ def test_outward_leads_away_from_the_leg_by_the_gain(distorted):
     for step in (-0.5, 0.5):
         rays = camera_of(distorted).ray(points.pixel + step * points.outward)
         # a pixel is a millimetre and a half: the second order of it is a per cent
-        moved = (beside(legs, tubes, rays) - radius) * points.gain
-        np.testing.assert_allclose(moved, step, rtol=0.02)
+        shifted = (beside(legs, tubes, rays) - radius) * points.gain
+        np.testing.assert_allclose(shifted, step, rtol=0.02)
 
 
 def test_points_are_spread_over_the_visible_stretch():
@@ -103,8 +103,8 @@ def test_across_is_the_outward_motion_by_the_point():
     project, step = camera_of().project, 1e-5
     for axis in np.eye(3):
         # central: the second order of 10 um cancels, rounding leaves 1e-13 px over the step
-        moved = (project(points.point + step * axis) - project(points.point - step * axis)) / 2
-        oracle = np.sum(moved * points.outward, axis=-1) / step
+        shifted = (project(points.point + step * axis) - project(points.point - step * axis)) / 2
+        oracle = np.sum(shifted * points.outward, axis=-1) / step
         np.testing.assert_allclose(points.across @ axis, oracle, atol=1e-5)
 
 
@@ -113,13 +113,13 @@ def test_by_normal_tells_where_a_turned_edge_passes(distorted):
     """Against cylinders moved and widened by hundredths of a millimetre: up to 0.05 px, found on
     the picture by secants; the second order is a ten-thousandth of it."""
     _, _, points = predicted(distorted)
-    moved = redrawn(3, 2e-5)
-    _, _, others = predicted(distorted, moved)
+    shifted = redrawn(3, 2e-5)
+    _, _, others = predicted(distorted, shifted)
     truth = outward_to(others.normal, points.pixel, points.outward, camera_of(distorted))
     assert 0.01 < np.abs(truth).max() < 0.2
     turn = (others.normal - points.normal)[..., None]
-    found = (points.by_normal() @ turn)[..., 0]
-    np.testing.assert_allclose(found, truth, atol=1e-4 * np.abs(truth).max())
+    values = (points.by_normal() @ turn)[..., 0]
+    np.testing.assert_allclose(values, truth, atol=1e-4 * np.abs(truth).max())
 
 
 def test_what_is_behind_the_camera_is_not_valid():
@@ -218,8 +218,8 @@ def test_a_leg_before_another_is_clear_where_it_crosses():
 
 
 def test_points_outside_the_picture_are_not_clear():
-    aside = look_at(np.array([0.1, -0.85, 0.32]), np.array([0.35, 0, 0.18]), np.array([0, 0, 1.0]))
-    legs, tubes, points = predicted(T_camera_base=aside)
+    offset = look_at(np.array([0.1, -0.85, 0.32]), np.array([0.35, 0, 0.18]), np.array([0, 0, 1.0]))
+    legs, tubes, points = predicted(T_camera_base=offset)
     clear = unobstructed(machine(), camera_of(), legs, tubes, points, 0.0)
     outside = ~camera_of().in_image(points.pixel, margin=4.0)
     assert outside.mean() > 0.05

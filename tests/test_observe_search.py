@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
+from pkmcal.calibration.localization import platform_poses, read_photographs, recognise
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import evidence, stations
-from pkmcal.observe.evidence import StationView, score
-from pkmcal.observe.legs import LEG_SEARCH_REACH, search, search_legs
-from pkmcal.observe.photographs import Photographs
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
-from pkmcal.observe.shadows import without_shadows
-from pkmcal.observe.stations import find_station
-from pkmcal.observe.tables import (
+from pkmcal.observe import pose_likelihood, station_localization
+from pkmcal.observe.distance_tables import (
     CHANCE_DISTANCE_BIN,
     EDGE_DIRECTIONS,
     direction_of,
     distance_tables,
 )
+from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.legs import LEG_SEARCH_REACH, search, search_legs
+from pkmcal.observe.pose_likelihood import StationView, score
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.shadows import without_shadows
+from pkmcal.observe.station_localization import find_station
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import camera_of_size
@@ -56,9 +56,9 @@ def looked_for(mechanism, pictures, samples=12):
     Returns the places, found and true outward positions (K, E, n) px, and which count.
     """
     readings = machine().inverse(poses())[: len(pictures)]
-    seen = poses()[: len(pictures)]
+    in_view = poses()[: len(pictures)]
     tubes, camera = tubes_of(mechanism), camera_of()
-    legs = legs_in_camera(mechanism, FRONT, seen, readings)
+    legs = legs_in_camera(mechanism, FRONT, in_view, readings)
     points = edge_points(mechanism, camera, legs, tubes, samples)
     clear = unobstructed(mechanism, camera, legs, tubes, points, CLEARANCE)
     places = search_legs(pictures, tubes, points, clear)
@@ -78,9 +78,9 @@ def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
     """
     shifts = []
     for seed in range(2):
-        places, found, truth, counted = looked_for(redrawn(seed, spread), images())
+        places, value, truth, counted = looked_for(redrawn(seed, spread), images())
         assert places.clear.mean() > 0.8
-        off = (found - truth)[counted]
+        off = (value - truth)[counted]
         assert np.sqrt(np.mean(off**2)) < 0.6
         assert np.abs(off).max() < 2.0
         shifts.append(np.abs(truth[counted]).max())
@@ -90,18 +90,18 @@ def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
 def test_a_leg_that_is_not_there_is_not_found():
     """The picture without leg 3: the others are found as before, it is nowhere clear."""
     without = [draw([t for t in tubes_at(machine(), T) if t.leg != 2])[0] for T in poses()[:3]]
-    places, found, truth, counted = looked_for(redrawn(0, 0.001), without)
+    places, value, truth, counted = looked_for(redrawn(0, 0.001), without)
     assert not places.clear[:, 2].any()
     assert places.clear[:, [0, 1, 3, 4, 5]].mean() > 0.7
-    assert np.sqrt(np.mean((found - truth)[counted] ** 2)) < 0.6
+    assert np.sqrt(np.mean((value - truth)[counted] ** 2)) < 0.6
 
 
 def test_a_leg_beyond_the_search_is_not_found():
     """All edges moved sideways by more than the reach: the place at its end is no place. A few
     legs meet their neighbours' edges instead."""
     far = int(LEG_SEARCH_REACH) + 6
-    moved = [np.roll(image, far, axis=1) for image in images()]
-    assert looked_for(machine(), moved)[0].clear.mean() < 0.35
+    shifted = [np.roll(image, far, axis=1) for image in images()]
+    assert looked_for(machine(), shifted)[0].clear.mean() < 0.35
 
 
 def test_what_a_search_gives_and_why_it_leaves_legs_out():
@@ -109,15 +109,15 @@ def test_what_a_search_gives_and_why_it_leaves_legs_out():
     pictures, readings = images(), machine().inverse(poses())
     taken = Photographs(3, camera_of(), np.arange(6), readings, pictures)
     wrong = redrawn(1, 0.001)
-    found = search(taken, wrong, FRONT, poses())
-    edges = found.edges
+    value = search(taken, wrong, FRONT, poses())
+    edges = value.edges
     assert set(edges.station) == {3}
     truth = true_normals(edges.leg, edges.tube, edges.side, edges.configuration)
     shift = np.einsum("nij,ni->nj", edges.basis, edges.normal - truth)[:, 0] / edges.shift[:, 0]
     assert np.sqrt(np.mean(shift**2)) < 0.6
     sigma = np.sqrt(edges.covariance[:, 0, 0]) / np.abs(edges.shift[:, 0])
     assert 0.5 < np.median(sigma) < 1.5
-    missing = {(r.configuration, r.leg) for r in found.rejected}
+    missing = {(r.configuration, r.leg) for r in value.rejected}
     present = set(zip(edges.configuration.tolist(), edges.leg.tolist(), strict=True))
     assert missing | present == {(k, leg) for k in range(6) for leg in range(6)}
     assert not missing & present
@@ -135,39 +135,43 @@ def rough_pose(seed, degrees=10.0, distance=0.1):
     return inverse(inverse(FRONT) @ pose(rotation(turn), shift))
 
 
-def view_of(pictures, mechanism=None, seen=None):
+def view_of(pictures, mechanism=None, in_view=None):
     mechanism = mechanism or machine()
-    seen = poses() if seen is None else seen
-    readings = machine().inverse(seen)
+    in_view = poses() if in_view is None else in_view
+    readings = machine().inverse(in_view)
     names = np.arange(len(pictures))
     tables = distance_tables(pictures)
-    return StationView(mechanism, camera_of(), names, readings, seen, tables)
+    return StationView(mechanism, camera_of(), names, readings, in_view, tables)
 
 
 def test_photographs_are_asked_under_each_name_as_if_they_bore_it():
     view, names = view_of(images()), np.array([4, 0, 3])
-    fits = evidence.evidence_by_name(view, FRONT, names)
+    fits = pose_likelihood.log_likelihood_by_name(view, FRONT, names)
     every = np.arange(len(images()))
-    own = evidence.distances_under(view, FRONT[None], every, 8)
-    mixture = own.mixture(evidence.first_mixture(1), rounds=10)
+    own = pose_likelihood.distances_under(view, FRONT[None], every, 8)
+    mixture = own.mixture(pose_likelihood.first_mixture(1), rounds=10)
     for name, fit in zip(names, fits.T, strict=True):
         named = replace(view, configuration=np.full(len(every), name))
-        found = evidence.distances_under(named, FRONT[None], every, 8).evidence(mixture)
-        np.testing.assert_allclose(fit, evidence.by_photograph(found, len(every))[0], rtol=1e-5)
+        count = pose_likelihood.distances_under(named, FRONT[None], every, 8).log_likelihood(
+            mixture
+        )
+        np.testing.assert_allclose(
+            fit, pose_likelihood.by_photograph(count, len(every))[0], rtol=1e-5
+        )
         assert fit.argmax() == name
 
 
-def misplaced(T_camera_base):
+def inconsistent_poses(T_camera_base):
     """Pixels by which leg points of all configurations are off, the median."""
     ends = machine().base_centers(), machine().platform_centers()
     base = np.broadcast_to(ends[0], (6, 6, 3))
     platform = ends[1] @ poses()[:, :3, :3].swapaxes(1, 2) + poses()[:, None, :3, 3]
     points = np.concatenate([base, platform]).reshape(-1, 3)
 
-    def seen(T):
+    def visible(T):
         return camera_of().project(points @ T[:3, :3].T + T[:3, 3])
 
-    return np.median(np.linalg.norm(seen(T_camera_base) - seen(FRONT), axis=1))
+    return np.median(np.linalg.norm(visible(T_camera_base) - visible(FRONT), axis=1))
 
 
 def often(*values):
@@ -190,12 +194,12 @@ def test_the_station_is_found_from_ten_degrees_and_ten_centimetres_or_from_nothi
     """
     rough = rough_pose(seed)
     view = view_of(images()[:count])
-    found = find_station(view, rough if given else None, np.random.default_rng(seed))
-    assert found.good
-    assert found.score < 0.3
-    assert misplaced(rough) > 30
-    assert misplaced(found.T_camera_base) < 5
-    off = pose_difference(found.T_camera_base, FRONT)
+    localization = find_station(view, rough if given else None, np.random.default_rng(seed))
+    assert localization.good
+    assert localization.score < 0.3
+    assert inconsistent_poses(rough) > 30
+    assert inconsistent_poses(localization.T_camera_base) < 5
+    off = pose_difference(localization.T_camera_base, FRONT)
     assert np.degrees(np.linalg.norm(off[:3])) < (2.0 if count == 3 else 1.5)
     assert np.linalg.norm(off[3:]) < 0.015
 
@@ -220,26 +224,26 @@ def test_turned_photographs_are_found_from_nothing(turn):
         camera=replace(camera, image_size=(width, height), parameters=parameters),
         tables=distance_tables(pictures),
     )
-    found = find_station(view, None, np.random.default_rng(0))
-    assert found.good
-    assert misplaced(inverse(turned) @ found.T_camera_base) < 5
+    localization = find_station(view, None, np.random.default_rng(0))
+    assert localization.good
+    assert inconsistent_poses(inverse(turned) @ localization.T_camera_base) < 5
 
 
 def test_one_photograph_says_where_but_not_that_it_is_the_machine():
     """Of one photograph the place is right; no other is there to confirm it."""
     for seed in range(2):
-        found = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
-        assert misplaced(found.T_camera_base) < 5
-        assert not found.good
+        localization = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
+        assert inconsistent_poses(localization.T_camera_base) < 5
+        assert not localization.good
 
 
 @pytest.mark.parametrize("seed", [2, *(often(seed) for seed in (0, 1, 3))])
 def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
     """Though a place beside the right one is confirmed by photographs as well."""
     rough = rough_pose(seed, 30.0, 0.3)
-    found = find_station(view_of(images()), rough, np.random.default_rng(seed))
-    assert found.good
-    assert misplaced(found.T_camera_base) < 5
+    localization = find_station(view_of(images()), rough, np.random.default_rng(seed))
+    assert localization.good
+    assert inconsistent_poses(localization.T_camera_base) < 5
 
 
 @pytest.mark.parametrize(("degrees", "distance", "far"), [(5.0, 0.05, False), (14.0, 0.14, True)])
@@ -247,29 +251,29 @@ def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degr
     """A place that is confirmed is not the station's if it is further than was looked for: so near
     to a pose that is wrong nothing is found by chance.
     """
-    searched, searching = [], stations._random_search
+    searched, searching = [], station_localization._random_search
 
-    def noted(view, told, rng):
-        searched.append(told.nearness.tried)
-        return searching(view, told, rng)
+    def noted(view, values, rng):
+        searched.append(values.nearness.tried)
+        return searching(view, values, rng)
 
-    monkeypatch.setattr(stations, "_random_search", noted)
+    monkeypatch.setattr(station_localization, "_random_search", noted)
     rough = rough_pose(3, degrees, distance)
-    found = find_station(view_of(images()), rough, np.random.default_rng(3))
-    assert found.sure
-    assert misplaced(found.T_camera_base) < 5
-    assert searched[0] == stations.NEAR.tried
-    assert (stations.FAR.tried in searched) == far
+    localization = find_station(view_of(images()), rough, np.random.default_rng(3))
+    assert localization.sure
+    assert inconsistent_poses(localization.T_camera_base) < 5
+    assert searched[0] == station_localization.NEAR.tried
+    assert (station_localization.FAR.tried in searched) == far
 
 
 def test_a_near_pose_is_near_by_turn_and_shift_together():
     """Its six deviations' squares are one on average; turned and shifted by a deviation along each
     axis is the limit."""
-    step = stations.NEAR.spread * (1 - 1e-9)
+    step = station_localization.NEAR.spread * (1 - 1e-9)
     for size, near in ((1.0, True), (1.001, False)):
         other = inverse(inverse(FRONT) @ pose(rotation(size * step[:3]), size * step[3:]))
-        assert stations.NEAR.reaches(FRONT, other) == near
-        assert stations.NEAR.reaches(other, FRONT) == near
+        assert station_localization.NEAR.reaches(FRONT, other) == near
+        assert station_localization.NEAR.reaches(other, FRONT) == near
 
 
 def test_edges_behind_the_camera_count_as_not_found():
@@ -287,9 +291,9 @@ def test_edges_behind_the_camera_count_as_not_found():
 
 def test_a_drawing_that_is_2_mm_wrong_is_recognised():
     view = view_of(images(), redrawn(5, 0.002))
-    found = find_station(view, rough_pose(9), np.random.default_rng(9))
-    assert found.good
-    assert misplaced(found.T_camera_base) < 6
+    localization = find_station(view, rough_pose(9), np.random.default_rng(9))
+    assert localization.good
+    assert inconsistent_poses(localization.T_camera_base) < 6
 
 
 def test_the_same_generator_gives_the_same_pose():
@@ -346,14 +350,16 @@ def test_photographs_of_other_configurations_are_not_recognised():
 # Distance tables
 
 
-@pytest.mark.parametrize("at_once", [evidence.SILHOUETTE_PLACES_AT_ONCE, 500])
+@pytest.mark.parametrize("at_once", [pose_likelihood.SILHOUETTE_PLACES_AT_ONCE, 500])
 def test_places_that_are_only_weighed_find_what_those_find_that_descend(monkeypatch, at_once):
-    monkeypatch.setattr(evidence, "SILHOUETTE_PLACES_AT_ONCE", at_once)
+    monkeypatch.setattr(pose_likelihood, "SILHOUETTE_PLACES_AT_ONCE", at_once)
     view = view_of(images())
     at = np.stack([rough_pose(seed) for seed in range(5)])
     every = np.arange(len(view.configuration))
-    weighed = evidence.distances_under(view, at, every, 6)
-    for one, other in zip(weighed, evidence.look_under(view, at, every, 6).distances, strict=True):
+    weighed = pose_likelihood.distances_under(view, at, every, 6)
+    for one, other in zip(
+        weighed, pose_likelihood.linearize_distances(view, at, every, 6).distances, strict=True
+    ):
         np.testing.assert_array_equal(one, other)
 
 
@@ -372,14 +378,14 @@ def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
     tables = distance_tables([image])
     assert not tables.tables.ready.any()
     pixel, one = np.array([[200.0, 240.0]]), np.array([3])
-    found, _ = tables.look(one, pixel, np.array(0))
+    distance, _ = tables.look_up(one, pixel, np.array(0))
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), one)
-    chance = tables.by_chance(np.array([5]), found)
+    chance = tables.by_chance(np.array([5]), distance)
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), [3, 5])
     # the same whatever was looked for before
     tables.tables.get_ready(np.arange(EDGE_DIRECTIONS))
-    assert tables.look(one, pixel, np.array(0))[0] == found
-    assert tables.by_chance(np.array([5]), found) == chance
+    assert tables.look_up(one, pixel, np.array(0))[0] == distance
+    assert tables.by_chance(np.array([5]), distance) == chance
     np.testing.assert_allclose(
         tables.tables.chance.sum(axis=1) * CHANCE_DISTANCE_BIN, 1.0, rtol=1e-5
     )
@@ -393,24 +399,24 @@ def test_tables_hold_the_distance_to_an_edge_of_that_direction():
     upright, level = direction_of(np.array([[1.0, 0.0], [0.0, 1.0]]))
     x = np.array([20.0, 200.0, 319.5, 400.0, 620.0])
     pixel = np.stack([x, np.full(5, 240.0)], axis=-1)
-    found, inside = tables.look(upright, pixel, np.array(0))
+    distance, inside = tables.look_up(upright, pixel, np.array(0))
     assert inside.all()
     # the distance transform counts a step along a row as 0.955; Canny and rounding have a table's
     # pixel each
     allowed = {"rtol": 0.05, "atol": 2 * tables.scale}
-    np.testing.assert_allclose(found * tables.scale, np.abs(x - 319.5), **allowed)
+    np.testing.assert_allclose(distance * tables.scale, np.abs(x - 319.5), **allowed)
     right = np.array([1.0, 0.0])
     smooth, slope, _ = tables.look_along(upright, pixel, right, np.array(0))
     np.testing.assert_allclose(smooth * tables.scale, np.abs(x - 319.5), **allowed)
     np.testing.assert_allclose(slope[[0, 1, 3]] * tables.scale, [-1, -1, 1], rtol=0.05)
-    assert tables.look(level, pixel, np.array(0))[0].min() > 100
+    assert tables.look_up(level, pixel, np.array(0))[0].min() > 100
 
 
 def test_outside_the_picture_and_without_an_image_nothing_is_inside():
     tables = distance_tables([blank(None)])
     pixel = np.array([[-5.0, 10.0], [700.0, 10.0], [10.0, 481.0], [np.nan, np.nan]])
     zero = np.zeros(4, dtype=int)
-    assert not tables.look(zero, pixel, zero)[-1].any()
+    assert not tables.look_up(zero, pixel, zero)[-1].any()
     assert not tables.look_along(zero, pixel, np.zeros((4, 2)), zero)[-1].any()
 
 
@@ -426,10 +432,10 @@ def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():
     level = direction_of(np.array([0.0, 1.0]))
     on_shelf, number = np.array([[600.0, 100.0]]), np.zeros(1, dtype=int)
     few, many = distance_tables(pictures[:2]), distance_tables(pictures)
-    assert few.look(level, on_shelf, number)[0] < 2
-    assert many.look(level, on_shelf, number)[0] > 20
+    assert few.look_up(level, on_shelf, number)[0] < 2
+    assert many.look_up(level, on_shelf, number)[0] > 20
     upright = direction_of(np.array([1.0, 0.0]))
-    assert many.look(upright, np.array([[100.0, 300.0]]), number)[0] < 2
+    assert many.look_up(upright, np.array([[100.0, 300.0]]), number)[0] < 2
 
 
 def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
@@ -442,9 +448,9 @@ def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
         pictures.append(picture)
     tables = distance_tables(pictures)
     pixel = np.array([[100.0, 110.0], [100.0, 310.0], [100.0, 200.0], [-5.0, 110.0]])
-    for seen, turn in ((tables, 1), (tables.mirrored(), -1)):
+    for in_view, turn in ((tables, 1), (tables.mirrored(), -1)):
         at = pixel if turn > 0 else pixel * (-1, 1) + (639, 0)
-        sign, inside = seen.brighter(at, np.zeros(4, dtype=int))
+        sign, inside = in_view.brighter(at, np.zeros(4, dtype=int))
         assert sign.tolist() == [1, -1, 0, 0]
         assert inside.tolist() == [True, True, True, False]
     places = np.broadcast_to(np.eye(4), (3, 4, 4)).copy()
@@ -462,12 +468,12 @@ def test_a_place_that_half_of_the_photographs_miss_is_asked_about_again(tmp_path
     folder = tmp_path / "session"
     simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)
     session = load_session(folder)
-    shown = read_photographs(session)
-    (view,) = recognise(session, shown, platform_poses(session), [np.random.default_rng(0)]).views
-    found = find_station(view, None, np.random.default_rng(1))
+    visible = read_photographs(session)
+    (view,) = recognise(session, visible, platform_poses(session), [np.random.default_rng(0)]).views
+    localization = find_station(view, None, np.random.default_rng(1))
     true = load_truth(folder, session.machine).T_camera_base[0]
-    eye, there = (inverse(T)[:3, 3] for T in (found.T_camera_base, true))
-    assert found.good
+    eye, there = (inverse(T)[:3, 3] for T in (localization.T_camera_base, true))
+    assert localization.good
     assert np.linalg.norm(eye - there) < 0.1 * np.linalg.norm(there)
-    monkeypatch.setattr(stations, "_asked_again", lambda *_: 1.0)
+    monkeypatch.setattr(station_localization, "_second_search", lambda *_: 1.0)
     assert not find_station(view, None, np.random.default_rng(1)).good

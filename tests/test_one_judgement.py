@@ -88,10 +88,10 @@ def calibrated_code(folder):
         return error.exit_code, str(error)
 
 
-def hold_together(found, code, message):
+def hold_together(value, code, message):
     """What one says implies what the other does."""
-    assert (found.exit_code == 2) == (code == 2)
-    refused = [f.text for f in found.findings if f.error is not None]
+    assert (value.exit_code == 2) == (code == 2)
+    refused = [f.text for f in value.findings if f.error is not None]
     assert refused == [message] if message else not refused
 
 
@@ -110,8 +110,8 @@ def test_a_good_session(checked, calibrating):
 )
 def test_a_spoilt_session(session, spoil):
     spoil(session)
-    found = check_session(session)
-    hold_together(found, *calibrated_code(session))
+    check = check_session(session)
+    hold_together(check, *calibrated_code(session))
 
 
 @pytest.mark.slow
@@ -136,13 +136,13 @@ def test_photographs_by_hand(tmp_path, seed):
     rendered(folder, machine, camera_of_size((640, 480)), settings, seed=seed)
     path = min((folder / "images").rglob("*.jpg"))
     shutil.copy(max((folder / "images").rglob("*.jpg")), path)  # it shows another configuration
-    found = check_session(folder)
+    check = check_session(folder)
     try:
         result = calibrate_session(folder)
     except PkmcalError as error:
-        hold_together(found, error.exit_code, str(error))
+        hold_together(check, error.exit_code, str(error))
         return
-    hold_together(found, 0 if result.verdict.usable else 1, None)
+    hold_together(check, 0 if result.verdict.usable else 1, None)
     lost = {one.station.name: one.finding.text for one in result.session.rejected}
-    assert {f.station: f.text for f in found.findings if f.station in lost} == lost
-    assert {s.name for s in found.stations if not s.recognised} == lost.keys()
+    assert {f.station: f.text for f in check.findings if f.station in lost} == lost
+    assert {s.name for s in check.stations if not s.recognised} == lost.keys()

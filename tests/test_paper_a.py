@@ -65,8 +65,8 @@ def test_chi2_is_its_degrees_of_freedom(reduced):
 
 def test_what_it_states_is_what_it_errs_by(reduced):
     """Intervals of 95 % hold 95 of 100 errors, and smaller ones as many as they promise."""
-    found = reduced.samples[PAPER_A_JOINT,]
-    errors, sigma = found.values["parameters"], found.sigma["parameters"]
+    value = reduced.samples[PAPER_A_JOINT,]
+    errors, sigma = value.values["parameters"], value.sigma["parameters"]
     assert sigma.shape == errors.shape == (75, 30)
     for share in (0.5, 0.95):
         inside = mean(covered(errors, sigma, share))
@@ -97,13 +97,13 @@ def test_end_effector(reduced):
     def error(method, name):
         return reduced.of(method)[name].value
 
-    moved = "displacement"
-    assert 1e3 * error("four steps as printed", moved) == pytest.approx(3.0, abs=0.5)
-    assert 1e3 * error("four steps", moved) == pytest.approx(0.25, abs=0.03)
-    assert 1e3 * error("joint", moved) == pytest.approx(0.0899, abs=0.012)
+    shifted = "displacement"
+    assert 1e3 * error("four steps as printed", shifted) == pytest.approx(3.0, abs=0.5)
+    assert 1e3 * error("four steps", shifted) == pytest.approx(0.25, abs=0.03)
+    assert 1e3 * error("joint", shifted) == pytest.approx(0.0899, abs=0.012)
     assert np.degrees(error("joint", "orientation")) == pytest.approx(0.0140, abs=0.0018)
     # frames by all centres instead of three: what a user of the tool would see
-    assert error("joint", "displacement_registered") < 0.75 * error("joint", moved)
+    assert error("joint", "displacement_registered") < 0.75 * error("joint", shifted)
 
 
 def test_the_bound_has_its_own_end_effector(reduced):
@@ -125,21 +125,21 @@ def test_standard_errors_are_the_scatter_of_studies():
     """Eight small studies scatter as each one's standard error says."""
     studies = [study(runs=12, poses=6, seed=seed).of(PAPER_A_JOINT) for seed in range(8)]
     names = (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
-    found = np.array([[s[name].value for name in names] for s in studies])
-    said = np.array([[s[name].error for name in names] for s in studies]).mean(axis=0)
-    ratio = found.std(axis=0, ddof=1) / said
+    values = np.array([[s[name].value for name in names] for s in studies])
+    message = np.array([[s[name].error for name in names] for s in studies]).mean(axis=0)
+    ratio = values.std(axis=0, ddof=1) / message
     # chi of seven degrees of freedom over its root: 0.29 to 1.87 in 99.8 of 100
     assert np.all((ratio > 0.29) & (ratio < 1.87)), ratio
 
 
 def test_the_result_does_not_depend_on_workers(monkeypatch):
-    results, told = [], []
+    results, rows = [], []
     for count in (1, 3):
         monkeypatch.setattr("pkmcal.studies.workers.cores", lambda count=count: count)
         setting = HexapodByAxes(batch=4)
-        results.append(engine.run(setting, 10, 3, told=lambda _text, share: told.append(share)))
+        results.append(engine.run(setting, 10, 3, progress=lambda _text, share: rows.append(share)))
     assert [r.workers for r in results] == [1, 3]
-    assert told == pytest.approx(2 * [1 / 3, 2 / 3, 1])
+    assert rows == pytest.approx(2 * [1 / 3, 2 / 3, 1])
     for name in PAPER_A_METHODS:
         assert results[0].of(name) == results[1].of(name)
         assert len(results[0].values("parameters", name)) == 10
@@ -155,25 +155,25 @@ def test_a_batch_depends_on_its_own_seed_alone():
     data = setting.draw(last)
     again = setting.judge(last, data, setting.solve(last, data))
     for name in PAPER_A_METHODS:
-        found = again[name,].values["parameters"]
-        np.testing.assert_array_equal(found, whole.values("parameters", name)[6:])
+        values = again[name,].values["parameters"]
+        np.testing.assert_array_equal(values, whole.values("parameters", name)[6:])
 
 
 def test_the_thirty_parameters():
     """Frames by centres 1, 3 and 5: their six coordinates vanish, and distances remain."""
     machine = hexapod_with_held_radii()
-    found = thirty(machine)
-    assert len(set(found.names)) == 30
-    assert {"A3 x", "A5 y", "B5 x", "q6"} <= set(found.names)
-    assert not {"A1 x", "A3 y", "A5 z"} & set(found.names)
-    value = dict(zip(found.names, found.drawing, strict=True))
+    actual_names = thirty(machine)
+    assert len(set(actual_names.names)) == 30
+    assert {"A3 x", "A5 y", "B5 x", "q6"} <= set(actual_names.names)
+    assert not {"A1 x", "A3 y", "A5 z"} & set(actual_names.names)
+    value = dict(zip(actual_names.names, actual_names.drawing, strict=True))
     centres = machine.base_centers()
     assert value["A3 x"] == pytest.approx(np.linalg.norm(centres[2] - centres[0]))
     assert np.hypot(value["A5 x"], value["A5 y"]) == pytest.approx(
         np.linalg.norm(centres[4] - centres[0])
     )
     # rows are unit and independent: an RMSE by them is one of lengths
-    np.testing.assert_allclose(found.rows @ found.rows.T, np.eye(30), atol=1e-12)
+    np.testing.assert_allclose(actual_names.rows @ actual_names.rows.T, np.eye(30), atol=1e-12)
 
 
 def test_groups_of_parameters():
@@ -182,13 +182,13 @@ def test_groups_of_parameters():
     names = thirty(machine).names
     errors = np.zeros((4, 30))
     errors[:, [names.index(n) for n in ("B2 z", "B4 z", "B6 z")]] = 1e-3
-    found = {
+    results = {
         name: rms_over_runs(errors[:, at]) for name, at in parameters_by_group(machine).items()
     }
-    assert list(found) == list(PAPER_A_PARAMETER_GROUPS)
-    assert [s.value for s in found.values()] == pytest.approx([0, 0, 0, 1e-3, 0])
+    assert list(results) == list(PAPER_A_PARAMETER_GROUPS)
+    assert [s.value for s in results.values()] == pytest.approx([0, 0, 0, 1e-3, 0])
     assert rms_over_runs(errors).value == pytest.approx(1e-3 * np.sqrt(3 / 30))
-    assert max(s.error for s in found.values()) == 0
+    assert max(s.error for s in results.values()) == 0
 
 
 @pytest.fixture(scope="module")
@@ -199,12 +199,12 @@ def near():
 @pytest.mark.parametrize("error", [pytest.param(0.005, marks=pytest.mark.slow), 0.02])
 def test_thirty_of_thirty_starts(near, error):
     """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
-    found = study(runs=30, start_error=error, seed=5)
-    assert converged(found) == 30
+    value = study(runs=30, start_error=error, seed=5)
+    assert converged(value) == 30
     for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES):
-        there, here = (s.of("joint")[name] for s in (found, near))
+        there, here = (s.of("joint")[name] for s in (value, near))
         assert there.value == pytest.approx(here.value, rel=1e-5)
-    assert near.of(PAPER_A_JOINT)["steps"].value < found.of(PAPER_A_JOINT)["steps"].value
+    assert near.of(PAPER_A_JOINT)["steps"].value < value.of(PAPER_A_JOINT)["steps"].value
 
 
 def test_accuracy_grows_with_the_square_root_of_the_poses():
@@ -255,14 +255,14 @@ def test_axis_as_edges_is_the_same_measurement():
         ],
         axis=-1,
     )
-    moved = axis + 1e-3 * sigma * rng.normal(size=axis.shape)
+    shifted = axis + 1e-3 * sigma * rng.normal(size=axis.shape)
     for radius in (0.005, 0.014, 0.05):
         r = np.full(30, radius)
         basis, whiten = as_edges(axis, sigma, r)
-        normal = pair_normals(moved, r)
+        normal = pair_normals(shifted, r)
         rows = (np.swapaxes(basis, -1, -2) @ normal[..., None]).reshape(30, 4)
         rows = (whiten @ rows[..., None])[..., 0]
-        np.testing.assert_allclose(rows, (moved - axis) / sigma, rtol=0.02, atol=2e-5)
+        np.testing.assert_allclose(rows, (shifted - axis) / sigma, rtol=0.02, atol=2e-5)
 
 
 def pair_normals(axis, radius):

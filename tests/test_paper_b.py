@@ -81,8 +81,8 @@ def errors(method, share, runs=12):
             place = rng.integers(0, normal.shape[1], len(bad))
             wrong[leg, bad], noise_of[leg, bad] = normal[other, place], noise[other, place]
         radius, present = np.full(wrong.shape[:2], RADIUS), np.ones(wrong.shape[:2])
-        found, _, _ = linear.solve_regressions(wrong, radius, present, noise_of, method, rng)
-        squares.append(np.mean(np.sum((found - centres) ** 2, axis=-1)))
+        values, _, _ = linear.solve_regressions(wrong, radius, present, noise_of, method, rng)
+        squares.append(np.mean(np.sum((values - centres) ** 2, axis=-1)))
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -119,8 +119,8 @@ def test_a_hexapod_seen_through_a_mirror(tmp_path):
         stations=(station,), configurations=8, rough_position=0.02, rough_angle=0.05
     )
     rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
-    found = pkmcal.calibrate(folder)
-    result = compare_with_truth(found, folder)
+    value = pkmcal.calibrate(folder)
+    result = compare_with_truth(value, folder)
     assert result.calibrated.centre < result.drawing.centre / 5
     assert result.calibrated.position < result.drawing.position / 5
     # 44 correlated values: 95 % expected within two deviations

@@ -82,8 +82,8 @@ def test_rods_alone_tilt_the_nacelle():
     tilt = []
     for rods in (0.0, 3e-4):
         setting = H4ByBoard(deviations=Deviations(rods=rods))
-        found = setting.simulated("rods", 1, np.random.default_rng(0))
-        tilt.append(np.abs(found.T_base_platform[0, :, 2, :2]).max())
+        study = setting.simulated("rods", 1, np.random.default_rng(0))
+        tilt.append(np.abs(study.T_base_platform[0, :, 2, :2]).max())
     assert tilt[0] < 1e-9
     assert tilt[1] > 1e-4
 
@@ -133,7 +133,7 @@ def test_every_figure_of_the_prototype_is_compared(short):
     key, allowed = ("design", "design", EQ3_AS_PRINTED), expected.PAPER_C_TOLERANCE
     figure = Compared(key, "larger_shift", Summary(0.07, 0.001), 0.070, 0.0005, allowed)
     assert figure.tolerable
-    assert not figure._replace(found=Summary(0.09, 0.001)).tolerable
+    assert not figure._replace(measured=Summary(0.09, 0.001)).tolerable
 
 
 @pytest.mark.slow
@@ -164,9 +164,9 @@ def test_another_seed_draws_anew():
     for first, again, other in zip(
         *(engine.batches(setting, 2, s) for s in (1, 1, 2)), strict=True
     ):
-        seen = [setting.draw(batch).T_camera_board for batch in (first, again, other)]
-        np.testing.assert_array_equal(seen[0], seen[1])
-        assert not np.isclose(seen[0], seen[2]).all(axis=(-1, -2)).any()
+        in_view = [setting.draw(batch).T_camera_board for batch in (first, again, other)]
+        np.testing.assert_array_equal(in_view[0], in_view[1])
+        assert not np.isclose(in_view[0], in_view[2]).all(axis=(-1, -2)).any()
         key = first.generator(1).random(), again.generator(1).random(), other.generator(1).random()
         assert key[0] == key[1] != key[2]
 
@@ -188,8 +188,8 @@ def test_the_command(tmp_path, monkeypatch, found):
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
     assert "…" not in done.out
     text = " ".join(done.out.split())
-    for said in ("Table 2", "Table 3", "Table 4", "26", "Not reproduced", "paper-c.html"):
-        assert said in text, said
+    for words in ("Table 2", "Table 3", "Table 4", "26", "Not reproduced", "paper-c.html"):
+        assert words in text, words
 
 
 def test_tables_are_whole(found):

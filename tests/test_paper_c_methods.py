@@ -19,7 +19,7 @@ from pkmcal.papers.inverse_kinematic import (
     pose_problem,
     turn_between,
 )
-from pkmcal.papers.measured_platform import seen_platform, taken
+from pkmcal.papers.measured_platform import measured_platform, taken
 from pkmcal.papers.rotation_axis import (
     MOST_TURN_PAIRS,
     _pairs,
@@ -43,25 +43,25 @@ def test_the_platform_from_the_board():
     """[C] eq. 6 and its derivatives, against differences."""
     rng = np.random.default_rng(0)
     camera, board, mount = (anywhere(rng, 1.0) for _ in range(3))
-    found = seen_platform(camera, board, mount)
-    np.testing.assert_allclose(camera @ found.pose @ mount, board, atol=1e-12)
+    values = measured_platform(camera, board, mount)
+    np.testing.assert_allclose(camera @ values.pose @ mount, board, atol=1e-12)
 
     def slope(of):
-        return np.stack([pose_difference(of(H * e), found.pose) / H for e in np.eye(6)], -1)
+        return np.stack([pose_difference(of(H * e), values.pose) / H for e in np.eye(6)], -1)
 
     np.testing.assert_allclose(
-        found.by_station,
-        slope(lambda d: seen_platform(inverse(perturb(inverse(camera), d)), board, mount).pose),
+        values.by_station,
+        slope(lambda d: measured_platform(inverse(perturb(inverse(camera), d)), board, mount).pose),
         atol=1e-5,
     )
     np.testing.assert_allclose(
-        found.by_mount,
-        slope(lambda d: seen_platform(camera, board, perturb(mount, d)).pose),
+        values.by_mount,
+        slope(lambda d: measured_platform(camera, board, perturb(mount, d)).pose),
         atol=1e-5,
     )
     np.testing.assert_allclose(
-        found.by_measured,
-        slope(lambda d: seen_platform(camera, perturb(board, d), mount).pose),
+        values.by_measured,
+        slope(lambda d: measured_platform(camera, perturb(board, d), mount).pose),
         atol=1e-5,
     )
 
@@ -73,18 +73,18 @@ def test_what_a_machine_can_take_of_a_pose(name, tilt):
     motion = MOTION_DIRECTIONS[name]
     own = perturb(np.eye(4), rng.normal(size=6) @ motion @ motion.T)
     whole = perturb(own, tilt * rng.normal(size=6))
-    found = taken(motion, whole)
+    value = taken(motion, whole)
     can = motion.any(axis=1)
-    assert found.off.shape == (6 - motion.shape[1],)
+    assert value.off.shape == (6 - motion.shape[1],)
     if not tilt:
-        np.testing.assert_allclose(found.pose, own, atol=1e-12)
-        np.testing.assert_allclose(found.off, 0, atol=1e-12)
-    assert np.abs(pose_difference(found.pose, np.eye(4))[~can]).max(initial=0) < 1e-12
+        np.testing.assert_allclose(value.pose, own, atol=1e-12)
+        np.testing.assert_allclose(value.off, 0, atol=1e-12)
+    assert np.abs(pose_difference(value.pose, np.eye(4))[~can]).max(initial=0) < 1e-12
     for e in np.eye(6):
-        moved = taken(motion, perturb(whole, H * e))
-        by = pose_difference(moved.pose, found.pose) / H
-        np.testing.assert_allclose(found.by @ e, by, atol=1e-5)
-        np.testing.assert_allclose(found.off_by @ e, (moved.off - found.off) / H, atol=1e-5)
+        shifted = taken(motion, perturb(whole, H * e))
+        by = pose_difference(shifted.pose, value.pose) / H
+        np.testing.assert_allclose(value.by @ e, by, atol=1e-5)
+        np.testing.assert_allclose(value.off_by @ e, (shifted.off - value.off) / H, atol=1e-5)
 
 
 def test_turns_between_directions():
@@ -129,8 +129,8 @@ def test_jacobians(name, form):
     rng = np.random.default_rng(3)
     drawing, _, data, _ = session(name, rng)
     start = start_from_poses(drawing, data)
-    seen, joints = data.poses.T_station_target, data.joints[data.poses.configuration]
-    problem, state = pose_problem(drawing, data, seen[None], joints[None], start, form)
+    in_view, joints = data.poses.T_station_target, data.joints[data.poses.configuration]
+    problem, state = pose_problem(drawing, data, in_view[None], joints[None], start, form)
     rows = problem.layout.n_equations + 6 - problem.layout.motion.shape[1]
     problem = replace(problem, weigh=np.eye(rows)[None, None])
     linear = problem.linearize(state)
@@ -138,8 +138,8 @@ def test_jacobians(name, form):
     for k in range(n + own):
         step, inner = np.zeros((1, n)), np.zeros((1, 1, own))
         (step[0] if k < n else inner[0, 0])[k if k < n else k - n] = H
-        plus = problem.residuals(problem.moved(state, step, inner)).value
-        minus = problem.residuals(problem.moved(state, -step, -inner)).value
+        plus = problem.residuals(problem.retract(state, step, inner)).value
+        minus = problem.residuals(problem.retract(state, -step, -inner)).value
         wanted = linear.by_shared[..., k] if k < n else linear.by_own[..., k - n]
         np.testing.assert_allclose((plus - minus) / (2 * H), wanted, atol=2e-6)
 
@@ -293,9 +293,9 @@ def boards(turns, rng, sigma=5e-4):
     whiten = np.diag(1 / np.repeat([sigma, 2e-4], 3))
     exact = anywhere(rng, 1.0) @ pose(rotation(turns), rng.normal(size=(n, 3)) * 0.1)
     exact = exact @ anywhere(rng, 0.1)
-    seen = perturb(exact, np.repeat([sigma, 2e-4], 3) * rng.normal(size=(n, 6)))
+    visible = perturb(exact, np.repeat([sigma, 2e-4], 3) * rng.normal(size=(n, 6)))
     none = np.zeros(n, dtype=int)
-    return PoseSet(none, np.arange(n), none, seen, np.broadcast_to(whiten, (n, 6, 6)))
+    return PoseSet(none, np.arange(n), none, visible, np.broadcast_to(whiten, (n, 6, 6)))
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 40, 700])
@@ -310,17 +310,17 @@ def test_pairs_of_many_poses_are_an_even_choice_of_all(n):
 def test_one_axis_is_found_and_tested():
     """chi2 has its mean and scatter; a tilt of the noise's size is found out."""
     z = np.array([0, 0, 1.0])
-    ratios, found = [], []
+    ratios, results = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         angles = np.radians(rng.choice([-20.0, 0, 20], 71))[:, None] * z
         axis = rotation_axis(boards(angles, rng), "schoenflies")
         ratios.append(axis.chi2)
-        found.append(axis.tenable)
+        results.append(axis.tenable)
         assert axis.dof == 2 * 71 - 4
         assert axis.spread == pytest.approx(axis.expected_spread, rel=0.25)
         assert axis.spread > np.radians(0.1)
-    assert all(found)
+    assert all(results)
     assert np.mean(ratios) == pytest.approx(138, abs=4 * np.sqrt(2 * 138 / 40))
     assert np.std(ratios) == pytest.approx(np.sqrt(2 * 138), rel=0.4)
     rng = np.random.default_rng(0)

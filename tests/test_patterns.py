@@ -23,9 +23,9 @@ MADE = {
 }
 """Arguments that are not written where they are used, and how to make all that they stand for."""
 BOUNDED = {
-    "session/photographs.py: _regex(parts, '|'.join(map(re.escape, some)))":
+    "session/image_files.py: _regex(parts, '|'.join(map(re.escape, some)))":
         r"a/(?P<configuration>x|xy)_(?P<repeat>[^/]+?)\.png",
-    "session/photographs.py: _regex(parts, '[^/]+?')":
+    "session/image_files.py: _regex(parts, '[^/]+?')":
         r"a/(?P<configuration>[^/]+?)_(?P<repeat>[^/]+?)\.png",
 }  # fmt: skip
 """The same with an example, of texts that are no longer than a file's name: may be polynomial."""
@@ -92,10 +92,10 @@ FILES = [path for path in sorted(SOURCE.rglob("*.py")) if "re." in path.read_tex
 
 def test_every_pattern_takes_linear_time():
     uses = [use for path in FILES for use in uses_of(path)]
-    slow = {f"{use.key} ({use.method}, line {use.line})": found
+    slow = {f"{use.key} ({use.method}, line {use.line})": value
             for use in uses
-            if (found := ambiguity(use.pattern, use.flags, use.method))
-            and not (use.key in BOUNDED and found == "polynomial")}  # fmt: skip
+            if (value := ambiguity(use.pattern, use.flags, use.method))
+            and not (use.key in BOUNDED and value == "polynomial")}  # fmt: skip
     assert not slow
     assert {use.key for use in uses} >= {*MADE, *BOUNDED}  # what is no longer there goes
 

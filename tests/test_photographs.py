@@ -12,7 +12,7 @@ from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
 from pkmcal.observe.images import decode
-from pkmcal.session.photographs import photograph_header
+from pkmcal.session.image_files import photograph_header
 
 
 def image(path, width, height):
@@ -103,8 +103,8 @@ def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
 def test_broken_images(tmp_path, content, sentence):
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    told = fault(photograph_header, path, "front/a.png")
-    assert told.startswith(f"front/a.png: the {sentence}")
+    values = fault(photograph_header, path, "front/a.png")
+    assert values.startswith(f"front/a.png: the {sentence}")
 
 
 def test_an_image_that_is_not_there(tmp_path):
@@ -145,12 +145,12 @@ def test_what_is_no_file_is_named_at_once(tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "device.png").symlink_to("/dev/zero")
     (tmp_path / "link.png").symlink_to("nowhere")
-    for name, said in (
+    for name, text in (
         ("pipe", "this is a pipe, not a file"),
         ("folder", "this is a folder, not a file"),
         ("device", "this is a device, not a file"),
         ("link", "this is a link to what is not there; found nowhere"),
     ):
         for read in (photograph_header, lambda p, label: decode(p, (4, 4), label), read_text):
-            with pytest.raises(InputError, match=f"^a.png: {said}"):
+            with pytest.raises(InputError, match=f"^a.png: {text}"):
                 read(tmp_path / f"{name}.png", "a.png")

@@ -40,17 +40,17 @@ def test_noise_and_estimate_are_the_same(runs, in_pieces):
     whole = solve_batch(problem, truth)
     at_whole = components(whole.info, whole.weight)
     in_pieces(problem)
-    found = solve_batch(problem, truth)
-    pieces = list(found.info.pieces())
+    value = solve_batch(problem, truth)
+    pieces = list(value.info.pieces())
     counts = [piece.state.T_base_platform.shape[1] for piece in pieces]
     assert counts == [2, 2, 2, 1]
     assert all(piece.linear.by_shared.shape[1] <= 2 for piece in pieces)
     at = components(whole.info, whole.weight)
     for name in ("chi2", "freedom"):
         np.testing.assert_allclose(getattr(at, name), getattr(at_whole, name), rtol=1e-9)
-    np.testing.assert_array_equal(found.info.by_kind.value.shape, whole.info.by_kind.value.shape)
-    np.testing.assert_allclose(found.solution.state.z, whole.solution.state.z, atol=1e-8)
-    np.testing.assert_allclose(found.noise_scale, whole.noise_scale, rtol=1e-6)
+    np.testing.assert_array_equal(value.info.by_kind.value.shape, whole.info.by_kind.value.shape)
+    np.testing.assert_allclose(value.solution.state.z, whole.solution.state.z, atol=1e-8)
+    np.testing.assert_allclose(value.noise_scale, whole.noise_scale, rtol=1e-6)
 
 
 @pytest.mark.parametrize("runs", [1, 3])
@@ -58,8 +58,8 @@ def test_residuals_by_themselves_are_the_same(runs, in_pieces):
     problem, truth, _ = problem_of(runs)
     whole = problem.unweighted(truth)
     in_pieces(problem)
-    for found, expected in zip(problem.unweighted(truth), whole, strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+    for item, expected in zip(problem.unweighted(truth), whole, strict=True):
+        np.testing.assert_allclose(item, expected, atol=1e-9)
 
 
 def test_what_weights_do_not_change_is_kept():
@@ -77,14 +77,14 @@ def test_the_rows_of_pieces_say_the_same(in_pieces):
     problem, truth, machine = problem_of()
     names = ("machine", "stations")
     whole = Information(problem, truth)
-    rows, left = reduced_rows(whole, names)
+    rows, residual = reduced_rows(whole, names)
     every, value = rows_on_shared(whole.linear, whole.reduced)
     spectrum = identifiability(whole, machine).singular_values
     in_pieces(problem)
     pieces = Information(problem, truth)
     few, rest = reduced_rows(pieces, names)
     assert len(few) <= 4 * (problem.unknowns.count + 1) + len(problem.prior)
-    for (a, x), (b, y) in (((rows, left), (few, rest)), (
+    for (a, x), (b, y) in (((rows, residual), (few, rest)), (
         (every[0], value[0]), tuple(part[0] for part in pieces.rows)),
     ):  # fmt: skip
         size = np.abs(a.T @ a).max()
@@ -118,10 +118,10 @@ def test_least_median_leg_after_leg(monkeypatch, noisy):
         size=n.shape[:-1]
     )
 
-    def found():
+    def values():
         return linear.least_median(n, radius, present, np.random.default_rng(0), noise=noise)
 
-    whole = found()
+    whole = values()
     assert np.isfinite(whole).all()
     monkeypatch.setattr(linear, "RESIDUALS_SORTED_TOGETHER", 1)
-    np.testing.assert_array_equal(found(), whole)
+    np.testing.assert_array_equal(values(), whole)

@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import run
-from pkmcal.calibration.saved import Known, load
+from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import machine_covariance
 from pkmcal.identify.gauge import default_gauge
@@ -28,7 +28,7 @@ from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.plan import AT_WORK, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
-from pkmcal.planning.route import length, motor_distances, shortest_way
+from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import of_machine, subject_of_session
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for
@@ -61,14 +61,14 @@ def planned():
 def test_more_pixels_than_a_lens_resolves_promise_nothing():
     """Of a camera nobody has seen the photographs of."""
     machine = load_mechanism("gough-stewart")
-    told = []
+    rows = []
     for size in ((1024, 768), (4096, 3072)):
         camera = camera_of_size(size)
         (one,) = of_machine(machine, [camera], machine.joint_names).rig.instruments
         assert one.camera is camera  # which plan.json names
         edges = one.measure(At(machine, None, machine.home()[None]), np.zeros(1, int), None)
-        told.append(np.sqrt(np.trace(edges.covariance, axis1=-2, axis2=-1)).mean())
-    assert told[1] == pytest.approx(told[0], rel=0.02)
+        rows.append(np.sqrt(np.trace(edges.covariance, axis1=-2, axis2=-1)).mean())
+    assert rows[1] == pytest.approx(rows[0], rel=0.02)
 
 
 # ------------------------------------------------------------------ the promise
@@ -81,19 +81,19 @@ def stated_by(rig, measurements, work):
     if rig.T_mount is not None and len(rig.mounts):
         start = replace(start, T_mount=rig.T_mount)
     estimate = bundle(machine, measurements, start, scale_noise=False)
-    assembled, info = as_ended(measurements, estimate)
+    assembled, info = linearize_at_solution(measurements, estimate)
     gauge = default_gauge(machine)
     by_itself = machine_covariance(
         assembled.problem, machine, estimate.state, info.covariance[0], gauge
     )
-    seen = len(measurements.edges) > 0
-    told = []
+    in_view = len(measurements.edges) > 0
+    rows = []
     for joint in (by_itself, estimate.joint_covariance):
         parameters = joint[: len(machine.parameters), : len(machine.parameters)]
         covariance = free_of_gauge(estimate.machine, parameters)
-        error = tool_error(machine, estimate.machine, covariance, work, legs_seen=seen)
-        told.append((error.position.mean(), error.orientation.mean()))
-    return told
+        error = tool_error(machine, estimate.machine, covariance, work, legs_observed=in_view)
+        rows.append((error.position.mean(), error.orientation.mean()))
+    return rows
 
 
 @pytest.mark.parametrize("seen", ["legs", "board", "points", "together"])
@@ -107,18 +107,18 @@ def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned
         subject = of_machine(machine, [], machine.joint_names, tracker=(2e-5, None))
     else:
         subject = hexapod()
-    found = planned if seen == "legs" else small(subject, monkeypatch, together=seen == "together")
-    rig, n = found.subject.rig, len(found.names)
+    count = planned if seen == "legs" else small(subject, monkeypatch, together=seen == "together")
+    rig, n = count.subject.rig, len(count.names)
     numbers = {name: k for k, name in enumerate(rig.names)}
-    pairs = np.array([(numbers[s], k) for k in range(n) for s in found.stations[k]])
-    data = rig.measured(found.joints, found.T_base_platform, pairs)
-    (position, orientation), stated = stated_by(rig, data, found.work)
+    pairs = np.array([(numbers[s], k) for k in range(n) for s in count.stations[k]])
+    data = rig.measured(count.joints, count.T_base_platform, pairs)
+    (position, orientation), stated = stated_by(rig, data, count.work)
     # the means of edges are drawn one by one for the promise: here they are all alike
-    assert found.promised.position == pytest.approx(position, rel=2e-3)
-    assert found.promised.orientation == pytest.approx(orientation, rel=2e-3, abs=1e-9)
+    assert count.promised.position == pytest.approx(position, rel=2e-3)
+    assert count.promised.orientation == pytest.approx(orientation, rel=2e-3, abs=1e-9)
     # how alike edges err is not planned with
-    assert found.promised.position == pytest.approx(stated[0], rel=0.03)
-    assert found.promised.orientation == pytest.approx(stated[1], rel=0.03, abs=1e-9)
+    assert count.promised.position == pytest.approx(stated[0], rel=0.03)
+    assert count.promised.orientation == pytest.approx(stated[1], rel=0.03, abs=1e-9)
 
 
 def test_a_plan_is_far_better_than_chance(planned):
@@ -128,18 +128,18 @@ def test_a_plan_is_far_better_than_chance(planned):
 
 
 def test_configurations_are_possible_and_their_way_is_short(planned):
-    found = planned
-    machine = found.subject.rig.machine
+    value = planned
+    machine = value.subject.rig.machine
     low, high = machine.joint_ranges.T
     margin = READING_RANGE_SHARES[0] * (high - low) - 1e-9
-    assert np.all(found.joints >= low + margin)
-    assert np.all(found.joints <= high - margin)
-    assert usable(machine, found.T_base_platform, found.joints).all()
-    np.testing.assert_allclose(machine.inverse(found.T_base_platform), found.joints, atol=1e-9)
-    assert found.travel[0] <= found.travel[1]
-    assert sorted(found.names) == ["a01", "a02", "a03", "a04", "a05", "b01", "b02", "b03", "b04",
+    assert np.all(value.joints >= low + margin)
+    assert np.all(value.joints <= high - margin)
+    assert usable(machine, value.T_base_platform, value.joints).all()
+    np.testing.assert_allclose(machine.inverse(value.T_base_platform), value.joints, atol=1e-9)
+    assert value.travel[0] <= value.travel[1]
+    assert sorted(value.names) == ["a01", "a02", "a03", "a04", "a05", "b01", "b02", "b03", "b04",
                                    "b05"]  # fmt: skip
-    assert sorted(found.rank.tolist()) == sorted([*range(1, 6)] * 2)
+    assert sorted(value.rank.tolist()) == sorted([*range(1, 6)] * 2)
 
 
 def test_more_configurations_never_tell_less(planned):
@@ -155,11 +155,13 @@ def test_more_configurations_never_tell_less(planned):
 def toy(seed=0, n=14, p=3):
     rng = np.random.default_rng(seed)
     rows = rng.normal(size=(n, 2, p + 2))
-    known = np.eye(p + 2) * 0.1
-    known[:p, :p] += np.eye(p) * 0.9
+    reference_values = np.eye(p + 2) * 0.1
+    reference_values[:p, :p] += np.eye(p) * 0.9
     machine = np.eye(p, p + 2)
     where = np.arange(n, dtype=float)[:, None]
-    return CandidateRows(rows, np.zeros(n, int), where, known, machine, rng.normal(size=(5, 6, p)))
+    return CandidateRows(
+        rows, np.zeros(n, int), where, reference_values, machine, rng.normal(size=(5, 6, p))
+    )
 
 
 @pytest.mark.parametrize("name", list(PLAN_INDICES))
@@ -172,8 +174,8 @@ def test_exchange_comes_near_the_best_of_all_subsets(name):
             float(index.value(info.covariance(info.of(np.array(c)))))
             for c in itertools.combinations(range(14), 4)
         ]
-        found = exchanged(info, greedy(info, 4, index).chosen, index)
-        value = float(index.value(info.covariance(info.of(found))))
+        result = exchanged(info, greedy(info, 4, index).chosen, index)
+        value = float(index.value(info.covariance(info.of(result))))
         better.append(np.sum(np.array(every) < value - 1e-12))
     # Exchanges one by one end in one of the best two hundredths of 1001 subsets; the largest
     # eigenvalue, which is not smooth, has a local optimum now and then.
@@ -198,9 +200,9 @@ def test_no_configuration_is_measured_twice():
     info = replace(info, rows=rows, where=where)
     index = PLAN_INDICES["D"](info)
     chosen = greedy(info, 5, index).chosen
-    for found in (chosen, exchanged(info, chosen, index)):
-        assert len(set(found // 2)) == 5
-        assert 0 in found // 2
+    for actual_names in (chosen, exchanged(info, chosen, index)):
+        assert len(set(actual_names // 2)) == 5
+        assert 0 in actual_names // 2
 
 
 @pytest.mark.parametrize("name", list(PLAN_INDICES))
@@ -218,10 +220,10 @@ def test_slopes_are_the_indices_derivatives(name):
 
 def test_the_greedy_path_is_that_of_its_choice():
     info = toy(2)
-    found = greedy(info, 5, PLAN_INDICES["tool"](info))
+    value = greedy(info, 5, PLAN_INDICES["tool"](info))
     for k in range(1, 6):
-        whole = info.covariance(info.of(found.chosen[:k]))
-        np.testing.assert_allclose(found.path[k - 1], whole, rtol=1e-9, atol=1e-12)
+        whole = info.covariance(info.of(value.chosen[:k]))
+        np.testing.assert_allclose(value.path[k - 1], whole, rtol=1e-9, atol=1e-12)
 
 
 # ------------------------------------------------------------------ what is known already
@@ -255,12 +257,14 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
     start = start_state(machine, data, rig.T_station_base)
     estimate = bundle(machine, replace(data, shaded=False), start, scale_noise=False)
     n = len(machine.values)
-    known = Known(estimate.joint_covariance[: n + 12, : n + 12], (0, 1), np.zeros((2, 4, 4)))
-    later = information_of(bare, Candidates.of_all(groups, joints, poses), work, known)
+    reference_values = CalibrationPrior(
+        estimate.joint_covariance[: n + 12, : n + 12], (0, 1), np.zeros((2, 4, 4))
+    )
+    later = information_of(bare, Candidates.of_all(groups, joints, poses), work, reference_values)
     in_turn = later.tool(later.covariance(later.of(two)))
     np.testing.assert_allclose(in_turn, direct, rtol=0.02)
-    moved = known.only(())
-    anew = information_of(bare, Candidates.of_all(groups, joints, poses), work, moved)
+    shifted = reference_values.only(())
+    anew = information_of(bare, Candidates.of_all(groups, joints, poses), work, shifted)
     assert anew.tool(anew.covariance(anew.of(two)))[0] > in_turn[0]
 
 
@@ -270,14 +274,14 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
 def test_places_stand_apart_and_better_one_alone(monkeypatch):
     monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_PLACES_A_RING", 6)
     monkeypatch.setattr("pkmcal.planning.plan.FOR_PLACES", 8)
-    found = small(hexapod(1), monkeypatch, free_places=2)
-    chosen = [tried for tried in found.tried if tried.chosen]
+    results = small(hexapod(1), monkeypatch, free_places=2)
+    chosen = [tried for tried in results.tried if tried.chosen]
     eyes = np.array([tried.place.position for tried in chosen])
-    middle = found.subject.rig.machine.home()[:3, 3]
+    middle = results.subject.rig.machine.home()[:3, 3]
     ways = (eyes - middle) / np.linalg.norm(eyes - middle, axis=1, keepdims=True)
     assert len(chosen) == 2
     assert abs(ways[0] @ ways[1]) < 0.9  # not along one line
-    assert found.promised.position < min(tried.alone for tried in found.tried)
+    assert results.promised.position < min(tried.alone for tried in results.tried)
 
 
 def test_a_board_is_seen_from_its_face_only():
@@ -302,10 +306,10 @@ def test_the_way_is_nearly_the_shortest(n, seed):
     joints = np.random.default_rng(seed).random((n, 3))
     apart = motor_distances(joints, np.tile([0.0, 1.0], (3, 1)))
     first = np.abs(joints - 0.5).max(axis=1)
-    way = shortest_way(apart, first)
-    assert sorted(way) == list(range(n))
+    path = shortest_path(apart, first)
+    assert sorted(path) == list(range(n))
     least = min(length(np.array(order), apart, first) for order in itertools.permutations(range(n)))
-    assert length(way, apart, first) <= 1.15 * least
+    assert length(path, apart, first) <= 1.15 * least
 
 
 def test_barred_steps_are_avoided():
@@ -313,8 +317,8 @@ def test_barred_steps_are_avoided():
     apart = motor_distances(joints, np.array([[0.0, 5.0]]))
     barred = np.zeros((6, 6), dtype=bool)
     barred[2, 3] = barred[3, 2] = True
-    way = shortest_way(apart, None, barred)
-    assert not barred[way[:-1], way[1:]].any()
+    path = shortest_path(apart, None, barred)
+    assert not barred[path[:-1], path[1:]].any()
 
 
 # ------------------------------------------------------------------ the command
@@ -326,7 +330,7 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     (session / "truth.json").unlink()
     result = run("plan", str(session), "-n", "4")
     assert result.code == 0, result.out + result.err
-    told = json.loads((session / "plan" / "plan.json").read_text())
+    values = json.loads((session / "plan" / "plan.json").read_text())
     table = read_csv(session / "plan" / "plan.csv")
     loaded = load_session(session)
     assert len(table.names) == 12
@@ -336,7 +340,7 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
         result.out + result.err
     ).replace("\n  ", " ")
     np.testing.assert_allclose(
-        table.values, [c["joints"] for c in told["configurations"]], atol=1e-6
+        table.values, [c["joints"] for c in values["configurations"]], atol=1e-6
     )
     assert 'id="where"' in (session / "plan" / "plan.html").read_text()
     # with a calibration beside it, what is known counts
@@ -344,12 +348,12 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     after = run("plan", str(session), "-n", "4", "-o", str(tmp_path / "after"))
     assert after.code == 0, after.err
     later = json.loads((tmp_path / "after" / "plan.json").read_text())
-    assert later["now"]["position"] < 0.2 * told["now"]["position"]
-    assert later["promised"]["position"] < told["promised"]["position"]
+    assert later["now"]["position"] < 0.2 * values["now"]["position"]
+    assert later["promised"]["position"] < values["promised"]["position"]
     still = run("plan", str(session), "-n", "4", "--same-place", "-o", str(tmp_path / "still"))
-    kept = json.loads((tmp_path / "still" / "plan.json").read_text())
+    retained = json.loads((tmp_path / "still" / "plan.json").read_text())
     assert still.code == 0
-    assert kept["promised"]["position"] < later["promised"]["position"]
+    assert retained["promised"]["position"] < later["promised"]["position"]
 
 
 def test_a_session_before_any_photograph(demo, quick_plans, tmp_path):
@@ -358,9 +362,9 @@ def test_a_session_before_any_photograph(demo, quick_plans, tmp_path):
     (session / "joints.csv").unlink()
     result = run("plan", str(session), "-n", "3", "--best-of", "2", "--json")
     assert result.code == 0, result.out + result.err
-    told = result.json
-    assert sum(place["chosen"] for place in told["places_tried"]) == 2
-    assert "no photograph tells it yet" in told["assumptions"][0]
+    values = result.json
+    assert sum(place["chosen"] for place in values["places_tried"]) == 2
+    assert "no photograph tells it yet" in values["assumptions"][0]
     assert (session / "plan" / "stations.yaml").is_file()
     # and calibrate still asks for photographs
     assert run("calibrate", str(session)).code == 2
@@ -437,7 +441,7 @@ def test_the_promise_is_kept_by_photographs(seed, tmp_path):
     assert made.code == 0, made.err
     out = tmp_path / "out"
     assert run("calibrate", str(whole), "-o", str(out)).code == 0
-    saved, told = load(out), json.loads((few / "plan" / "plan.json").read_text())
+    saved, values = load(out), json.loads((few / "plan" / "plan.json").read_text())
     work = poses_in(saved.machine.limits(), Region(), AT_WORK, 0)
     stated = float(saved.tool_error(work).position.mean())
-    assert told["promised"]["position"] == pytest.approx(stated, rel=0.15)
+    assert values["promised"]["position"] == pytest.approx(stated, rel=0.15)

@@ -30,48 +30,48 @@ def repeated(alone, common, seed=0, n=CONFIGURATIONS, repeats=REPEATS):
     return truth, rows, T, np.broadcast_to(np.diag(SIGMA**2), (len(rows), 6, 6))
 
 
-def squares(found, truth):
+def squares(value, truth):
     """Mean of the errors' squares by the stated covariance, one number of six."""
-    error = pose_difference(found.pose, truth)
-    white = np.linalg.solve(np.linalg.cholesky(found.covariance), error[..., None])
+    error = pose_difference(value.pose, truth)
+    white = np.linalg.solve(np.linalg.cholesky(value.covariance), error[..., None])
     return float(np.mean(white**2))
 
 
 @pytest.mark.parametrize("common", [0.0, 0.5, 0.9])
 def test_errors_are_what_the_mean_says(common):
     truth, rows, T, covariance = repeated(1 - common, common)
-    found = mean_poses(rows, T, covariance, common)
-    assert found.used.all()
-    assert squares(found, truth) == pytest.approx(1.0, abs=FOUR)
+    value = mean_poses(rows, T, covariance, common)
+    assert value.used.all()
+    assert squares(value, truth) == pytest.approx(1.0, abs=FOUR)
     expected = SIGMA * np.sqrt(common + (1 - common) / REPEATS)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance[0])), expected, rtol=0.03)
+    np.testing.assert_allclose(np.sqrt(np.diag(value.covariance[0])), expected, rtol=0.03)
 
 
 def test_a_floor_that_shakes_is_measured():
     """Repeats that scatter three times more than they state, whatever they have in common."""
     for common in (0.0, 0.5):
         truth, rows, T, covariance = repeated(9.0 * (1 - common), common, seed=1)
-        found = mean_poses(rows, T, covariance, common)
-        assert squares(found, truth) == pytest.approx(1.0, abs=FOUR)
+        value = mean_poses(rows, T, covariance, common)
+        assert squares(value, truth) == pytest.approx(1.0, abs=FOUR)
         variance = common + 9 * (1 - common) / REPEATS
         np.testing.assert_allclose(
-            np.diagonal(found.covariance, axis1=1, axis2=2) / SIGMA**2, variance, rtol=0.1
+            np.diagonal(value.covariance, axis1=1, axis2=2) / SIGMA**2, variance, rtol=0.1
         )
 
 
 def test_repeats_that_agree_too_well_promise_nothing_more():
     _, rows, T, covariance = repeated(0.01, 0.0)
-    found = mean_poses(rows, T, covariance, 0.0)
-    np.testing.assert_allclose(found.covariance, covariance[: len(found.pose)] / REPEATS)
+    count = mean_poses(rows, T, covariance, 0.0)
+    np.testing.assert_allclose(count.covariance, covariance[: len(count.pose)] / REPEATS)
 
 
 def test_what_is_common_does_not_average_out():
     """The error of a hundred repeats is the shared part, and the covariance says so."""
     truth, rows, T, covariance = repeated(0.5, 0.5, n=30, repeats=100)
-    found = mean_poses(rows, T, covariance, 0.5)
-    error = pose_difference(found.pose, truth)
+    value = mean_poses(rows, T, covariance, 0.5)
+    error = pose_difference(value.pose, truth)
     assert np.sqrt(np.mean((error / SIGMA) ** 2)) == pytest.approx(np.sqrt(0.505), rel=0.2)
-    assert squares(found, truth) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 180))
+    assert squares(value, truth) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 180))
     wrong = mean_poses(rows, T, covariance, 0.0)
     assert squares(wrong, truth) > 20
 
@@ -80,22 +80,22 @@ def test_a_repeat_elsewhere_is_let_go():
     _, rows, T, covariance = repeated(1.0, 0.0, n=20)
     spoilt = T.copy()
     spoilt[12] = perturb(T[12], 40 * SIGMA)
-    found = mean_poses(rows, spoilt, covariance, 0.0)
-    assert np.flatnonzero(~found.used).tolist() == [12]
-    assert found.off[12] == pytest.approx(40, rel=0.1)
+    results = mean_poses(rows, spoilt, covariance, 0.0)
+    assert np.flatnonzero(~results.used).tolist() == [12]
+    assert results.off[12] == pytest.approx(40, rel=0.1)
     without = np.delete(np.arange(len(rows)), 12)
     expected = mean_poses(rows[without], T[without], covariance[without], 0.0)
-    np.testing.assert_allclose(found.pose, expected.pose, atol=1e-12)
+    np.testing.assert_allclose(results.pose, expected.pose, atol=1e-12)
     # one repeat less, so a little less is known of it
-    assert found.covariance[2, 0, 0] / found.covariance[0, 0, 0] == pytest.approx(5 / 4)
+    assert results.covariance[2, 0, 0] / results.covariance[0, 0, 0] == pytest.approx(5 / 4)
 
 
 def test_of_two_that_differ_both_stay():
     _, rows, T, covariance = repeated(1.0, 0.0, n=20, repeats=2)
     T[6] = perturb(T[6], 40 * SIGMA)
-    found = mean_poses(rows, T, covariance, 0.0)
-    assert found.used.all()
-    assert found.covariance[0, 0, 0] > 10 * SIGMA[0] ** 2
+    value = mean_poses(rows, T, covariance, 0.0)
+    assert value.used.all()
+    assert value.covariance[0, 0, 0] > 10 * SIGMA[0] ** 2
 
 
 # boards in photographs
@@ -108,34 +108,34 @@ def photographs(board, rows, noise, seed=0):  # noqa: F811
     pixels = CAMERA.project(apply(truth[rows][:, None], board.points))
     pixels = pixels + noise * rng.normal(size=pixels.shape)
     ids = np.arange(len(board.points))
-    found = [
+    results = [
         Detection(f"{k:04d}.png", CAMERA.image_size, ids, p, np.full(len(ids), noise))
         for k, p in enumerate(pixels)
     ]
-    return found, truth
+    return results, truth
 
 
 def test_photographs_of_one_configuration_become_one_measurement(board):  # noqa: F811
     rows = np.repeat(np.arange(60), 4)
-    found, truth = photographs(board, rows, 0.1)
-    poses, odd = one_a_configuration(seen(board, found, rows), mount=3)
+    value, truth = photographs(board, rows, 0.1)
+    poses, odd = one_a_configuration(seen(board, value, rows), mount=3)
     assert poses.configuration.tolist() == list(range(60))
     assert set(poses.mount.tolist()) == {3}
     assert odd == ()
     error = pose_difference(poses.T_station_target, truth)
     white = np.einsum("nij,nj->ni", poses.whiten, error)
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.3)
-    single, _ = one_a_configuration(seen(board, found[::4], rows[::4]), mount=3)
+    single, _ = one_a_configuration(seen(board, value[::4], rows[::4]), mount=3)
     gain = np.linalg.norm(poses.whiten, axis=(1, 2)) / np.linalg.norm(single.whiten, axis=(1, 2))
     np.testing.assert_allclose(gain, 2.0, rtol=0.15)  # the root of four photographs
 
 
 def test_an_odd_photograph_is_named(board):  # noqa: F811
     rows = np.repeat(np.arange(6), 4)
-    found, truth = photographs(board, rows, 0.1)
-    moved = perturb(truth[2], np.array([0, 0, 0, 2e-3, 0, 0]))
-    pixels = CAMERA.project(apply(moved, board.points))
-    found[9] = Detection(found[9].name, CAMERA.image_size, found[9].ids, pixels, found[9].sigma)
-    _, (odd,) = one_a_configuration(seen(board, found, rows), mount=0)
+    values, truth = photographs(board, rows, 0.1)
+    shifted = perturb(truth[2], np.array([0, 0, 0, 2e-3, 0, 0]))
+    pixels = CAMERA.project(apply(shifted, board.points))
+    values[9] = Detection(values[9].name, CAMERA.image_size, values[9].ids, pixels, values[9].sigma)
+    _, (odd,) = one_a_configuration(seen(board, values, rows), mount=0)
     assert odd.configuration == 2
     assert "from where the repeats show it" in odd.reason

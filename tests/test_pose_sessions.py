@@ -10,8 +10,8 @@ import pytest
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.outvoted import outvoted
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.outlier_explanations import outlier_explanations
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.check.check import check_session, pose_findings
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text
@@ -61,13 +61,13 @@ def make(folder, name, kind="poses", n=24, seed=0, scale=1.0, model=None, statio
     place = np.eye(4) if kind == "heights" else T_TRACKER_BASE
     target = T_PLATFORM_TARGET if station is None else station
     sigma = np.repeat([TURN, POSITION], 3)
-    seen = perturb(place @ T @ target, sigma * rng.normal(size=(len(T), 6)))
+    in_view = perturb(place @ T @ target, sigma * rng.normal(size=(len(T), 6)))
     noise = 1e-5
     readings = joints + noise * rng.normal(size=joints.shape)
     folder.mkdir()
     (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
     write_joints(folder, readings)
-    write_poses(folder, seen, kind)
+    write_poses(folder, in_view, kind)
     document = {
         "pkmcal": 1,
         "mechanism": "mechanism.yaml",
@@ -100,9 +100,9 @@ def write_joints(folder, joints):
     (folder / "joints.csv").write_text(csv_text(columns, names, joints))
 
 
-def write_poses(folder, seen, kind="poses"):
-    names = [f"{k:03d}" for k in range(len(seen))]
-    values = np.concatenate([seen[:, :3, 3], rotation_vector(seen[:, :3, :3])], axis=1)
+def write_poses(folder, in_view, kind="poses"):
+    names = [f"{k:03d}" for k in range(len(in_view))]
+    values = np.concatenate([in_view[:, :3, 3], rotation_vector(in_view[:, :3, :3])], axis=1)
     values = values[:, [2]] if kind == "heights" else values[:, : len(COLUMNS[kind])]
     (folder / "poses.csv").write_text(csv_text(COLUMNS[kind], names, values))
 
@@ -117,9 +117,9 @@ def tool_error(machine, made, n=60):
     fit of both frames, at poses that were not measured.
     """
     T, joints = configurations(made.machine, n, np.random.default_rng(99))
-    found = machine.forward(joints)
-    frames = solve_pairs(found[None], T[None], 0.3)
-    off = frames.T_camera_base[0] @ found @ frames.T_mount[0] - T
+    forward_kinematics = machine.forward(joints)
+    frames = solve_pairs(forward_kinematics[None], T[None], 0.3)
+    off = frames.T_camera_base[0] @ forward_kinematics @ frames.T_mount[0] - T
     return np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=-1)))
 
 
@@ -151,8 +151,8 @@ def test_stations_and_targets_are_found_with_their_deviations(folder):
     made = make(folder, "gough-stewart", seed=3)
     result = calibrate_session(folder)
     state = result.estimate.state
-    found = state.T_camera_base[0] @ state.T_base_platform @ state.T_mount[0]
-    error = rotation_vector((inverse(found) @ seen_poses(made))[:, :3, :3])
+    value = state.T_camera_base[0] @ state.T_base_platform @ state.T_mount[0]
+    error = rotation_vector((inverse(value) @ seen_poses(made))[:, :3, :3])
     assert np.sqrt(np.mean(error**2)) < TURN
     sigma = np.sqrt(np.diag(result.estimate.mount_covariance[0]))
     assert np.all(sigma > 0)
@@ -187,14 +187,14 @@ def test_heights_of_a_flat_bed(folder):
 
 def test_outliers_are_let_go_and_named(folder):
     made = make(folder, "h4", n=30)
-    seen = seen_poses(made)
-    seen[7] = perturb(seen[7], np.array([0, 0, 0, 0.004, 0, 0.0]))
-    seen[20] = perturb(seen[20], np.array([0, 0.02, 0, 0, 0, 0.0]))
-    write_poses(folder, seen)
+    in_view = seen_poses(made)
+    in_view[7] = perturb(in_view[7], np.array([0, 0, 0, 0.004, 0, 0.0]))
+    in_view[20] = perturb(in_view[20], np.array([0, 0.02, 0, 0, 0, 0.0]))
+    write_poses(folder, in_view)
     result = calibrate_session(folder)
     assert np.flatnonzero(result.estimate.pose_weights < 0.5).tolist() == [7, 20]
-    told = [r for r in result.observation.rejected if r.configuration in (7, 20)]
-    assert all("standard deviations from where all others put it" in r.reason for r in told)
+    rows = [r for r in result.observation.rejected if r.configuration in (7, 20)]
+    assert all("standard deviations from where all others put it" in r.reason for r in rows)
     # thirty poses of six numbers confirm that these two are wrong
     assert result.verdict.usable
     (named,) = result.verdict.of("rejected.units")
@@ -244,10 +244,10 @@ def test_everything_is_saved_and_read_back(folder, tmp_path):
 
 def test_a_target_moved_on_the_platform(folder):
     made = make(folder, "h4", n=20)
-    seen = seen_poses(made)
+    in_view = seen_poses(made)
     step = perturb(np.eye(4), np.array([0.01, 0.0, 0.02, 0.002, 0.0, 0.001]))
-    seen[12:] = seen[12:] @ step
-    write_poses(folder, seen)
+    in_view[12:] = in_view[12:] @ step
+    write_poses(folder, in_view)
     with pytest.raises(InputError, match="between configuration 011 and 012"):
         calibrate_session(folder)
 
@@ -257,11 +257,11 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     joints = made.joints.copy()
     joints[7, 2] += 0.02
     write_joints(folder, joints)
-    found = calibrate_session(folder)
-    assert tool_error(found.machine, made) < 1.5e-4
-    (told,) = found.verdict.of("readings.outvoted")
-    assert told.subject == "motor3, 007"
-    assert told.facts["value"] == pytest.approx(-0.02, rel=0.06)
+    calibration = calibrate_session(folder)
+    assert tool_error(calibration.machine, made) < 1.5e-4
+    (values,) = calibration.verdict.of("readings.outvoted")
+    assert values.subject == "motor3, 007"
+    assert values.facts["value"] == pytest.approx(-0.02, rel=0.06)
 
 
 def test_no_configuration_is_exchanged_with_itself(folder):
@@ -271,18 +271,18 @@ def test_no_configuration_is_exchanged_with_itself(folder):
     estimate, measurements = right.estimate, right.measurements
     weights = estimate.pose_weights.copy()
     weights[measurements.poses.configuration == 7] = 0.0
-    said = []
+    text = []
     for off in np.linspace(0, 2e-3, 401):
         joints = measurements.joints.copy()
         joints[7] += off
-        said += outvoted(
+        text += outlier_explanations(
             replace(right.session, joints=joints),
             replace(measurements, joints=joints),
             replace(estimate, pose_weights=weights),
         )
-    assert said  # far off enough it is named
-    assert "007" not in {one.facts.get("other") for one in said}
-    assert "007" not in {one.facts.get("like") for one in said}
+    assert text  # far off enough it is named
+    assert "007" not in {one.facts.get("other") for one in text}
+    assert "007" not in {one.facts.get("like") for one in text}
     assert len(made.joints) == 30
 
 
@@ -292,33 +292,33 @@ def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
     made = make(folder, "h4", n=24)
     rng = np.random.default_rng(3)
     write_joints(folder, made.joints + np.deg2rad(0.5) * rng.normal(size=made.joints.shape))
-    found = calibrate_session(folder)
-    assert np.all(found.estimate.pose_weights > 0.5)
-    scatter = found.estimate.statistics.reading_scale * found.session.joint_noise
+    calibration = calibrate_session(folder)
+    assert np.all(calibration.estimate.pose_weights > 0.5)
+    scatter = calibration.estimate.statistics.reading_scale * calibration.session.joint_noise
     assert np.rad2deg(scatter) == pytest.approx(0.5, rel=0.25)
-    low, high = found.estimate.statistics.reading_range
-    assert low < np.deg2rad(0.5) / found.session.joint_noise < high
+    low, high = calibration.estimate.statistics.reading_range
+    assert low < np.deg2rad(0.5) / calibration.session.joint_noise < high
 
 
 def test_exchanged_rows_are_outvoted_and_told(folder):
     made = make(folder, "h4", n=30)
     write_joints(folder, made.joints[[*range(11), 20, *range(12, 20), 11, *range(21, 30)]])
-    found = calibrate_session(folder)
-    assert tool_error(found.machine, made) < 1.5e-4
-    (told,) = found.verdict.of("configurations.misnamed")
-    assert told.subject == "joints.csv, configuration 011 and 020"
-    assert (told.facts["configuration"], told.facts["both"]) == ("011", "yes")
+    calibration = calibrate_session(folder)
+    assert tool_error(calibration.machine, made) < 1.5e-4
+    (values,) = calibration.verdict.of("configurations.misnamed")
+    assert values.subject == "joints.csv, configuration 011 and 020"
+    assert (values.facts["configuration"], values.facts["both"]) == ("011", "yes")
 
 
 def test_a_pose_under_another_name_is_told(folder):
     made = make(folder, "h4", n=30)
-    seen = seen_poses(made)
-    seen[4] = seen[17]
-    write_poses(folder, seen)
-    found = calibrate_session(folder)
-    (told,) = found.verdict.of("configurations.misnamed")
-    assert (told.facts["configuration"], told.facts["other"]) == ("004", "017")
-    assert told.facts["both"] == "no"
+    in_view = seen_poses(made)
+    in_view[4] = in_view[17]
+    write_poses(folder, in_view)
+    calibration = calibrate_session(folder)
+    (values,) = calibration.verdict.of("configurations.misnamed")
+    assert (values.facts["configuration"], values.facts["other"]) == ("004", "017")
+    assert values.facts["both"] == "no"
 
 
 @pytest.mark.slow
@@ -380,9 +380,9 @@ def test_readings_in_degrees(folder):
 
 def test_lengths_of_another_scale(folder):
     made = make(folder, "h4", n=30)
-    seen = seen_poses(made)
-    seen[:, :3, 3] *= 1.05
-    write_poses(folder, seen)
+    in_view = seen_poses(made)
+    in_view[:, :3, 3] *= 1.05
+    write_poses(folder, in_view)
     verdict = calibrate_session(folder).verdict
     assert not verdict.usable
     (scale,) = verdict.of("machine.scale")
@@ -391,16 +391,16 @@ def test_lengths_of_another_scale(folder):
 
 def test_check_tells_how_the_platform_turns(folder):
     made = make(folder, "h4", n=20)
-    found = check_session(folder)
-    assert found.exit_code < 2
-    assert "poses.turning" in [one.code for one in found.findings]
+    check = check_session(folder)
+    assert check.exit_code < 2
+    assert "poses.turning" in [one.code for one in check.findings]
     rng = np.random.default_rng(1)
-    seen = perturb(seen_poses(made), np.concatenate([0.01 * rng.normal(size=(20, 3)),
+    visible = perturb(seen_poses(made), np.concatenate([0.01 * rng.normal(size=(20, 3)),
                                                      np.zeros((20, 3))], axis=1))  # fmt: skip
-    write_poses(folder, seen)
-    doubts = [
+    write_poses(folder, visible)
+    faults = [
         finding.code
         for finding in pose_findings(load_session(folder), Boards())
         if finding.level is Level.DOUBTFUL
     ]
-    assert "poses.not_turning" in doubts
+    assert "poses.not_turning" in faults

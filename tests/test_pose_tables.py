@@ -40,9 +40,9 @@ def test_quaternions_and_rotation_vectors_say_the_same(tmp_path):
     quaternions[3, 3:] *= -1  # the same turn
     first = table(tmp_path, FULL + "\n" + rows(quaternions))
     second = table(tmp_path, "configuration,x,y,z,rx,ry,rz\n" + rows(vectors))
-    for found in (first, second):
-        assert found.kind == "poses"
-        np.testing.assert_allclose(pose_difference(found.T, T), 0, atol=1e-12)
+    for item in (first, second):
+        assert item.kind == "poses"
+        np.testing.assert_allclose(pose_difference(item.T, T), 0, atol=1e-12)
     poses = first.poses(station=2, mount=1)
     assert set(poses.station) == {2}
     assert set(poses.mount) == {1}
@@ -70,8 +70,8 @@ def test_points_have_three_rows_and_heights_one(tmp_path):
 
 def test_a_part_of_the_configurations_in_any_order(tmp_path):
     _, numbers, _ = whole()
-    found = table(tmp_path, FULL + "\n" + rows(numbers[:4], ("005", "001", "007", "002")))
-    assert found.configuration.tolist() == [5, 1, 7, 2]
+    results = table(tmp_path, FULL + "\n" + rows(numbers[:4], ("005", "001", "007", "002")))
+    assert results.configuration.tolist() == [5, 1, 7, 2]
 
 
 def spoilt(row, column, value):
@@ -113,9 +113,9 @@ def test_whole_poses_need_the_noise_of_their_turns(tmp_path):
 def test_millimetres(tmp_path):
     T, numbers, _ = whole()
     numbers[:, :3] *= 1000
-    found = table(tmp_path, FULL + "\n" + rows(numbers))
+    value = table(tmp_path, FULL + "\n" + rows(numbers))
     with pytest.raises(InputError, match="look like millimetres"):
-        check_lengths(found, T)
+        check_lengths(value, T)
     numbers[:, :3] /= 1000
     check_lengths(table(tmp_path, FULL + "\n" + rows(numbers)), T)
 
@@ -123,8 +123,8 @@ def test_millimetres(tmp_path):
 def test_starts_of_points_and_heights(tmp_path):
     T, _, _ = whole()
     T_tracker_base = pose(rotation(np.array([0.3, -2.0, 1.0])), np.array([3.0, 1.0, -0.5]))
-    seen = (T_tracker_base @ T)[:, :3, 3]
-    points = table(tmp_path, "configuration,x,y,z\n" + rows(seen), turn=None)
+    in_view = (T_tracker_base @ T)[:, :3, 3]
+    points = table(tmp_path, "configuration,x,y,z\n" + rows(in_view), turn=None)
     np.testing.assert_allclose(points.start(T), T_tracker_base, atol=1e-12)
     heights = table(tmp_path, "configuration,z\n" + rows(T[:, 2:3, 3] + 0.25), turn=None)
     np.testing.assert_allclose(heights.start(T)[:3, 3], [0, 0, 0.25], atol=1e-12)

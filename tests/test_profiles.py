@@ -175,8 +175,8 @@ def test_well_exposed_edges_are_unbiased(blur, scene):
     """
     made = make(1, blur=blur, **scene)
     at = located(made.profiles, blur)
-    assert at.found.mean() > 0.98
-    off = (at.position - made.truth)[at.found]
+    assert at.valid.mean() > 0.98
+    off = (at.position - made.truth)[at.valid]
     assert abs(off.mean()) < (0.01 if blur < 0.75 else 0.015)
     assert rms(off) < 0.03
     assert np.abs(off).max() < 0.15
@@ -208,7 +208,7 @@ def test_the_strongest_gradient_is_biased_where_the_model_is_not():
 def test_the_stated_sigma_covers_the_scatter(noise, count, narrow, wide):
     made = make(3, 400, noise=noise, count=count)
     at = located(made.profiles, 0.7)
-    ratio = ((at.position - made.truth) / at.sigma)[at.found]
+    ratio = ((at.position - made.truth) / at.sigma)[at.valid]
     assert narrow < rms(ratio) < wide
     # a normal law has 0.3 % beyond three sigmas
     assert np.mean(np.abs(ratio) > 3 * wide) < 0.01
@@ -226,9 +226,9 @@ def test_overexposed_edges_are_cut_or_dropped():
     cut = made.profiles.cut > 0
     assert 0.3 < cut.mean() < 0.99
     at = located(made.profiles, 0.7)
-    used = cut & at.found
+    used = cut & at.valid
     assert used.sum() > 30
-    assert (cut & ~at.found).sum() > 30
+    assert (cut & ~at.valid).sum() > 30
     off = at.position - made.truth
     # shading hides behind what is clipped, all to one side
     assert abs(off[used].mean()) < 0.02
@@ -246,7 +246,7 @@ def test_what_is_cut_off_widens_the_sigma():
         assert np.median(at.sigma / whole.sigma) > wider
         off = at.position - made.truth
         assert rms(off) > 1.1 * rms(whole.position - made.truth)
-        assert rms((off / at.sigma)[at.found]) < 1.2
+        assert rms((off / at.sigma)[at.valid]) < 1.2
 
 
 def test_clipped_samples_that_are_not_cut_would_bias():
@@ -254,7 +254,7 @@ def test_clipped_samples_that_are_not_cut_would_bias():
     made = make(5, 600, gain=1.7, albedo=(150, 230))
     blind = replace(made.profiles, cut=np.zeros_like(made.profiles.cut))
     cut = located(made.profiles, 0.7)
-    used = (made.profiles.cut > 0) & cut.found
+    used = (made.profiles.cut > 0) & cut.valid
     naive = located(blind, 0.7).position - made.truth
     assert rms(naive[used]) > 1.5 * rms((cut.position - made.truth)[used])
 
@@ -286,8 +286,8 @@ def test_a_highlight_is_not_taken_for_the_limb():
     assert highlight.mean() > 0.85
     at = located(less, 0.7)
     off = at.position - made.truth
-    assert rms(off[at.found & highlight]) > 0.9
-    assert rms(off[at.found & ~highlight]) < 0.3
+    assert rms(off[at.valid & highlight]) > 0.9
+    assert rms(off[at.valid & ~highlight]) < 0.3
 
 
 def test_what_lies_beyond_a_highlights_middle_is_left_out():
@@ -297,11 +297,11 @@ def test_what_lies_beyond_a_highlights_middle_is_left_out():
     less, highlight = without_highlights(made.profiles, {0: 0.7})
     assert np.mean(less.cut > made.profiles.cut) > 0.9
     cut, whole = located(less, 0.7), located(made.profiles, 0.7)
-    off, before = (np.abs(at.position - made.truth)[at.found] for at in (cut, whole))
-    assert cut.found.sum() > whole.found.sum()
+    off, before = (np.abs(at.position - made.truth)[at.valid] for at in (cut, whole))
+    assert cut.valid.sum() > whole.valid.sum()
     assert np.mean(off > 0.5) < 0.5 * np.mean(before > 0.5)
     assert rms(off) < 0.7 * rms(before)
-    assert rms(off[~highlight[cut.found]]) < 0.8 * rms(off)
+    assert rms(off[~highlight[cut.valid]]) < 0.8 * rms(off)
 
 
 def test_diffuse_light_is_kept():
@@ -349,7 +349,7 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
     grey = np.stack([np.interp(profile_offsets() - t, PLACE, level) for t in truth])
     profiles = plain(grey, 12.0)
     at = located(profiles, blur)
-    assert at.found.all()
+    assert at.valid.all()
     np.testing.assert_allclose(at.position, truth, atol=0.014)
 
 
@@ -368,7 +368,7 @@ def test_where_there_is_no_edge_none_is_found():
     for noise in (0.2, 1.0, 5.0):
         grey = 120 + noise * rng.normal(size=(200, len(profile_offsets())))
         flat = plain(grey, 12.0)
-        assert located(flat, 0.7).found.mean() < 0.01
+        assert located(flat, 0.7).valid.mean() < 0.01
 
 
 @pytest.mark.parametrize("away", [-2.5, -1.7, 1.7])
@@ -376,4 +376,4 @@ def test_an_edge_out_of_reach_is_not_found(away):
     level = blurred(Limb(12, 0.8, 200, 30, 0.0).brightness(), 0.7)
     grey = np.interp(profile_offsets() - away, PLACE, level)[None]
     alone = plain(grey, 12.0)
-    assert not located(alone, 0.7).found.any()
+    assert not located(alone, 0.7).valid.any()

@@ -84,29 +84,29 @@ def test_help_names_every_argument_with_its_type(name):
 # what shows itself
 
 
-def objects_of(value, name, depth, seen):
+def objects_of(value, name, depth, in_view):
     """pkmcal's objects that a person comes across behind a name."""
     yield name, value
     for attribute in dir(value):
         if depth and not attribute.startswith("_") and is_dataclass(value):
             other = getattr(value, attribute)
             inside = type(other).__module__.startswith("pkmcal") and not callable(other)
-            if inside and type(other) not in seen:
-                seen.add(type(other))
-                yield from objects_of(other, f"{name}.{attribute}", depth - 1, seen)
+            if inside and type(other) not in in_view:
+                in_view.add(type(other))
+                yield from objects_of(other, f"{name}.{attribute}", depth - 1, in_view)
 
 
 def test_reprs_are_short(result, loaded, planned):
     tool = result.tool_error(result.estimate.state.T_base_platform)
-    seen = set()
+    in_view = set()
     for name, value in {
         "result": result, "loaded": loaded, "session": result.session, "machine": result.machine,
         "camera": result.session.stations[0].camera, "tool": tool, "plan": planned,
     }.items():  # fmt: skip
-        for path, found in objects_of(value, name, 3, seen):
+        for path, item in objects_of(value, name, 3, in_view):
             most = 1200 if path.endswith(".parameters") else LONGEST
-            assert len(repr(found)) <= most, path
-    assert len(seen) > 20
+            assert len(repr(item)) <= most, path
+    assert len(in_view) > 20
     assert repr(result.machine) == (
         "<Machine gough-stewart: spatial, 6 legs, 6 readings, 60 parameters>"
     )
@@ -163,20 +163,20 @@ def test_what_a_notebook_shows_is_escaped(loaded):
 
 
 def test_parameters_are_a_table(result, loaded):
-    found = result.parameters
+    value = result.parameters
     table = result.machine.parameters
-    assert [row.name for row in found] == list(table.names)
-    assert np.array_equal([row.value for row in found], result.machine.values)
-    assert np.array_equal([row.drawing for row in found], result.session.machine.values)
+    assert [row.name for row in value] == list(table.names)
+    assert np.array_equal([row.value for row in value], result.machine.values)
+    assert np.array_equal([row.drawing for row in value], result.session.machine.values)
     variance = np.diag(result.estimate.covariance)
-    assert np.allclose([row.sigma**2 for row in found], variance, atol=1e-30)
-    row = found["legs[2].base.center.x"]
-    assert row == found[table.index("legs[2].base.center.x")]
+    assert np.allclose([row.sigma**2 for row in value], variance, atol=1e-30)
+    row = value["legs[2].base.center.x"]
+    assert row == value[table.index("legs[2].base.center.x")]
     assert row.change == row.value - row.drawing
-    assert [r.value for r in loaded.parameters] == [r.value for r in found]
-    assert [r.decided_by for r in loaded.parameters] == [r.decided_by for r in found]
+    assert [r.value for r in loaded.parameters] == [r.value for r in value]
+    assert [r.decided_by for r in loaded.parameters] == [r.decided_by for r in value]
     with pytest.raises(InputError, match=r"such as 'legs\[2\].base.center.x'"):
-        found["legs[2].base.centre.x"]
+        value["legs[2].base.centre.x"]
 
 
 def test_a_table_is_short_as_a_repr_and_whole_when_printed(result):
@@ -370,11 +370,11 @@ def test_images_are_of_the_size_that_the_options_say():
 def test_the_command_plans_what_the_function_plans(demo, quick_plans, tmp_path, subject, n):
     subject = demo.session if subject == "session" else subject
     done = run("plan", subject, "-n", n, "-o", tmp_path / "out", "--json")
-    found = pkmcal.plan(subject, count=n)
-    assert done.json["promised"]["position"] == found.promised.position
+    value = pkmcal.plan(subject, count=n)
+    assert done.json["promised"]["position"] == value.promised.position
     table = read_csv(tmp_path / "out" / "plan.csv")
-    assert table.names == found.names
-    np.testing.assert_allclose(table.values, found.joints, atol=1e-6)
+    assert table.names == value.names
+    np.testing.assert_allclose(table.values, value.joints, atol=1e-6)
 
 
 def test_the_command_simulates_what_the_function_simulates(tmp_path):
@@ -391,16 +391,16 @@ def test_the_command_simulates_what_the_function_simulates(tmp_path):
 def test_the_command_studies_what_the_function_studies(tmp_path, one_process):
     done = run("study", "a", "--runs", 2, "-o", tmp_path / "out", "--json")
     (combination,) = done.json["combinations"]
-    (found,) = pkmcal.study("a", runs=2).found
-    assert combination["position"]["value"] == found.position.value
-    assert combination["chi2"] == found.chi2
+    (value,) = pkmcal.study("a", runs=2).found
+    assert combination["position"]["value"] == value.position.value
+    assert combination["chi2"] == value.chi2
 
 
 def test_the_command_calibrates_what_the_function_calibrates(tmp_path):
     (tmp_path / "printer.cfg").write_text(calibrated_cfg())
     assert run("new", tmp_path / "kit", "--printer", tmp_path / "printer.cfg").code == 0
     done = run("calibrate", tmp_path / "kit", "--json")
-    found = pkmcal.calibrate(tmp_path / "kit")
+    value = pkmcal.calibrate(tmp_path / "kit")
     saved = pkmcal.load_result(tmp_path / "kit" / "calibration")
-    np.testing.assert_array_equal(saved.machine.values, found.machine.values)
-    assert done.json["verdict"]["headline"] == found.verdict.headline
+    np.testing.assert_array_equal(saved.machine.values, value.machine.values)
+    assert done.json["verdict"]["headline"] == value.verdict.headline

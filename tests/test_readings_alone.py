@@ -74,15 +74,15 @@ def estimate(drawing, joints, noise):
     return bundle(drawing, given, start_state(drawing, given, np.zeros((0, 4, 4))))
 
 
-def whitened(found, truth):
+def whitened(value, truth):
     """The parameters' errors in the result's frames, along the covariance's axes, in sigmas."""
     from pkmcal.identify.gauge import default_gauge, in_gauge
 
-    drawing = found.machine.with_values(found.machine.parameters.drawing)
-    true = in_gauge(drawing, replace(found.state, theta=truth.values), default_gauge(drawing)).theta
-    error, c = found.machine.values - true, found.covariance
-    known = np.flatnonzero(np.diag(c) > 0)
-    error, c = error[known], c[np.ix_(known, known)]
+    drawing = value.machine.with_values(value.machine.parameters.drawing)
+    true = in_gauge(drawing, replace(value.state, theta=truth.values), default_gauge(drawing)).theta
+    error, c = value.machine.values - true, value.covariance
+    above_limit = np.flatnonzero(np.diag(c) > 0)
+    error, c = error[above_limit], c[np.ix_(above_limit, above_limit)]
     scale = np.sqrt(np.diag(c))
     values, vectors = np.linalg.eigh(c / np.outer(scale, scale))
     keep = values > 1e-9
@@ -110,16 +110,16 @@ def test_the_truth_is_within_the_stated_deviations(make, noise, n):
         joints = truth.inverse(poses)
         joints = joints + noise * rng.standard_normal(joints.shape)
         stated = (3.0, 1 / 3, 1.0)[run % 3]
-        found = estimate(drawing, joints, noise * stated)
-        errors.append(whitened(found, truth))
-        scales.append(found.statistics.reading_scale * stated)
-        low, high = found.statistics.reading_range
+        value = estimate(drawing, joints, noise * stated)
+        errors.append(whitened(value, truth))
+        scales.append(value.statistics.reading_scale * stated)
+        low, high = value.statistics.reading_range
         assert low < 1 / stated < high
     errors = np.array(errors)
     # the noise's own uncertainty, some five per cent, widens both a little
     assert np.mean(errors**2) == pytest.approx(1, abs=4 * np.sqrt(2 / errors.size) + 0.05)
     assert np.mean(np.abs(errors) < 1.96) == pytest.approx(0.95, abs=0.04)
-    dof = found.statistics.dof_joints
+    dof = value.statistics.dof_joints
     assert np.mean(scales) == pytest.approx(1, abs=4 / np.sqrt(2 * dof * len(scales)))
 
 
@@ -133,10 +133,10 @@ def test_without_a_drawing_worth_the_name():
     rng = np.random.default_rng(4)
     truth = true_machine(drawing, 0.2, rng)
     joints = readings(truth, 25, rng)
-    found = estimate(drawing, joints, 1e-6)
-    np.testing.assert_allclose(whitened(found, truth), 0, atol=1e4)
+    values = estimate(drawing, joints, 1e-6)
+    np.testing.assert_allclose(whitened(values, truth), 0, atol=1e4)
     a = truth.base_centers()
-    b = found.machine.base_centers()
+    b = values.machine.base_centers()
 
     def sides(x):
         return np.linalg.norm(x[:, None] - x[None], axis=-1)
@@ -183,8 +183,8 @@ def test_a_session_of_readings_is_calibrated_from_the_command_line(belts):
     assert out["statistics"]["reading_scale"] == pytest.approx(10, rel=0.25)
     low, high = out["statistics"]["reading_range"]
     assert low < 10 < high
-    (told,) = [text for text in out["verdict"]["warnings"] if "scatter" in text]
-    assert "joints.noise in session.yaml says 0.1 mm" in told
+    (rows,) = [text for text in out["verdict"]["warnings"] if "scatter" in text]
+    assert "joints.noise in session.yaml says 0.1 mm" in rows
     values = {p["name"]: p for p in out["parameters"]}
     width = values["legs[2].base.center.x"]
     true = truth.base_centers()
@@ -222,12 +222,12 @@ def test_repeats_of_a_pose_count_once(tmp_path):
     session = load_session(write(tmp_path / "repeats", drawing, again, NOISE))
     assert session.configurations == tuple(f"{4 * k:03d}" for k in range(20))
     np.testing.assert_allclose(session.joints, again.reshape(20, 4, 4).mean(axis=1), atol=1e-15)
-    (told,) = session.findings
-    assert told.code == "readings.repeated_poses"
-    assert (told.facts["number"], told.facts["poses"]) == (80, 20)
+    (values,) = session.findings
+    assert values.code == "readings.repeated_poses"
+    assert (values.facts["number"], values.facts["poses"]) == (80, 20)
     once = calibrate_session(write(tmp_path / "once", drawing, joints, NOISE)).estimate
-    found = calibrate_session(session).estimate
-    sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, found)]
+    calibration = calibrate_session(session).estimate
+    sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, calibration)]
     assert sigma[1] == pytest.approx(sigma[0], rel=0.1)
 
 
@@ -246,9 +246,9 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
     drawing, rng = load_mechanism("four-belt"), np.random.default_rng(8)
     joints = readings(drawing, 20, rng)
     joints = joints + 0.01 * rng.standard_normal(joints.shape)
-    found = calibrate_session(write(tmp_path / "wild", drawing, joints, NOISE))
-    assert not found.verdict.usable
-    assert found.verdict.of("readings.noise_beyond_tolerance")
+    calibration = calibrate_session(write(tmp_path / "wild", drawing, joints, NOISE))
+    assert not calibration.verdict.usable
+    assert calibration.verdict.of("readings.noise_beyond_tolerance")
 
 
 def test_what_needs_a_camera_says_so(belts):

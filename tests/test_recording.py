@@ -29,8 +29,8 @@ def entries(calibrated):
 
 def of(entries, *path, at=None):
     """What was logged at a path, the newest up to a configuration, as a viewer shows it."""
-    found = [e for e in entries if e.path == path and (e.at is None or at is None or e.at <= at)]
-    return found[-1]
+    results = [e for e in entries if e.path == path and (e.at is None or at is None or e.at <= at)]
+    return results[-1]
 
 
 def image(station, *part):
@@ -45,13 +45,13 @@ def decoded(entry):
 def test_every_photograph_is_there_in_its_place(calibrated, entries):
     session = calibrated.session
     for station in session.stations:
-        shown = {e.at: e for e in entries if e.path == image(station.name, "photograph")}
-        assert sorted(shown) == list(range(1, len(session.configurations) + 1))
+        display = {e.at: e for e in entries if e.path == image(station.name, "photograph")}
+        assert sorted(display) == list(range(1, len(session.configurations) + 1))
         taken = {p.configuration + 1: p for p in station.photographs}
-        assert {e.kind for e in shown.values()} == {"photograph"}
-        assert {at for at, e in shown.items() if decoded(e).any()} == set(taken)
+        assert {e.kind for e in display.values()} == {"photograph"}
+        assert {at for at, e in display.items() if decoded(e).any()} == set(taken)
         at, photo = next(iter(taken.items()))
-        grey = decoded(shown[at])
+        grey = decoded(display[at])
         truth = decode(photo.path, station.camera.image_size, "photograph")
         assert np.abs(grey.astype(float) - truth).mean() < 2  # grey levels, of JPEG
 
@@ -82,9 +82,9 @@ def seen(calibrated, entries, name, points):
 def apart(strip, line):
     """How far (px) a strip's ends and middle are from the nearest part of a line of many points."""
     points = strip[[0, len(strip) // 2, -1]][:, None]
-    start, way = line[:-1], np.diff(line, axis=0)
-    share = np.sum((points - start) * way, axis=-1) / np.sum(way**2, axis=-1)
-    nearest = start + np.clip(share, 0, 1)[..., None] * way
+    start, direction = line[:-1], np.diff(line, axis=0)
+    share = np.sum((points - start) * direction, axis=-1) / np.sum(direction**2, axis=-1)
+    nearest = start + np.clip(share, 0, 1)[..., None] * direction
     return np.linalg.norm(points - nearest, axis=-1).min(axis=1).max()
 
 
@@ -130,10 +130,10 @@ def test_edges_put_aside_are_apart(calibrated):
     entries = list(recorded(doubted))
     station = calibrated.session.stations[edges.station[n]].name
     at = edges.configuration[n] + 1
-    aside = of(entries, *image(station, "aside"), at=at).values
-    assert len(aside["strips"]) == 1
-    assert aside["colours"] == [RECORDED_GREY]
-    (label,) = aside["labels"]
+    offset = of(entries, *image(station, "aside"), at=at).values
+    assert len(offset["strips"]) == 1
+    assert offset["colours"] == [RECORDED_GREY]
+    (label,) = offset["labels"]
     assert label.startswith(f"leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}")
     assert label.endswith("weight 0.20")
 
@@ -141,8 +141,8 @@ def test_edges_put_aside_are_apart(calibrated):
 def test_poses_and_numbers_are_the_calibrations(calibrated, entries):
     estimate = calibrated.estimate
     for k, T in enumerate(estimate.state.T_base_platform):
-        told = of(entries, "machine", "platform", at=k + 1)
-        np.testing.assert_array_equal(told.values["T"], T)
+        items = of(entries, "machine", "platform", at=k + 1)
+        np.testing.assert_array_equal(items.values["T"], T)
         points = of(entries, "machine", "calibrated", "centres", at=k + 1).values["points"]
         np.testing.assert_allclose(points[:6], estimate.machine.base_centers(), atol=1e-15)
         values = [
@@ -242,23 +242,23 @@ def test_rerun_reads_what_was_recorded(calibrated, entries, tmp_path):
     rows: dict[str, list[dict]] = {}
     for part in reader.stream().to_chunks():
         batch = part.to_record_batch()
-        kept = [name for name in batch.schema.names if name != "log_time"]
-        rows.setdefault(part.entity_path, []).extend(batch.select(kept).to_pylist())
+        retained = [name for name in batch.schema.names if name != "log_time"]
+        rows.setdefault(part.entity_path, []).extend(batch.select(retained).to_pylist())
     wanted = {"/" + "/".join(e.path) for e in entries}
     assert wanted <= set(rows)
     name = calibrated.session.stations[0].name
-    found = rows[f"/machine/cameras/{name}/image/photograph"]
+    results = rows[f"/machine/cameras/{name}/image/photograph"]
     blobs = {
         row["configuration"]: row["EncodedImage:blob"]
-        for row in found
+        for row in results
         if row.get("EncodedImage:blob")
     }
-    told = {
+    values = {
         e.at: e.values["jpeg"]
         for e in entries
         if e.path == image(name, "photograph") and e.kind == "photograph"
     }
-    assert {at: bytes(blob[0]) for at, blob in blobs.items()} == told
+    assert {at: bytes(blob[0]) for at, blob in blobs.items()} == values
     for row in rows["/machine/calibrated"]:
         strips = of(entries, "machine", "calibrated", at=row["configuration"]).values["strips"]
         np.testing.assert_allclose(

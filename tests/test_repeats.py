@@ -14,8 +14,8 @@ from pkmcal.calibration.repeats import (
     Cylinders,
     RepeatStudy,
     _findings,
-    _Look,
     _station_row,
+    _StationEdges,
     axis_coordinates,
     by_ends,
     fit_motions,
@@ -114,8 +114,8 @@ def test_medians_and_exchanges_stay_inside_their_group():
 
 
 def test_a_look_without_repeats_is_left_as_it_is(machine, poses):
-    look = look_of(edges_of(machine, poses[:3]))
-    assert combined(look) is look
+    edges = look_of(edges_of(machine, poses[:3]))
+    assert combined(edges) is edges
 
 
 def test_repeats_become_one_edge_at_their_mean_and_keep_their_points(machine, poses):
@@ -140,11 +140,11 @@ def test_the_scatter_is_measured_by_leg(machine, poses):
     pixels = np.where(edges.leg == 2, 0.3, 0.05)[:, None]
     many = repeated(edges, 4, pixels, np.random.default_rng(0))
     groups = same_edges(many)
-    found = np.sqrt(repeat_scatter(many, groups)[:, [0, 1], [0, 1]])
-    found /= pixel_units(edges.select(same_edges(edges).first))
+    values = np.sqrt(repeat_scatter(many, groups)[:, [0, 1], [0, 1]])
+    values /= pixel_units(edges.select(same_edges(edges).first))
     leg = many.leg[groups.first]
-    assert np.sqrt(np.mean(found[leg == 2] ** 2)) == pytest.approx(0.3, rel=0.06)
-    assert np.sqrt(np.mean(found[(leg != 2)] ** 2)) == pytest.approx(0.05, rel=0.06)
+    assert np.sqrt(np.mean(values[leg == 2] ** 2)) == pytest.approx(0.3, rel=0.06)
+    assert np.sqrt(np.mean(values[(leg != 2)] ** 2)) == pytest.approx(0.05, rel=0.06)
 
 
 @pytest.mark.parametrize(
@@ -201,10 +201,10 @@ def test_a_bad_repeat_is_left_out_and_told(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 5, 0.02, np.random.default_rng(0))
     good, bad = combined(look_of(many)), combined(look_of(spoiled(many, [7], 1.0)))
-    (told,) = bad.rejected
-    assert (told.configuration, told.leg, told.tube, told.side) == tuple(keys(many)[7])
-    assert told.reason.startswith("a repeat lies 9.")
-    assert told.reason.endswith("standard deviations from the others, which are used without it")
+    (values,) = bad.rejected
+    assert (values.configuration, values.leg, values.tube, values.side) == tuple(keys(many)[7])
+    assert values.reason.startswith("a repeat lies 9.")
+    assert values.reason.endswith("standard deviations from the others, which are used without it")
     assert 7 not in bad.points[:, 0]
     assert len(bad.points) == len(many) - 1
     off = np.linalg.norm(good.edges.normal - bad.edges.normal, axis=1)
@@ -215,9 +215,9 @@ def test_repeats_without_a_majority_are_left_out(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 2, 0.02, np.random.default_rng(0))
     one = combined(look_of(spoiled(many, [7], 1.0)))
-    (told,) = one.rejected
-    assert told.reason.startswith("its repeats lie up to 4.9 ")
-    assert told.reason.endswith("standard deviations off, and no majority agrees")
+    (values,) = one.rejected
+    assert values.reason.startswith("its repeats lie up to 4.9 ")
+    assert values.reason.endswith("standard deviations off, and no majority agrees")
     assert len(one.edges) == len(edges) - 1
     assert len(one.points) == len(many) - 2
 
@@ -227,8 +227,8 @@ def test_an_edge_that_shows_now_and_then_is_left_out(machine, poses):
     many = repeated(edges, 4, 0.02, np.random.default_rng(0))
     late = np.arange(len(many)) >= 2 * len(edges)
     one = combined(look_of(many.select(~((keys(many) == keys(many)[7]).all(axis=1) & late))))
-    (told,) = one.rejected
-    assert told.reason == "seen in only 2 of 4 repeats"
+    (values,) = one.rejected
+    assert values.reason == "seen in only 2 of 4 repeats"
     assert len(one.edges) == len(edges) - 1
 
 
@@ -263,22 +263,22 @@ def cylinders_of(machine, poses, edges):
 def test_a_fitted_axis_is_where_the_leg_went(machine, poses):
     poses = poses[:6]
     both_poses = poses, perturb(poses, np.full(6, 1e-5))
-    edges, moved = (edges_of(machine, p, shift=1e-9) for p in both_poses)
+    edges, shifted = (edges_of(machine, p, shift=1e-9) for p in both_poses)
     cylinders, other = (cylinders_of(machine, p, edges) for p in both_poses)
-    assert np.array_equal(keys(edges), keys(moved))
-    turn = np.einsum("nij,ni->nj", edges.basis, moved.normal - edges.normal)
+    assert np.array_equal(keys(edges), keys(shifted))
+    turn = np.einsum("nij,ni->nj", edges.basis, shifted.normal - edges.normal)
     groups = groups_of(edges.configuration, edges.leg)
     whiten = np.broadcast_to(np.eye(2), (len(edges), 2, 2))
     fit = fit_motions(turn, by_ends(edges, edges.basis, cylinders), whiten, groups)
     sides = groups.total(edges.side[:, None] == np.array([0, 1]))
     both = (sides > 0).all(axis=1)
     first = groups.first
-    found = axis_coordinates(fit.motion, cylinders.a[first], cylinders.b[first])[both]
+    value = axis_coordinates(fit.motion, cylinders.a[first], cylinders.b[first])[both]
     true = to_coordinates(other.a[first], other.b[first])
     true = (true - to_coordinates(cylinders.a[first], cylinders.b[first]))[both]
-    known = np.isfinite(found).all(axis=1)
-    assert known.sum() > 20
-    assert np.abs(found - true)[known].max() < 0.05 * np.abs(true[known]).max()
+    finite = np.isfinite(value).all(axis=1)
+    assert finite.sum() > 20
+    assert np.abs(value - true)[finite].max() < 0.05 * np.abs(true[finite]).max()
 
 
 def motion_look(machine, poses, edges, rng):
@@ -293,7 +293,7 @@ def motion_look(machine, poses, edges, rng):
     turn = np.einsum("nij,ni->nj", many.basis[reference], many.normal - many.normal[reference])
     turn -= same.mean(turn)[same.member]
     cylinders = cylinders_of(machine, poses, many)
-    return _Look(0, many, photo, cylinders, same, turn, many.basis[reference], 0)
+    return _StationEdges(0, many, photo, cylinders, same, turn, many.basis[reference], 0)
 
 
 def shaken_machine(machine, rng):
@@ -311,24 +311,24 @@ def test_what_moves_between_repeats_is_recognised(machine, poses, cause):
 
     def edges(_repeat):
         if cause == "camera":
-            moved = perturb(np.eye(4), twist * rng.standard_normal(6))
-            return edges_of(machine, poses, moved @ STATION)
+            shifted = perturb(np.eye(4), twist * rng.standard_normal(6))
+            return edges_of(machine, poses, shifted @ STATION)
         if cause == "platform":
             return edges_of(machine, perturb(poses, 3e-4 * rng.standard_normal((5, 6))))
         if cause == "legs":
             return edges_of(shaken_machine(machine, rng), poses)
         return edges_of(machine, poses)
 
-    found = _station_row(motion_look(machine, poses, edges, rng), "front")
-    assert found.cause == cause
+    value = _station_row(motion_look(machine, poses, edges, rng), "front")
+    assert value.cause == cause
     if cause == "noise":
-        assert abs(found.camera) < 0.05
-        assert abs(found.platform) < 0.05
-        assert abs(found.legs) < 0.1
-        assert found.shift == pytest.approx(0.02, rel=0.1)
-        assert found.promised == pytest.approx(0.2, rel=0.5)
+        assert abs(value.camera) < 0.05
+        assert abs(value.platform) < 0.05
+        assert abs(value.legs) < 0.1
+        assert value.shift == pytest.approx(0.02, rel=0.1)
+        assert value.promised == pytest.approx(0.2, rel=0.5)
     else:
-        assert getattr(found, cause) > 0.5
+        assert getattr(value, cause) > 0.5
 
 
 def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
@@ -336,12 +336,12 @@ def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
     rng = np.random.default_rng(8)
     one_tube = edges_of(machine, poses[:5])
     one_tube = one_tube.select(one_tube.tube == 0)
-    look = motion_look(machine, poses[:5], lambda _repeat: one_tube, rng)
-    found = _station_row(look, "front")
-    assert found.legs == 0.0
-    assert found.cause == "noise"
+    edges = motion_look(machine, poses[:5], lambda _repeat: one_tube, rng)
+    count = _station_row(edges, "front")
+    assert count.legs == 0.0
+    assert count.cause == "noise"
     with np.errstate(all="raise"):
-        still = _station_row(replace(look, turn=0 * look.turn), "front")
+        still = _station_row(replace(edges, turn=0 * edges.turn), "front")
     assert (still.camera, still.platform, still.legs, still.cause) == (0.0, 0.0, 0.0, "noise")
 
 
@@ -387,8 +387,8 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
         path.unlink()
     one, four = calibrate_session(single), looked.calibration
     sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
-    known = sigma[0] > 1e-9
-    assert 0.7 < np.median(sigma[1][known] / sigma[0][known]) < 1.1
+    above_limit = sigma[0] > 1e-9
+    assert 0.7 < np.median(sigma[1][above_limit] / sigma[0][above_limit]) < 1.1
     result = compare_with_truth(four, repeats)
     assert result.within / result.count > 0.85
     edges = four.observation.edges
@@ -432,56 +432,59 @@ def once(looked, checked, monkeypatch):
 
 @pytest.mark.usefixtures("once")
 def test_check_repeat_gives_table_1(repeats):
-    told = run("check", repeats, "--repeat")
-    assert told.code == run("check", repeats).code
-    assert "upper bound" in told.out
-    row = next(line for line in told.out.splitlines() if line.startswith("[A] Table 1"))
+    values = run("check", repeats, "--repeat")
+    assert values.code == run("check", repeats).code
+    assert "upper bound" in values.out
+    row = next(line for line in values.out.splitlines() if line.startswith("[A] Table 1"))
     assert row.split()[3:] == ["0.05°", "0.06°", "0.05", "mm", "0.1", "mm"]
-    assert "neither the camera nor the machine moves: sensor noise" in " ".join(told.out.split())
-    assert "more repeats will hardly help" in " ".join(told.out.split())
+    assert "neither the camera nor the machine moves: sensor noise" in " ".join(values.out.split())
+    assert "more repeats will hardly help" in " ".join(values.out.split())
 
 
 @pytest.mark.usefixtures("once")
 def test_check_repeat_as_json(repeats):
-    plain, told = run("check", repeats, "--json").json, run("check", repeats, "--repeat", "--json")
-    found = told.json["repeats"]
+    plain, values = (
+        run("check", repeats, "--json").json,
+        run("check", repeats, "--repeat", "--json"),
+    )
+    value = values.json["repeats"]
     assert "repeats" not in plain
-    assert {k: v for k, v in told.json.items() if k != "repeats"} == plain
-    assert found["paper"]["psi"] == pytest.approx(np.radians(0.05))
-    legs = found["legs"]
+    assert {k: v for k, v in values.json.items() if k != "repeats"} == plain
+    assert value["paper"]["psi"] == pytest.approx(np.radians(0.05))
+    legs = value["legs"]
     assert {(row["station"], row["leg"]) for row in legs} == {
         (f"station{s}", leg) for s in (1, 2) for leg in range(1, 7)
     }
     for name in ("psi", "theta", "x", "z", "shift", "tilt"):
-        known = [row[name] for row in legs if row[name] is not None]
-        assert found["bound"][name] == max(known)
+        reference_values = [row[name] for row in legs if row[name] is not None]
+        assert value["bound"][name] == max(reference_values)
     # a pixel's noise of a few grey levels' share: hundredths of a pixel an edge
-    assert 0.005 < found["middle"]["shift"] < 0.08
+    assert 0.005 < value["middle"]["shift"] < 0.08
     assert all(0 < row["promised"] < 1 for row in legs)
-    assert [s["cause"] for s in found["stations"]] == ["noise", "noise"]
+    assert [s["cause"] for s in value["stations"]] == ["noise", "noise"]
 
 
 def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
-    told = run("check", folder, "--repeat", "--json")
-    assert told.code == 1
-    (station,) = told.json["repeats"]["stations"]
+    values = run("check", folder, "--repeat", "--json")
+    assert values.code == 1
+    (station,) = values.json["repeats"]["stations"]
     assert station["cause"] == "camera"
     assert station["camera"] > 0.7
     assert station["promised"] > 1
-    text = told.json["repeats"]["findings"][0]["text"]
+    text = values.json["repeats"]["findings"][0]["text"]
     assert "as if the camera moved: fix the camera" in text
 
 
 def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
-    told = run("check", demo.session, "--repeat")
-    assert told.code == 2
-    assert "the session has no repeated photographs" in told.err
-    assert "images/station1/{configuration}_{repeat}.png" in told.err
-    assert "images/station1/0001_1.png" in told.err
+    values = run("check", demo.session, "--repeat")
+    assert values.code == 2
+    assert "the session has no repeated photographs" in values.err
+    assert "images/station1/{configuration}_{repeat}.png" in values.err
+    assert "images/station1/0001_1.png" in values.err
 
 
 def test_repeats_are_asked_of_cameras_that_stand(demo):
@@ -498,9 +501,9 @@ def test_repeats_are_asked_of_cameras_that_stand(demo):
 
 def test_check_repeat_of_a_broken_session_says_what_is_broken(session):
     (session / "joints.csv").unlink()
-    told = run("check", session, "--repeat", "--json")
-    assert told.code == 2
-    assert told.json["repeats"] is None
+    values = run("check", session, "--repeat", "--json")
+    assert values.code == 2
+    assert values.json["repeats"] is None
 
 
 def test_points_on_an_edge_project_where_the_turn_says(machine, poses):
@@ -510,7 +513,7 @@ def test_points_on_an_edge_project_where_the_turn_says(machine, poses):
     a, u = (v[edges.configuration, edges.leg] for v in (legs.a, legs.u))
     middle = a + edges.span.mean(axis=1)[:, None] * u
     ray = middle / np.linalg.norm(middle, axis=1)[:, None]
-    moved = turned(edges, pixel_units(edges) * [1.0, 0.0])
-    offset = [np.arcsin(dot(e.normal, ray)) for e in (edges, moved)]
+    shifted = turned(edges, pixel_units(edges) * [1.0, 0.0])
+    offset = [np.arcsin(dot(e.normal, ray)) for e in (edges, shifted)]
     pixel = 1 / CAMERA.parameters[0]
     assert np.allclose(np.abs(offset[1] - offset[0]), pixel, rtol=0.4)

@@ -15,14 +15,14 @@ from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.found import found_parameters
+from pkmcal.identify.parameter_estimates import parameter_estimates
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import wrong
-from pkmcal.pages import drawn
+from pkmcal.pages import overlays
 from pkmcal.pages.charts import enlargement, ticks_between
-from pkmcal.pages.drawn import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
+from pkmcal.pages.overlays import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from test_report_case import OUTWARD, RADIUS, Case, calibration, edges_of, make_case
@@ -59,13 +59,13 @@ def test_ticks_are_round_and_inside():
 # ------------------------------------------------------------------ parameters
 
 
-def found_of(case):
+def findings_of(case):
     e = case.estimate
-    return found_parameters(case.session.machine.values, e.machine, e.covariance, e.data_share)
+    return parameter_estimates(case.session.machine.values, e.machine, e.covariance, e.data_share)
 
 
 def test_table_rows_carry_value_change_and_sigma(case):
-    rows = {r.name: r for g in parameters.parameter_groups(found_of(case))
+    rows = {r.name: r for g in parameters.parameter_groups(findings_of(case))
             for r in g.rows}  # fmt: skip
     row = rows["legs[2].base.center.x"]
     k = case.session.machine.parameters.index(row.name)
@@ -94,21 +94,21 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
     )  # fmt: skip
     refused = Verdict(False, "Not to be used.", (wrong("edges.misfit", scale=5.0),))
     estimate = replace(case.estimate, statistics=noisy)
-    found = report_of(calibration(case.session, case.observation, estimate, refused))
-    (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
+    value = report_of(calibration(case.session, case.observation, estimate, refused))
+    (card,) = (card for card in value.figures if card.question.startswith("Does the model"))
     assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
     assert "1.04 after the edges' stated noise was multiplied by 7.00" in card.note
-    assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
+    assert value.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
     plain = replace(noisy, noise_scale=1.0)
     estimate = replace(estimate, statistics=plain)
-    found = report_of(calibration(case.session, case.observation, estimate, refused))
-    (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
+    value = report_of(calibration(case.session, case.observation, estimate, refused))
+    (card,) = (card for card in value.figures if card.question.startswith("Does the model"))
     assert card.values == (("1.04", "χ² per degree of freedom"),)
     assert "multiplied" not in card.note
 
 
 def test_groups_follow_the_legs(case):
-    groups = parameters.parameter_groups(found_of(case))
+    groups = parameters.parameter_groups(findings_of(case))
     assert [g.leg for g in groups] == [1, 2, 3, 4, 5, 6]
     assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
 
@@ -119,9 +119,9 @@ def test_what_can_hardly_be_told_apart_is_said_in_words(case):
             for p in ("platform.center.z", "length.offset"))  # fmt: skip
     covariance[i, j] = covariance[j, i] = -0.98 * covariance[i, i]
     estimate = with_covariance(case.estimate, covariance)
-    (said,) = parameters.bound_together(estimate)
-    assert said.startswith("Leg 6 platform centre z and leg 6 length offset move together")
-    assert "their sum is known far better" in said
+    (text,) = parameters.bound_together(estimate)
+    assert text.startswith("Leg 6 platform centre z and leg 6 length offset move together")
+    assert "their sum is known far better" in text
 
 
 # ------------------------------------------------------------------ uncertainty
@@ -134,10 +134,10 @@ def test_pose_covariance_agrees_with_forward_kinematics(case):
     sigma = np.sqrt(np.diag(case.estimate.covariance))
     columns = []
     for k in range(sigma.size):  # one parameter at a time by its own standard deviation
-        moved = machine.with_values(machine.values + sigma * (np.arange(sigma.size) == k))
+        shifted = machine.with_values(machine.values + sigma * (np.arange(sigma.size) == k))
         start = state.T_base_platform[0]
-        found = moved.forward(case.session.joints[:1], start)[0]
-        columns.append(pose_difference(found, start))
+        forward_kinematics = shifted.forward(case.session.joints[:1], start)[0]
+        columns.append(pose_difference(forward_kinematics, start))
     expected = np.transpose(columns) @ np.array(columns)
     np.testing.assert_allclose(got, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
 
@@ -147,8 +147,8 @@ def test_uncertainty_does_not_depend_on_the_frame(case):
     index = machine.layout.base[0].index[:, :3]
     shift = np.zeros(len(machine.values))
     shift[index[:, 0]] = 1e-3  # a common shift of the base along x: a frame change
-    moved = with_covariance(case.estimate, case.estimate.covariance + np.outer(shift, shift))
-    once, twice = (free_of_gauge(e.machine, e.covariance) for e in (case.estimate, moved))
+    shifted = with_covariance(case.estimate, case.estimate.covariance + np.outer(shift, shift))
+    once, twice = (free_of_gauge(e.machine, e.covariance) for e in (case.estimate, shifted))
     np.testing.assert_allclose(once, twice, atol=1e-6 * once.max())
 
 
@@ -176,8 +176,8 @@ def test_errors_are_enlarged_by_a_round_factor():
 def test_camera_position_sigma(case):
     T, sigma = case.estimate.state.T_camera_base[0], np.array([1e-4] * 3 + [2e-4] * 3)
     rng = np.random.default_rng(0)
-    moved = perturb(T, sigma * rng.normal(size=(20000, 6)))
-    places = -(np.swapaxes(moved[:, :3, :3], 1, 2) @ moved[:, :3, 3:])[..., 0]
+    shifted = perturb(T, sigma * rng.normal(size=(20000, 6)))
+    places = -(np.swapaxes(shifted[:, :3, :3], 1, 2) @ shifted[:, :3, 3:])[..., 0]
     got = base_camera_covariance(T, np.diag(sigma**2))[3:, 3:]
     # 20 000 draws leave 1 % on a standard deviation
     np.testing.assert_allclose(np.sqrt(np.diag(got)), places.std(axis=0), rtol=0.03)
@@ -200,8 +200,8 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
     edges = edges_of(
         estimate.machine, state.T_camera_base, state.T_base_platform, session.joints, 0.0
     )
-    seen = replace(case.observation, edges=edges)
-    curves = pictures.edge_curves(calibration(session, seen, estimate), np.arange(len(edges)), 0)
+    in_view = replace(case.observation, edges=edges)
+    curves = pictures.edge_curves(calibration(session, in_view, estimate), np.arange(len(edges)), 0)
     legs = legs_in_camera(
         estimate.machine, state.T_camera_base[0], state.T_base_platform[0], session.joints[0]
     )
@@ -209,8 +209,8 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
     for n, curve in enumerate(curves):
         leg, radius = edges.leg[n], np.array(RADIUS[int(edges.tube[n])])
         along = np.linspace(*edges.span[n], EDGE_CURVE_POINTS)
-        seen = contour_point(legs.a[leg], legs.u[leg], edges.normal[n], radius, along)
-        np.testing.assert_allclose(curve, T.project(seen), atol=1e-6)
+        in_view = contour_point(legs.a[leg], legs.u[leg], edges.normal[n], radius, along)
+        np.testing.assert_allclose(curve, T.project(in_view), atol=1e-6)
 
 
 def test_joints_are_drawn_where_the_camera_sees_them(case):
@@ -237,12 +237,12 @@ def test_straight_curves_are_two_points_and_bent_ones_are_kept():
     begun, point = line.copy(), np.full((13, 2), np.nan)
     begun[:4], point[7] = np.nan, line[7]
     curves = np.stack([line, bent, begun, np.where(x[:, None] < 50, bent, np.nan), point])
-    found = drawn.straightened(curves)
-    assert found[0] == line[[0, -1]].tolist()
-    assert found[1] == bent.tolist()
-    assert found[2] == line[[4, -1]].tolist()
-    assert found[3] == bent[x < 50].tolist()
-    assert found[4] == [line[7].tolist()]
+    value = overlays.straightened(curves)
+    assert value[0] == line[[0, -1]].tolist()
+    assert value[1] == bent.tolist()
+    assert value[2] == line[[4, -1]].tolist()
+    assert value[3] == bent[x < 50].tolist()
+    assert value[4] == [line[7].tolist()]
 
 
 def album_of(case: Case, **changed) -> pictures.Album:
@@ -260,18 +260,20 @@ def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
     white = np.ones((len(edges), 2))
     white[(edges.station == 1) & (edges.configuration == 3)] = 5
     white[(edges.station == 2) & (edges.configuration == 4)] = 0.1
-    kept = ~((edges.station == 0) & (edges.configuration == 2))
+    retained = ~((edges.station == 0) & (edges.configuration == 2))
     estimate = replace(
-        case.estimate, edge_residuals=white[kept], edge_weights=case.estimate.edge_weights[kept]
+        case.estimate,
+        edge_residuals=white[retained],
+        edge_weights=case.estimate.edge_weights[retained],
     )
-    observation = replace(case.observation, edges=edges.select(kept))
-    shown = album_of(case, observation=observation, estimate=estimate).pictures
-    named = [(shot.station, shot.configuration) for shot in shown]
+    observation = replace(case.observation, edges=edges.select(retained))
+    display = album_of(case, observation=observation, estimate=estimate).pictures
+    named = [(shot.station, shot.configuration) for shot in display]
     assert len(set(named)) == len(named) == 15
     assert named[:2] == [("front0", "c2"), ("front1", "c3")]
     assert named[-1] == ("front2", "c4")
-    assert "nothing in use" in shown[0].caption
-    assert "residuals 5.00 σ" in shown[1].caption
+    assert "nothing in use" in display[0].caption
+    assert "residuals 5.00 σ" in display[1].caption
 
 
 def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
@@ -285,8 +287,8 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
         case.session.joints, 0.0,
     )  # fmt: skip
     one = np.flatnonzero((exact.leg == 2) & (exact.tube == 1) & (exact.side == 0))
-    seen = replace(case.observation, edges=exact)
-    curve = pictures.edge_curves(calibration(case.session, seen, case.estimate), one, 0)[0]
+    in_view = replace(case.observation, edges=exact)
+    curve = pictures.edge_curves(calibration(case.session, in_view, case.estimate), one, 0)[0]
     at = np.linspace(0, len(line.points) - 1, 4000)
     x, y = (np.interp(at, range(len(line.points)), c) for c in zip(*line.points, strict=True))
     away = np.hypot(curve[:, :1] - x, curve[:, 1:] - y).min(axis=1)
@@ -295,18 +297,18 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
 
 
 def test_as_many_pictures_are_shown_as_there_is_room_for(case, monkeypatch):
-    monkeypatch.setattr(pictures, "MOST_PHOTOGRAPHS_SHOWN", 7)
+    monkeypatch.setattr(pictures, "MOST_PAGE_IMAGES", 7)
     html = str(pictures.section(case.session, album_of(case)).html)
     assert "Here are 7 of 15 photographs" in html
     assert html.count('<figure class="picture"') == html.count("data-large=") == 7
     whole = sum(len(shot.jpeg) + len(shot.large) for shot in album_of(case).pictures)
     small = sum(len(shot.jpeg) for shot in album_of(case).pictures)
     monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", (whole + small) // 2)
-    shown = album_of(case).pictures
-    assert len(shown) == 7
-    assert 0 < sum(bool(shot.large) for shot in shown) < 7
+    display = album_of(case).pictures
+    assert len(display) == 7
+    assert 0 < sum(bool(shot.large) for shot in display) < 7
     assert (
-        sum(len(shot.jpeg) + len(shot.large) for shot in shown) <= pictures.JPEG_CHARACTERS_A_PAGE
+        sum(len(shot.jpeg) + len(shot.large) for shot in display) <= pictures.JPEG_CHARACTERS_A_PAGE
     )
     monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", small // 2)
     assert 0 < len(album_of(case).pictures) < 7
@@ -336,8 +338,8 @@ def test_expected_rms_holds_nineteen_of_twenty():
     rng = np.random.default_rng(3)
     for n in (4, 40):
         low, high = residuals.expected_rms(n)
-        found = np.sqrt(np.mean(rng.normal(size=(20000, n)) ** 2, axis=1))
-        assert np.mean((found > low) & (found < high)) == pytest.approx(0.95, abs=0.01)
+        valid = np.sqrt(np.mean(rng.normal(size=(20000, n)) ** 2, axis=1))
+        assert np.mean((valid > low) & (valid < high)) == pytest.approx(0.95, abs=0.01)
 
 
 def test_a_session_is_called_by_its_folder_or_the_one_around_it(case):
@@ -348,8 +350,8 @@ def test_a_session_is_called_by_its_folder_or_the_one_around_it(case):
 def test_the_table_can_be_taken_along(case):
     estimate, drawing = case.estimate, case.session.machine
     html = str(parameters.section(drawing, estimate).html)
-    found = dict(re.findall(r'<a download="([\w.]+)" href="data:[^"]*;base64,([\w+/=]+)"', html))
-    texts = {name: base64.b64decode(packed).decode("utf-8") for name, packed in found.items()}
+    results = dict(re.findall(r'<a download="([\w.]+)" href="data:[^"]*;base64,([\w+/=]+)"', html))
+    texts = {name: base64.b64decode(packed).decode("utf-8") for name, packed in results.items()}
     assert set(texts) == {"parameters.csv", "parameters.tex", "parameters.json"}
     rows = list(csv.DictReader(texts["parameters.csv"].splitlines()))
     table = estimate.machine.parameters

@@ -19,8 +19,8 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
+from pkmcal.session.image_files import Photograph
 from pkmcal.session.load import Session, Station
-from pkmcal.session.photographs import Photograph
 
 OUTWARD = 0.25
 """Pixels that the case's edges lie outward, besides the camera's own shift."""
@@ -46,9 +46,9 @@ def calibration(session, observation, estimate, verdict=None, findings=TOLD, tim
     )
 
 
-def report_html(*found, **more) -> str:
+def report_html(*value, **more) -> str:
     """The report's page; as :func:`calibration`."""
-    return page_html(report_of(calibration(*found, **more)))
+    return page_html(report_of(calibration(*value, **more)))
 
 
 def camera() -> Pinhole:

@@ -25,11 +25,11 @@ def drawn_field(case: Case, shift_at, noise, n=6000):
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     value = np.sum(direction * shift_at(pixel), axis=-1) + noise * rng.normal(size=n)
     zero = np.zeros(n, dtype=int)
-    found = field.fields(
+    values = field.fields(
         case.session, Offsets(zero, zero, np.arange(n), pixel, direction, value), Links()
     )
-    assert found is not None
-    (one,), factor, _ = found
+    assert values is not None
+    (one,), factor, _ = values
     return one, factor
 
 
@@ -63,9 +63,9 @@ def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
     zero = np.zeros(n, dtype=int)
     value = 0.3 + 0.01 * rng.normal(size=n)
     offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
-    found = field.fields(case.session, offsets, Links())
-    assert found is not None
-    (one,), factor, longest = found
+    result = field.fields(case.session, offsets, Links())
+    assert result is not None
+    (one,), factor, longest = result
     shift = np.array([(c.dx, c.dy) for c in one.cells]) / factor
     np.testing.assert_allclose(shift, np.tile([0.3, 0.0], (len(shift), 1)), atol=0.02)
     assert longest == pytest.approx(0.3, abs=0.02)
@@ -74,12 +74,12 @@ def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
 def test_edges_are_off_by_what_they_were_shifted(case):
     none, no_pixel = np.zeros(0, dtype=int), np.zeros((0, 2))
     corners = BoardCorners(none, none, none, none, no_pixel, no_pixel, none.astype(bool))
-    found = field.field_offsets(case.session, case.observation.edges, case.estimate, corners)
-    kept = int(np.sum(case.estimate.edge_weights >= 0.5))
-    assert len(found.value) == kept * len(field.FIELD_EDGE_FRACTIONS)
+    count = field.field_offsets(case.session, case.observation.edges, case.estimate, corners)
+    inliers = int(np.sum(case.estimate.edge_weights >= 0.5))
+    assert len(count.value) == inliers * len(field.FIELD_EDGE_FRACTIONS)
     # the camera's own constant shift is taken out; the two sides of a leg lie off in opposite ways
-    side = case.observation.edges.side[found.thing]
-    np.testing.assert_allclose(found.value, np.where(side == 0, OUTWARD, -OUTWARD), atol=2e-3)
+    side = case.observation.edges.side[count.thing]
+    np.testing.assert_allclose(count.value, np.where(side == 0, OUTWARD, -OUTWARD), atol=2e-3)
 
 
 def test_correlations_are_those_of_the_covariance(case):

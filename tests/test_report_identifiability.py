@@ -8,24 +8,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.identify.unidentified import explain, seen_legs
+from pkmcal.identify.unidentified import explain, observed_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
-from pkmcal.report.identifiability import STUB_BAR_HEIGHT, directions_headline, held, spectrum, tied
+from pkmcal.report.identifiability import (
+    STUB_BAR_HEIGHT,
+    directions_headline,
+    held_text,
+    spectrum,
+    tied,
+)
 from test_report_case import make_case, report_html
 from test_report_page import Found
 from test_words import heaved, make, told_of
 
 
 def findings_of(scene, *views):
-    told, seen, _ = told_of(scene, *views)
+    values, in_view, _ = told_of(scene, *views)
     machine = scene.machine.with_values(scene.theta[0])
     estimate = replace(
         make_estimate_stub(), machine=machine, state=scene.state(),
         configurations=np.ones(len(scene.poses[0]), bool),
     )  # fmt: skip
-    return explain(told, estimate, seen, conditions(machine, seen))
+    return explain(values, estimate, in_view, conditions(machine, in_view))
 
 
 def make_estimate_stub():
@@ -77,7 +83,7 @@ def test_a_whole_session_has_nothing_to_list():
         "Each is known better from the data than from the drawing."
     )
     assert findings.unidentified == findings.weak == ()
-    assert (held(findings, table), tied(table)) == ("", "")
+    assert (held_text(findings, table), tied(table)) == ("", "")
 
 
 def test_the_spectrum_shows_lost_directions_as_stubs(apart):
@@ -99,9 +105,9 @@ def test_what_was_held_is_said_with_its_reason(apart):
         ("legs[1].base.center", "legs[2].length.offset"),
         (("legs[3].length.offset", "legs[4].length.offset"),),
     )
-    said = held(apart, table)
-    assert said.startswith("Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and")
-    assert "under fixed, so the drawing's value counts as exact" in said
+    text = held_text(apart, table)
+    assert text.startswith("Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and")
+    assert "under fixed, so the drawing's value counts as exact" in text
     assert (
         tied(table)
         == "Changes together, as one value: leg 3 length offset and leg 4 length offset."
@@ -111,4 +117,4 @@ def test_what_was_held_is_said_with_its_reason(apart):
 def test_seen_legs_leaves_out_what_was_given_up():
     edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
     weights = np.where(edges.leg == 2, 0.1, 1.0)
-    assert seen_legs(edges, weights, 3, 7).tolist() == [[j not in (2, 6) for j in range(7)]] * 3
+    assert observed_legs(edges, weights, 3, 7).tolist() == [[j not in (2, 6) for j in range(7)]] * 3

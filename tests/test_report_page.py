@@ -82,8 +82,8 @@ def test_page_tells_verdict_numbers_and_model_error(page):
 def test_page_tells_when_and_from_what_it_was_made(case):
     noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
     fine = Verdict(True, "Fine.")
-    found = report_of(calibration(noted, case.observation, case.estimate, fine), digest="3f2a")
-    html = page_html(found, datetime(2026, 3, 4, 15, 2))
+    value = report_of(calibration(noted, case.observation, case.estimate, fine), digest="3f2a")
+    html = page_html(value, datetime(2026, 3, 4, 15, 2))
     text = Found(html).text
     assert "4 March 2026, 15:02" in text
     assert f"pkmcal {version('pkmcal')}" in text
@@ -94,9 +94,9 @@ def test_page_tells_when_and_from_what_it_was_made(case):
 
 
 def test_charts_lead_to_photographs_that_are_there(page, case):
-    found = Found(page)
-    links = [str(a["href"]) for tag, a in found.tags if tag == "a" and "download" not in a]
-    names = {f"#{a['id']}" for _, a in found.tags if "id" in a}
+    results = Found(page)
+    links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
+    names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
     leading = [link for link in links if link.startswith("#photograph-")]
     # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
     assert len(leading) > 5 + 6 + 3 + 6 + 20
@@ -125,11 +125,11 @@ def test_hostile_names_stay_text(tmp_path):
     verdict = Verdict(False, HOSTILE, tuple(Finding("", x, saved_text=HOSTILE) for x in Level))
     estimate = replace(case.estimate, gauge=HOSTILE)
     page = report_html(session, observation, estimate, verdict, timings={HOSTILE: 1.0})
-    found = Found(page)
+    value = Found(page)
     assert "<script>alert" not in page
-    assert not [a for tag, a in found.tags if "onerror" in a or tag == "img"]
-    assert sum(tag == "script" for tag, _ in found.tags) == 6
-    assert found.text.count("<script>alert('x')") > 10
+    assert not [a for tag, a in value.tags if "onerror" in a or tag == "img"]
+    assert sum(tag == "script" for tag, _ in value.tags) == 6
+    assert value.text.count("<script>alert('x')") > 10
 
 
 def test_a_scale_of_long_numbers_has_room():
@@ -271,11 +271,11 @@ def test_page_runs_in_a_browser(page, tmp_path):
     assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 15 + 1
     dialog = document[document.index('<dialog id="large"') :]
     assert dialog[: dialog.index(">")].endswith('open=""')
-    shown = dialog[: dialog.index("</dialog>")]
-    assert shown.count("<svg") == 1
+    display = dialog[: dialog.index("</dialog>")]
+    assert display.count("<svg") == 1
     large = re.search(r'data-large="([^"]+)"', page)
     assert large is not None
-    assert f"base64,{large[1]}" in shown
+    assert f"base64,{large[1]}" in display
     assert str(root["data-bar"]).startswith("#photograph-")
     assert root["data-point"] == "#photograph-1-2"
     assert root["data-paper"] == "672"

@@ -11,7 +11,7 @@ from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.pages.plots import frustum
-from pkmcal.report import photographed, pictures
+from pkmcal.report import image_scene, pictures
 from test_report_case import RADIUS, Case, calibration, make_case
 
 
@@ -23,10 +23,10 @@ def case(tmp_path_factory) -> Case:
 def figure(case: Case):
     centres = joint_centres(case.session.machine, case.estimate.machine, case.estimate.covariance)
     shifts = np.zeros(len(case.observation.edges))
-    found = calibration(case.session, case.observation, case.estimate)
-    album = pictures.album(found, shifts, centres)
+    value = calibration(case.session, case.observation, case.estimate)
+    album = pictures.album(value, shifts, centres)
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
-    return album, photographed.plot(case.session, case.estimate, album.links, none)
+    return album, image_scene.plot(case.session, case.estimate, album.links, none)
 
 
 def points(trace) -> np.ndarray:
@@ -36,13 +36,13 @@ def points(trace) -> np.ndarray:
 def test_tubes_lie_about_their_legs_in_every_pose(case):
     _, plot = figure(case)
     machine, poses = case.estimate.machine, case.estimate.state.T_base_platform
-    limbs = photographed.posed_limbs(machine, case.session.joints, poses)
+    limbs = image_scene.posed_limbs(machine, case.session.joints, poses)
     assert [frame["name"] for frame in plot.frames] == list(case.session.configurations)
     for k, frame in enumerate(plot.frames):
         for leg, trace in enumerate(frame["data"][:6]):
             a, b = limbs.a[k, leg], limbs.b[k, leg]
             u = (b - a) / np.linalg.norm(b - a)
-            rings = points(trace).reshape(2, 2, photographed.TUBE_RING_CORNERS, 3)
+            rings = points(trace).reshape(2, 2, image_scene.TUBE_RING_CORNERS, 3)
             along = (rings - a) @ u
             away = np.linalg.norm(rings - a - along[..., None] * u, axis=-1)
             for tube, drawn in enumerate(machine.document.legs[leg].tubes):
@@ -55,8 +55,8 @@ def test_a_crank_is_drawn_with_its_arm():
     machine = load_mechanism("h4")
     pose = machine.home()
     joints = machine.inverse(pose[None])
-    limbs = photographed.posed_limbs(machine, joints, pose[None])
-    turned = photographed.posed_limbs(machine, joints + 0.1, pose[None])
+    limbs = image_scene.posed_limbs(machine, joints, pose[None])
+    turned = image_scene.posed_limbs(machine, joints + 0.1, pose[None])
     for leg, arm in enumerate(limbs.arms):
         np.testing.assert_allclose(arm[0, -1], limbs.a[0, leg])
         # the motor's axis stays, and the arm about it turns with the reading
@@ -114,15 +114,15 @@ def test_all_that_is_drawn_is_in_the_picture(case, scale):
     state = replace(estimate.state, T_camera_base=np.stack(away))
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
     links = figure(case)[0].links
-    plot = photographed.plot(case.session, replace(estimate, state=state), links, none)
+    plot = image_scene.plot(case.session, replace(estimate, state=state), links, none)
     drawn = np.concatenate([points(trace) for trace in plot.figure["data"]])
     drawn = drawn[np.isfinite(drawn).all(axis=1)]
     low, high = drawn.min(axis=0), drawn.max(axis=0)
     unit = np.prod(1.0625 * (high - low)) ** (1 / 3)  # Plotly's, with its room about the data
     corners = ((drawn - (low + high) / 2) / unit).tolist()
     layout = plot.figure["layout"]
-    looks = [(layout["meta"]["wide"], layout["scene"]["camera"]), (1.0, layout["meta"]["narrow"])]
-    for width, camera in looks:
+    parts = [(layout["meta"]["wide"], layout["scene"]["camera"]), (1.0, layout["meta"]["narrow"])]
+    for width, camera in parts:
         eye, center = (
             np.array([camera[name][axis] for axis in "xyz"]) for name in ("eye", "center")
         )
@@ -136,7 +136,7 @@ def test_all_that_is_drawn_is_in_the_picture(case, scale):
 
 
 def test_many_poses_are_thinned_and_that_is_said(case, monkeypatch):
-    monkeypatch.setattr(photographed, "MOST_SLIDER_POSES", 3)
+    monkeypatch.setattr(image_scene, "MOST_SLIDER_POSES", 3)
     plot = figure(case)[1]
     assert [frame["name"] for frame in plot.frames] == ["c0", "c2", "c4"]
     assert "3 poses of 5, evenly chosen" in plot.caption

@@ -26,7 +26,7 @@ from pkmcal.studies.paper_a import (
     PAPER_A_METHODS,
     HexapodByAxes,
 )
-from pkmcal.studies.paper_a_photographs import MeasuredNoise
+from pkmcal.studies.paper_a_images import MeasuredNoise
 from pkmcal.studies.paper_a_report import table_1
 from pkmcal.studies.reproduction import REPRODUCED_PAPERS, Compared, Options, Words, reproduce_paper
 from pkmcal.studies.statistics import Summary
@@ -84,10 +84,10 @@ def test_in_words(tmp_path, monkeypatch, found):
     assert done.code == 0
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
     text = " ".join(done.out.split())
-    for said in ("Table 1", "0.05 rad", "0.05°", "Mean |error|", "End-effector", "RMSE, mm",
+    for message in ("Table 1", "0.05 rad", "0.05°", "Mean |error|", "End-effector", "RMSE, mm",
                  "Four steps as printed", "independent prototype", "Cramér-Rao bound",
                  f"{RUNS} of {RUNS}, expected all", "paper-a.html open it"):  # fmt: skip
-        assert said.lower() in text.lower(), said
+        assert message.lower() in text.lower(), message
     assert "…" not in done.out
 
 
@@ -124,12 +124,12 @@ def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
     words = Words("a", {**document, "remarks": {}, "cards": []}, {})
     good, bad = (Check(what, "5", "4", what == "good") for what in ("good", "bad"))
     assert words.reproduction((), (good,), (), {}).verdict.headline == "Reproduced: all."
-    found = words.reproduction((), (good, bad), (), {})
-    assert found.verdict.headline == (
+    value = words.reproduction((), (good, bad), (), {})
+    assert value.verdict.headline == (
         "Not reproduced: this run misses 1 of the 2 expectations that it is held against."
     )
-    assert found.document["headline"] == found.verdict.headline
-    assert found.verdict.reasons == (bad.sentence,)
+    assert value.document["headline"] == value.verdict.headline
+    assert value.verdict.reasons == (bad.sentence,)
 
 
 def test_few_runs_that_miss_are_told_to_be_more(monkeypatch, found):
@@ -215,21 +215,21 @@ def test_every_paper_of_the_command_has_its_module():
 def test_every_figure_of_the_prototype_is_compared(short):
     figures = expected.paper_a_figures(short)
     assert len(figures) == 4 * 5 + 3 * 2
-    assert all(f.found.error >= 0 and f.rounding > 0 for f in figures)
+    assert all(f.measured.error >= 0 and f.rounding > 0 for f in figures)
     assert all(f.tolerable for f in figures)
     by_name = {(*f.key, f.quantity): f for f in figures}
     assert by_name[PAPER_A_JOINT, "displacement"].expected == 0.091
     assert by_name[PAPER_A_JOINT, "displacement"].rounding == pytest.approx(0.0005)
     assert by_name[FOUR_STEPS_PRINTED, "base_z"].rounding == pytest.approx(0.005)
-    assert by_name[PAPER_A_BOUND, "base_z"].found.value == pytest.approx(0.060, abs=0.002)
+    assert by_name[PAPER_A_BOUND, "base_z"].measured.value == pytest.approx(0.060, abs=0.002)
 
 
 def test_what_differs_and_what_fails():
     """Beyond the Monte-Carlo error is told; beyond what the setting explains fails."""
 
-    def figure(method, quantity, found, error, wanted, rounding):
+    def figure(method, quantity, value, error, wanted, rounding):
         allowed = expected.tolerance((method,), quantity)
-        return Compared((method,), quantity, Summary(found, error), wanted, rounding, allowed)
+        return Compared((method,), quantity, Summary(value, error), wanted, rounding, allowed)
 
     offset = figure(PAPER_A_JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
     assert not offset.differs
@@ -288,9 +288,9 @@ def test_table_1_with_and_without_a_measurement():
 @pytest.mark.slow
 def test_table_1_on_photographs():
     """Edges to a few hundredths of a pixel; depth from the width of a leg, so far worse."""
-    found = reproduce_paper("a", Options(runs=3, photographs=True)).document["table_1_measured"]
-    assert 0.01 < found["edge_px"] < 0.08
-    middle, worst = found["median"], found["worst"]
+    value = reproduce_paper("a", Options(runs=3, photographs=True)).document["table_1_measured"]
+    assert 0.01 < value["edge_px"] < 0.08
+    middle, worst = value["median"], value["worst"]
     assert all(middle[name] <= worst[name] for name in middle)
     assert middle["theta"] > 2 * middle["psi"]
     assert middle["z"] > 3 * middle["x"]
@@ -338,10 +338,10 @@ def test_the_page_runs_in_a_browser(page, tmp_path):
 @pytest.mark.slow
 def test_more_poses():
     """--long: as the square root of the poses, and as the prototype."""
-    found = reproduce_paper("a", Options(runs=60, long=True))
-    by_poses = found.document["by_poses"]
+    value = reproduce_paper("a", Options(runs=60, long=True))
+    by_poses = value.document["by_poses"]
     for poses, wanted in expected.PROTOTYPE_POSES.items():
         ours = 1e3 * by_poses[poses]["found"]["displacement"]
         error = 1e3 * by_poses[poses]["standard_error"]["displacement"]
         assert ours == pytest.approx(wanted, abs=3 * error), poses
-    assert len([plot for part in found.parts for plot in part.plots]) == 2
+    assert len([plot for part in value.parts for plot in part.plots]) == 2

@@ -29,7 +29,7 @@ from pkmcal.studies.paper_b import (
     HexapodByLegs,
     drawn_machine,
     hexapod_with_cylinder_legs,
-    seen,
+    measured_hexapod,
     solved,
     views_by_name,
 )
@@ -72,7 +72,7 @@ def test_without_noise_every_method_is_exact(view, monkeypatch):
     monkeypatch.setattr(paper_b, "POINT_NOISE", 1e-7)
     monkeypatch.setattr(paper_b, "PAPER_B_READING_NOISE", 1e-12)
     rng = np.random.default_rng(3)
-    one = seen(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
+    one = measured_hexapod(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
     for centres in solved(one, PAPER_B_REGRESSIONS, rng).values():
         assert np.abs(centres - one.centres).max() < 1e-8
 
@@ -80,7 +80,7 @@ def test_without_noise_every_method_is_exact(view, monkeypatch):
 @pytest.mark.parametrize("view", PAPER_B_VIEW_NAMES)
 def test_every_leg_is_seen_in_most_configurations(view):
     rng = np.random.default_rng(3)
-    one = seen(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
+    one = measured_hexapod(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
     edges = one.measurements.edges
     most = 2 * paper_b.PAPER_B_CONFIGURATIONS
     counts = np.bincount(edges.leg, minlength=6)
@@ -96,7 +96,9 @@ def test_every_leg_is_seen_in_most_configurations(view):
 def test_cases_are_what_they_say():
     truth = drawn_machine(np.random.default_rng(5))
     right, wrong, shifted, radius = (
-        seen(truth, views_by_name()[MIRROR_VIEW], PAPER_B_CASES[case], np.random.default_rng(6))
+        measured_hexapod(
+            truth, views_by_name()[MIRROR_VIEW], PAPER_B_CASES[case], np.random.default_rng(6)
+        )
         for case in ("right", "20 % wrong", "shifted", "radius")
     )
     off = np.linalg.norm(wrong.measurements.edges.normal - right.measurements.edges.normal, axis=-1)
@@ -130,11 +132,11 @@ def test_what_is_believed_is_what_was_estimated(short, ran):
     drawing = hexapod_with_cylinder_legs().base_centers()
     apart = np.linalg.norm(drawing[:, None] - drawing, axis=-1)
     for name in (E1, *CAMERA_BY_HAND_ERRORS):
-        told = ran.centres[name]
-        found = np.linalg.norm(told[:, :, None] - told[:, None], axis=-1)
-        np.testing.assert_allclose(found, np.broadcast_to(apart, found.shape), atol=1e-12)
+        items = ran.centres[name]
+        values = np.linalg.norm(items[:, :, None] - items[:, None], axis=-1)
+        np.testing.assert_allclose(values, np.broadcast_to(apart, values.shape), atol=1e-12)
     true = inverse(views_by_name()[PERSPECTIVE_VIEW].T_camera_base)
-    believed = inverse(ran.trials["hand"].estimate.seen.T_camera_base)
+    believed = inverse(ran.trials["hand"].estimate.view.T_camera_base)
     shift = np.linalg.norm(believed[:, :3, 3] - true[:3, 3], axis=-1)
     # three centimetres by hand, and what laying the drawing on the truth leaves
     assert np.abs(shift - CAMERA_BY_HAND_ERRORS["hand"][0]).max() < 5e-3
@@ -199,8 +201,8 @@ def test_the_page_has_the_papers_figures(found):
         text = re.search(rf'id="figure-{name}">(.*?)</script>', page, re.DOTALL)
         figure = json.loads(text[1], parse_constant=pytest.fail)
         assert all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure["data"]), name
-    for said in ("12 and 8 mm", "Not reproduced: the overshoot of E3", "E1 and E2 cannot be told"):
-        assert said in " ".join(page.split())
+    for words in ("12 and 8 mm", "Not reproduced: the overshoot of E3", "E1 and E2 cannot be told"):
+        assert words in " ".join(page.split())
     assert "{" not in found.verdict.headline
 
 
@@ -227,10 +229,10 @@ def test_legs_are_drawn_as_the_camera_has_them(ran, found):
 def test_numbers_for_programs(short, ran, found):
     document = json.loads(json.dumps(found.document, default=list))
     assert document["paper"]["from_drawing"] == {"mirror": 0.012, "perspective": 0.008}
-    told = {(a["view"], a["case"], a["method"]): a for a in document["accuracy"]}
-    assert set(told) == set(short.samples)
-    right = told[MIRROR_VIEW, "right", PAPER_B_JOINT]
+    entries = {(a["view"], a["case"], a["method"]): a for a in document["accuracy"]}
+    assert set(entries) == set(short.samples)
+    right = entries[MIRROR_VIEW, "right", PAPER_B_JOINT]
     assert right["centre"] == short.of(MIRROR_VIEW, "right", PAPER_B_JOINT)["centre"].value
-    assert right["runs"] == RUNS // paper_b.ASKED_RUNS_A_CASE
+    assert right["runs"] == RUNS // paper_b.RUNS_A_CASE
     assert document["seconds"]["wall"] == 12.5
     assert document["control"][E2]["astray"] == float(np.median(ran.trials[E2].astray))

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 
 import pkmcal
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.recognise import read_photographs
-from pkmcal.calibration.responses import (
+from pkmcal.calibration.camera_responses import (
     LEAST_RESPONSE_GAIN,
-    ResponseTold,
+    ResponseEstimate,
     _scored,
-    told_by_edges,
+    responses_by_edges,
 )
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.localization import read_photographs
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.cylinders import tangent_basis
@@ -52,9 +52,9 @@ def recode(folder: Path, kind: str, table=None) -> None:
 
 def stated(folder: Path, response: str) -> None:
     text = (folder / "session.yaml").read_text()
-    said = re.sub(r"^( +)(observe: legs.*)$", rf"\1\2\n\1response: {response}", text, flags=re.M)
-    assert said != text
-    (folder / "session.yaml").write_text(said)
+    words = re.sub(r"^( +)(observe: legs.*)$", rf"\1\2\n\1response: {response}", text, flags=re.M)
+    assert words != text
+    (folder / "session.yaml").write_text(words)
 
 
 # the curve
@@ -100,8 +100,8 @@ def test_a_blurred_edge_is_where_it_is_by_the_right_code_alone():
     there = redrawn(0, 0.0005), FRONT, poses()
     shift = {}
     for response in ("srgb", "linear"):
-        found = measure(replace(taken(pictures), response=response), *there)
-        shift[response] = errors(found.edges)[0]
+        value = measure(replace(taken(pictures), response=response), *there)
+        shift[response] = errors(value.edges)[0]
     assert rms(shift["srgb"]) < 0.05
     assert abs(shift["srgb"].mean()) < 0.03
     assert rms(shift["linear"]) > 2 * rms(shift["srgb"])
@@ -114,10 +114,10 @@ def test_light_that_is_cut_off_is_so_by_any_code():
     there = redrawn(0, 0.0005), FRONT, poses()
     usual = measure(taken(clipped), *there).edges
     coded = taken([cv2.LUT(image, SRGB) for image in clipped])
-    found = measure(replace(coded, response="srgb"), *there).edges
+    count = measure(replace(coded, response="srgb"), *there).edges
     assert 60 < len(usual) < 110
-    assert abs(len(found) - len(usual)) < 0.1 * len(usual)
-    assert rms(errors(found)[0]) < 1.2 * rms(errors(usual)[0]) + 0.01
+    assert abs(len(count) - len(usual)) < 0.1 * len(usual)
+    assert rms(errors(count)[0]) < 1.2 * rms(errors(usual)[0]) + 0.01
 
 
 # what a session takes for granted
@@ -128,14 +128,14 @@ def test_files_of_a_kind_are_taken_for_what_is_usual(session, kind, usual):
     recode(session, kind)
     stations = load_session(session).stations
     assert {station.response for station in stations} == {usual}
-    assert not any(station.response_told for station in stations)
+    assert not any(station.response_given for station in stations)
 
 
 def test_what_the_session_says_holds(session):
     stated(session, "srgb")
     stations = load_session(session).stations
     assert {station.response for station in stations} == {"srgb"}
-    assert all(station.response_told for station in stations)
+    assert all(station.response_given for station in stations)
 
 
 def test_a_response_that_there_is_not(session):
@@ -163,14 +163,14 @@ def coded(demo, tmp_path_factory):
     return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
 
 
-def check_overruled(calibration, found, usual, demo, worse=1.0):
+def check_overruled(calibration, value, usual, demo, worse=1.0):
     """And the machine is found as well as where it is as usual, but for what the file's kind does:
     errors that are so many times as large.
     """
     (hint,) = calibration.verdict.of("image.response")
-    assert (hint.facts["other"], hint.facts["usual"]) == (found, usual)
+    assert (hint.facts["other"], hint.facts["usual"]) == (value, usual)
     check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480 * worse)
-    assert {station.response for station in calibration.session.stations} == {found}
+    assert {station.response for station in calibration.session.stations} == {value}
 
 
 def test_the_edges_overrule_what_is_usual_for_png_files(demo, coded):
@@ -215,7 +215,7 @@ def asked_of(calibrated, measurements, estimate, other):
         every.append(True)
         raise ResultError("no edge was measured")
 
-    told_by_edges(
+    responses_by_edges(
         calibrated.session,
         read_photographs(calibrated.session),
         measurements,
@@ -265,7 +265,7 @@ def test_right_photographs_are_seldom_all_asked(calibrated):
 def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
     """In the dark the wrong one leaves three of a hundred, which say nothing, and that says it."""
     few = calibrated.measurements.edges.select(np.arange(3))
-    told = told_by_edges(
+    values = responses_by_edges(
         calibrated.session,
         read_photographs(calibrated.session),
         calibrated.measurements,
@@ -274,21 +274,21 @@ def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(cali
         lambda _: few,
         lambda edges: replace(calibrated.measurements, edges=edges),
     )
-    assert told == ()
+    assert values == ()
 
 
 def test_stations_whose_response_is_stated_are_not_asked_about(calibrated):
     session = calibrated.session
-    stations = tuple(replace(station, response_told=True) for station in session.stations)
+    stations = tuple(replace(station, response_given=True) for station in session.stations)
 
-    def asked(_):
+    def query(_):
         pytest.fail("its photographs were measured otherwise")
 
-    told = told_by_edges(
+    values = responses_by_edges(
         replace(session, stations=stations), read_photographs(session), calibrated.measurements,
-        calibrated.estimate, asked, asked, asked,
+        calibrated.estimate, query, query, query,
     )  # fmt: skip
-    assert told == ()
+    assert values == ()
 
 
 @pytest.mark.slow
@@ -302,20 +302,22 @@ def test_a_stated_response_is_not_asked_about(session):
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
 def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
-    told = ResponseTold(("front", "left"), "linear", gain)
-    assert told.sure == sure
-    assert told.response == ("srgb" if sure else "linear")
+    values = ResponseEstimate(("front", "left"), "linear", gain)
+    assert values.sure == sure
+    assert values.response == ("srgb" if sure else "linear")
     if sure:
-        assert "at odds of more than 1000 to 1. They are measured so" in told.finding.text
-        assert "write response: srgb in session.yaml, under the stations front" in told.finding.text
+        assert "at odds of more than 1000 to 1. They are measured so" in values.finding.text
+        assert (
+            "write response: srgb in session.yaml, under the stations front" in values.finding.text
+        )
     else:
         assert (
             "do not tell whether the levels of the photographs of front and left are linear"
-            in told.finding.text
+            in values.finding.text
         )
         assert (
             "Write response: linear or response: srgb in session.yaml, under the"
-            in told.finding.text
+            in values.finding.text
         )
 
 
@@ -332,8 +334,8 @@ def test_each_camera_is_asked_by_itself(session):
     changed = text.replace(f"cameras/{camera.name}", "cameras/own.yaml", 1)
     (session / "session.yaml").write_text(changed)
     calibration = calibrate_session(session)
-    told = {station.camera_file: station.response for station in calibration.session.stations}
-    assert told == {"cameras/own.yaml": "srgb", f"cameras/{camera.name}": "linear"}
+    entries = {station.camera_file: station.response for station in calibration.session.stations}
+    assert entries == {"cameras/own.yaml": "srgb", f"cameras/{camera.name}": "linear"}
     assert [one.facts["other"] for one in calibration.verdict.of("image.response")] == ["srgb"]
 
 
@@ -343,4 +345,4 @@ def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(coded,
     assert {row["response"] for row in saved.document["stations"]} == {"srgb"}
     fresh = _as_then(saved, load_session(coded.folder))
     assert {station.response for station in fresh} == {"srgb"}
-    assert all(station.response_told for station in fresh)
+    assert all(station.response_given for station in fresh)

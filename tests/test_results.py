@@ -14,7 +14,7 @@ import pytest
 
 from pkmcal.calibration import results
 from pkmcal.calibration.results import base_camera_covariance, calibration_document, check_output
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text, json_value
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
@@ -59,8 +59,8 @@ def test_it_comes_back(calibrated, tmp_path):
     assert np.array_equal(saved.used, estimate.configurations)
     assert json_value(saved.verdict.document()) == json_value(calibrated.verdict.document())
     assert (saved.gauge, saved.method, saved.seed) == (estimate.gauge, "bundle", 0)
-    found = np.stack([station.T_base_camera for station in saved.stations])
-    assert np.array_equal(found, inverse(estimate.state.T_camera_base))
+    values = np.stack([station.T_base_camera for station in saved.stations])
+    assert np.array_equal(values, inverse(estimate.state.T_camera_base))
     assert load(tmp_path / "out" / "calibration.json").path == saved.path
 
 
@@ -139,11 +139,11 @@ def earlier(folder, tmp_path) -> Path:
 
 def test_an_earlier_result_is_kept_under_its_date(calibrated, earlier):
     before = files_in(earlier)
-    kept = save(calibrated, earlier)
-    assert kept == earlier.with_name("out-2026-11-23T1502")
-    assert dated(earlier) == [kept]
-    assert files_in(kept) == before
-    assert load(kept).seed == 7  # as good a calibration as any
+    retained = save(calibrated, earlier)
+    assert retained == earlier.with_name("out-2026-11-23T1502")
+    assert dated(earlier) == [retained]
+    assert files_in(retained) == before
+    assert load(retained).seed == 7  # as good a calibration as any
     assert load(earlier).seed == 0
 
 
@@ -272,25 +272,25 @@ def test_other_files(tmp_path, text, said):
 
 
 def test_a_changed_value(folder):
-    said = rewritten(folder, lambda data: data["parameters"][4].update(value=0.1))
-    assert "parameters[5].value: the calibration does not agree with itself" in said
-    assert "Calibrate again" in said
+    text = rewritten(folder, lambda data: data["parameters"][4].update(value=0.1))
+    assert "parameters[5].value: the calibration does not agree with itself" in text
+    assert "Calibrate again" in text
 
 
 def test_a_lost_reading(folder):
-    said = rewritten(folder, lambda data: data["configurations"][2]["joints"].pop())
-    assert "configurations[3].joints: the calibration does not agree with itself" in said
-    assert "expected the 6 readings of its machine, not 5" in said
+    text = rewritten(folder, lambda data: data["configurations"][2]["joints"].pop())
+    assert "configurations[3].joints: the calibration does not agree with itself" in text
+    assert "expected the 6 readings of its machine, not 5" in text
 
 
 def test_a_changed_name(folder):
-    said = rewritten(folder, lambda data: data["parameters"].pop())
-    assert "expected the names of the mechanism's parameters" in said
+    text = rewritten(folder, lambda data: data["parameters"].pop())
+    assert "expected the names of the mechanism's parameters" in text
 
 
 def test_a_changed_covariance(folder):
-    said = rewritten(folder, lambda data: data["covariance"].pop())
-    assert "the covariance has another size than the list of parameters" in said
+    text = rewritten(folder, lambda data: data["covariance"].pop())
+    assert "the covariance has another size than the list of parameters" in text
 
 
 def test_a_covariance_that_is_none(folder):
@@ -309,22 +309,22 @@ def test_covariances_of_stations_come_back_with_the_machine(calibrated, tmp_path
     size = np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
     assert np.all(np.abs(saved.joint_covariance - joint) <= 1e-9 * size)
     n, last = len(saved.covariance), len(saved.placed) - 1
-    known = saved.known(saved.placed[-1:], saved.placed)
-    one = known.covariance
-    assert known.stations == (last,)
-    there = inverse(known.T_camera_base)[0]
+    prior = saved.prior(saved.placed[-1:], saved.placed)
+    one = prior.covariance
+    assert prior.stations == (last,)
+    there = inverse(prior.T_camera_base)[0]
     np.testing.assert_allclose(there, saved.stations[last].T_base_camera, atol=1e-15)
     rows = np.r_[:n, n + 6 * last : n + 6 * last + 6]
     assert np.array_equal(one, saved.joint_covariance[np.ix_(rows, rows)])
     # the station is not independent of the machine that was found with it
     unit = np.abs(one[n:, :n]) / np.sqrt(np.outer(np.diag(one)[n:], np.diag(one)[:n]) + 1e-300)
     assert unit.max() > 0.3
-    found = np.sqrt(
+    values = np.sqrt(
         np.diag(base_camera_covariance(estimate.state.T_camera_base[last], one[n:, n:]))
     )
-    assert np.allclose(found[3:], saved.stations[last].sigma_translation, rtol=1e-9)
+    assert np.allclose(values[3:], saved.stations[last].sigma_translation, rtol=1e-9)
     with pytest.raises(InputError, match=r"stood is not known .* found attic"):
-        saved.known(["attic"], ["attic"])
+        saved.prior(["attic"], ["attic"])
 
 
 def test_a_file_without_the_stations_covariance_still_loads(folder):
@@ -335,7 +335,7 @@ def test_a_file_without_the_stations_covariance_still_loads(folder):
     assert saved.placed == ()
     assert np.array_equal(saved.joint_covariance, saved.covariance)
     with pytest.raises(InputError, match="Calibrate once more"):
-        saved.known([saved.stations[0].name], [saved.stations[0].name])
+        saved.prior([saved.stations[0].name], [saved.stations[0].name])
 
 
 def test_a_covariance_of_stations_that_is_none(folder):
@@ -355,9 +355,9 @@ def test_stations_that_do_not_fit(folder, what):
         for row in data["station_covariance"]["rows"]:  # symmetric, with correlations above one
             row[:n] = [3 * value for value in row[:n]]
 
-    said = rewritten(folder, change)
+    text = rewritten(folder, change)
     wanted = {"renamed": "expected names of the stations", "stretched": "a negative variance"}
-    assert wanted[what] in said
+    assert wanted[what] in text
 
 
 def test_a_pose_that_is_none(folder):
@@ -401,5 +401,5 @@ def test_covariance_of_the_inverse_pose():
     jacobian = np.stack(columns, axis=-1)
     root = rng.normal(size=(6, 6))
     covariance = root @ root.T
-    found = base_camera_covariance(T, covariance)
-    assert np.allclose(found, jacobian @ covariance @ jacobian.T, rtol=1e-4, atol=1e-4)
+    values = base_camera_covariance(T, covariance)
+    assert np.allclose(values, jacobian @ covariance @ jacobian.T, rtol=1e-4, atol=1e-4)

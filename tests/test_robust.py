@@ -9,7 +9,7 @@ import pytest
 
 import printers
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.gather import measurements_of, refinement_of
+from pkmcal.calibration.camera_refinement import measurements_of, refinement_of
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.robust import anneal, robust_cost, robust_start
@@ -100,13 +100,13 @@ def test_each_run_keeps_the_better_of_its_two_starts(tmp_path):
     start = take(begin, np.zeros(2, dtype=int))
     annealed = anneal(one, begin).weight.poses[0, :, 0]
     assert np.flatnonzero(annealed < 0.5).tolist() == [0]
-    found = robust_start(both, start)
-    assert found.weight.poses[0].min() > 0.9
-    assert np.flatnonzero(found.weight.poses[1, :, 0] < 0.5).tolist() == [1]
+    value = robust_start(both, start)
+    assert value.weight.poses[0].min() > 0.9
+    assert np.flatnonzero(value.weight.poses[1, :, 0] < 0.5).tolist() == [1]
     for run in range(2):
         alone = robust_start(both.select(np.array([run])), begin)
-        np.testing.assert_allclose(alone.weight.poses[0], found.weight.poses[run], atol=1e-6)
-        np.testing.assert_allclose(alone.state.z[0], found.state.z[run], atol=1e-7)
+        np.testing.assert_allclose(alone.weight.poses[0], value.weight.poses[run], atol=1e-6)
+        np.testing.assert_allclose(alone.state.z[0], value.state.z[run], atol=1e-7)
 
 
 def joined(one, other, name):

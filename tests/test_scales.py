@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from export_sources import built, source_of, with_scales
-from pkmcal.calibration.doubts import scales_told
-from pkmcal.calibration.same_machine import _check_machine
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.faults import scale_notes
+from pkmcal.calibration.machine_identity import _check_machine
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.export.contract import make_export
 from pkmcal.judge.causes import single_causes
@@ -140,11 +140,11 @@ def test_derivatives_by_scales_and_readings(name):
     T = on_manifold(layout, theta, machine.home()[None]).T_base_platform
     q, phi = inverse_result(layout, theta, T)
     c, h = closure(layout, theta, q, T, phi), 1e-6
-    found = dense(c, len(theta))
+    count = dense(c, len(theta))
     for k in machine.parameters.of_kind("scale"):
         step = h * np.eye(len(theta))[k]
         up, down = (closure(layout, theta + s * step, q, T, phi).rows.value for s in (1, -1))
-        np.testing.assert_allclose(found[..., k], (up - down) / (2 * h), atol=1e-8)
+        np.testing.assert_allclose(count[..., k], (up - down) / (2 * h), atol=1e-8)
     for m, step in enumerate(h * np.eye(machine.n_joints)):
         up, down = (closure(layout, theta, q + s * step, T, phi).rows.value for s in (1, -1))
         by = c.by_reading * layout.of_motor[:, m]
@@ -195,11 +195,11 @@ def test_scales_that_surely_differ_are_told_once(demo):
     estimate = SimpleNamespace(machine=machine.with_values(values), covariance=np.diag(sigma**2))
     columns = [f"leg{j}" for j in range(1, 7)]
     session = SimpleNamespace(machine=machine, document={"joints": {"columns": columns}})
-    (found,) = scales_told(session, estimate, ())
-    assert (found.code, found.facts["columns"]) == ("readings.scale_estimates", ["leg1", "leg2"])
-    assert found.facts["values"] == pytest.approx((4e-4, -3e-4), rel=1e-3)
-    assert "0.040 ± 0.010 % larger (leg1) and 0.030 ± 0.009 % smaller (leg2)." in found.text
-    (other,) = scales_told(session, estimate, ("leg1",))
+    (names,) = scale_notes(session, estimate, ())
+    assert (names.code, names.facts["columns"]) == ("readings.scale_estimates", ["leg1", "leg2"])
+    assert names.facts["values"] == pytest.approx((4e-4, -3e-4), rel=1e-3)
+    assert "0.040 ± 0.010 % larger (leg1) and 0.030 ± 0.009 % smaller (leg2)." in names.text
+    (other,) = scale_notes(session, estimate, ("leg1",))
     assert other.facts["columns"] == ["leg2"]
 
 
@@ -219,9 +219,9 @@ def test_a_calibration_from_before_scales_has_exact_ones(demo, tmp_path):
     assert len(keep) == n - 6
     data["parameters"] = [data["parameters"][k] for k in keep]
     data["covariance"] = [[data["covariance"][i][k] for k in keep] for i in keep]
-    known = data["station_covariance"]
-    own = [*keep, *range(n, n + len(known["rows"]))]
-    known["rows"] = [[row[k] for k in own] for row in known["rows"]]
+    reference_values = data["station_covariance"]
+    own = [*keep, *range(n, n + len(reference_values["rows"]))]
+    reference_values["rows"] = [[row[k] for k in own] for row in reference_values["rows"]]
     for leg in data["mechanism"]["legs"]:
         del leg["scale"]
     path.write_text(json.dumps(data))

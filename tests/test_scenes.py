@@ -49,16 +49,18 @@ def drawn(case, rng):
 
 def test_errors_drawn_from_the_covariance_whiten_to_one(scenes, case):
     parts, covariance, _ = case
-    found = [scenes.errors_of(*parts, covariance, t) for t in drawn(case, np.random.default_rng(0))]
-    assert {e.dof for e in found} == {30}  # 42 numbers less two bodies' frames
+    results = [
+        scenes.errors_of(*parts, covariance, t) for t in drawn(case, np.random.default_rng(0))
+    ]
+    assert {e.dof for e in results} == {30}  # 42 numbers less two bodies' frames
     # the mean of NEES / dof over n draws has the standard deviation sqrt(2 / (n dof))
-    share = np.mean([e.nees for e in found]) / 30
+    share = np.mean([e.nees for e in results]) / 30
     assert share == pytest.approx(1, abs=4 * np.sqrt(2 / (30 * DRAWS)))
     low, high = scenes.honest(30, 0.95)
-    inside = np.mean([low < e.whitened < high for e in found])
+    inside = np.mean([low < e.whitened < high for e in results])
     assert inside == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / DRAWS))
     # and the tool's z by the same covariance
-    assert np.mean([e.tool_z**2 for e in found]) == pytest.approx(1, abs=0.2)
+    assert np.mean([e.tool_z**2 for e in results]) == pytest.approx(1, abs=0.2)
 
 
 def test_a_covariance_that_promises_too_much_is_told(scenes, case):
@@ -93,12 +95,12 @@ def test_frames_are_conventions(scenes, case, calibrated):
 
 def test_a_whole_session_is_scored_and_its_truth_not_shown(scenes, demo, tmp_path, capsys):
     scenes.main([str(demo.session), "--json"])
-    found = json.loads(capsys.readouterr().out)
-    (row,) = found["sessions"]
+    value = json.loads(capsys.readouterr().out)
+    (row,) = value["sessions"]
     assert row["usable"]
     assert row["errors"]["tool"] < 3 * row["errors"]["tool_stated"]
-    assert found["dof"] == row["errors"]["dof"] == 30
-    assert found["whitened"] == pytest.approx(row["errors"]["whitened"])
+    assert value["dof"] == row["errors"]["dof"] == 30
+    assert value["whitened"] == pytest.approx(row["errors"]["whitened"])
     assert (demo.session / "truth.json").exists()
 
 
@@ -108,9 +110,9 @@ def test_what_is_refused_has_its_sentence(scenes, session, demo, capsys):
     for path in (session / "images").glob("*/*.png"):
         path.unlink()
     scenes.main([str(session)])
-    said = capsys.readouterr().out
-    assert "refused" in said
-    (line,) = [line for line in said.splitlines() if line.startswith("session: ")]
+    text = capsys.readouterr().out
+    assert "refused" in text
+    (line,) = [line for line in text.splitlines() if line.startswith("session: ")]
     assert "expected files images/station1/{configuration}.png" in line
 
 

@@ -11,7 +11,8 @@ from pkmcal.cameras import camera_models
 from pkmcal.control.analysis import equilibria, matrix_at, subsets, visibility
 from pkmcal.control.image import Eye, edge_responses
 from pkmcal.control.laws import limited, task_of
-from pkmcal.control.seen import legs_at, seen_machine, true_edges
+from pkmcal.control.machine_view import legs_at, machine_view, true_edges
+from pkmcal.control.sentences import judgement
 from pkmcal.control.simulation import (
     End,
     LoopSettings,
@@ -30,7 +31,6 @@ from pkmcal.control.study import (
     estimates,
     study_servoing,
 )
-from pkmcal.control.words import judgement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import load_mechanism
@@ -52,7 +52,7 @@ def eye_of(camera, name: str = "gough-stewart", legs=None) -> Eye:
     machine = load_mechanism(name)
     place = default_stations(machine, (camera,), np.random.default_rng(3))[0]
     numbers = None if legs is None else np.array(legs)
-    return Eye.of(seen_machine(machine, place.T_camera_base(), numbers), camera)
+    return Eye.of(machine_view(machine, place.T_camera_base(), numbers), camera)
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,8 @@ def ways_of(eye: Eye, n: int):
 def by_hand(eye: Eye, position: float, degrees: float, runs: int):
     none = Uncertainty(np.zeros((len(eye.true.theta),) * 2), np.zeros(3), np.zeros(3))
     rng = np.random.default_rng(6)
-    found = estimates(eye.true, eye.true.theta, none, runs, rng, position, np.deg2rad(degrees))
-    return found[3].seen
+    values = estimates(eye.true, eye.true.theta, none, runs, rng, position, np.deg2rad(degrees))
+    return values[3].view
 
 
 # ------------------------------------------------------------------ the camera
@@ -148,9 +148,9 @@ def test_wrong_geometry_changes_the_way_and_not_the_end(eye):
         eye, by_hand(eye, 0.03, 3, 6), starts, goals, loop, np.random.default_rng(0)
     )
     assert set(runs.end) == {End.REACHED}
-    assert runs.way[:, -1].max() < 1e-6
+    assert runs.travel[:, -1].max() < 1e-6
     exact = simulate_servo_runs(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
-    assert np.abs(runs.way - exact.way).max() > 1e-3
+    assert np.abs(runs.travel - exact.travel).max() > 1e-3
 
 
 def test_large_rotation_errors_break_it(eye):
@@ -201,7 +201,7 @@ def test_predicted_stillness_is_what_the_loop_does(eye, delay):
         noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0
     )
     runs = simulate_servo_runs(eye, eye.true, goals, goals, loop, np.random.default_rng(0))
-    measured = np.sqrt(np.mean(runs.way[:, 30:] ** 2))
+    measured = np.sqrt(np.mean(runs.travel[:, 30:] ** 2))
     joints = eye.true.machine.inverse(goals)
     rng = np.random.default_rng(1)
     still = one_image(eye, eye.true, "edges", goals, joints, noise, rng).held(0.2, delay)
@@ -241,14 +241,14 @@ def test_leaving_the_workspace(eye):
     runs = simulate_servo_runs(
         eye, by_hand(eye, 0.0, 70, 8), starts, goals, CLEAN, np.random.default_rng(0)
     )
-    left = [k for k, end in enumerate(runs.end) if end is End.LEFT_WORKSPACE]
-    assert left
+    remainder = [k for k, end in enumerate(runs.end) if end is End.OUTSIDE_WORKSPACE]
+    assert remainder
     low, high = eye.true.machine.joint_ranges.T
     assert np.all((runs.readings >= low - 1e-9) & (runs.readings <= high + 1e-9))
-    k = left[0]
+    k = remainder[0]
     stopped = runs.readings[k, runs.last[k] :]
     np.testing.assert_array_equal(stopped, np.broadcast_to(stopped[0], stopped.shape))
-    assert "end of its range" in End.LEFT_WORKSPACE.sentence
+    assert "end of its range" in End.OUTSIDE_WORKSPACE.sentence
 
 
 def turned_home(machine, angle: float):
@@ -301,15 +301,15 @@ def test_losing_a_leg(eye):
     starts, goals = ways_of(eye, 12)
     parameters = eye.camera.parameters.copy()
     parameters[2] += 250
-    aside = replace(eye, camera=replace(eye.camera, parameters=parameters))
+    offset = replace(eye, camera=replace(eye.camera, parameters=parameters))
     loop = replace(CLEAN, duration=3.0)
-    runs = simulate_servo_runs(aside, eye.true, starts, goals, loop, np.random.default_rng(0))
+    runs = simulate_servo_runs(offset, eye.true, starts, goals, loop, np.random.default_rng(0))
     lost = [k for k, end in enumerate(runs.end) if end is End.LOST_LEG and runs.last[k] > 0]
     assert lost
     assert len(lost) < 12
     k = lost[0]
-    points = aside.points(runs.T_base_platform[k, -1:], runs.readings[k, -1:])
-    assert not aside.in_view(points).all()
+    points = offset.points(runs.T_base_platform[k, -1:], runs.readings[k, -1:])
+    assert not offset.in_view(points).all()
     assert "left the camera's view" in End.LOST_LEG.sentence
 
 
@@ -336,10 +336,10 @@ def test_every_end_has_a_sentence():
 def test_visibility_of_few_legs(eye):
     poses = draw_configurations(eye.true.machine, 20, 0.2, np.random.default_rng(2))[0][:20]
     matrix = matrix_at(eye.true, "directions", poses)
-    found = {choice.legs: choice for choice in subsets(matrix, eye.true.legs)}
-    assert len(found) == 2**6 - 1
-    assert all(choice.blind == (len(legs) < 3) for legs, choice in found.items())
-    every, three = found[0, 1, 2, 3, 4, 5], found[0, 2, 4]
+    results = {choice.legs: choice for choice in subsets(matrix, eye.true.legs)}
+    assert len(results) == 2**6 - 1
+    assert all(choice.blind == (len(legs) < 3) for legs, choice in results.items())
+    every, three = results[0, 1, 2, 3, 4, 5], results[0, 2, 4]
     assert every.worst > 0.2
     assert not every.fading
     assert three.fading
@@ -350,12 +350,12 @@ def test_visibility_of_few_legs(eye):
 
 def test_directions_of_parallel_sliders_are_blind():
     machine = load_mechanism("hexaglide")
-    seen = replace(
+    case = replace(
         eye_of(demo_camera()).true, machine=machine, legs=np.arange(6), radius=np.full(6, 0.004)
     )
     poses = draw_configurations(machine, 5, 0.2, np.random.default_rng(2))[0][:5]
-    assert visibility(matrix_at(seen, "directions", poses)).max() < 1e-6
-    assert visibility(matrix_at(seen, "edges", poses)).min() > 1e-4
+    assert visibility(matrix_at(case, "directions", poses)).max() < 1e-6
+    assert visibility(matrix_at(case, "edges", poses)).min() > 1e-4
 
 
 def test_three_legs_leave_other_poses(eye):
@@ -363,16 +363,16 @@ def test_three_legs_leave_other_poses(eye):
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
     goals, starts = poses[:4], poses[4:40]
     three = eye.true.only(np.array([0, 1, 2]))
-    found = equilibria(three, "directions", goals, starts)
-    assert found.alike > 0.05
-    assert found.looks_alike.any()
-    for pose, goal in zip(found.T_base_platform, found.goal, strict=True):
+    value = equilibria(three, "directions", goals, starts)
+    assert value.same_image > 0.05
+    assert value.same_edges.any()
+    for pose, goal in zip(value.T_base_platform, value.goal, strict=True):
         same = true_edges(three, pose[None]) - true_edges(three, goals[goal][None])
         assert np.abs(same).max() < 1e-6
         assert not outside(eye.true.machine, eye.true.machine.inverse(pose[None])).any()
-    assert found.distance.min() > 1e-3
+    assert value.distance.min() > 1e-3
     every = equilibria(eye.true, "directions", goals, starts)
-    assert every.alike == 0
+    assert every.same_image == 0
     assert every.reached > 0.95
 
 
@@ -380,8 +380,8 @@ def test_an_equilibrium_is_one(eye):
     """N^T e vanishes where the search says that the control rests."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
     three = eye.true.only(np.array([0, 1, 2]))
-    found = equilibria(three, "directions", poses[:3], poses[3:40])
-    for pose, goal in zip(found.T_base_platform, found.goal, strict=True):
+    value = equilibria(three, "directions", poses[:3], poses[3:40])
+    for pose, goal in zip(value.T_base_platform, value.goal, strict=True):
         wanted = true_edges(three, poses[goal][None])
         task = task_of("directions", three, true_edges(three, pose[None]), wanted,
                        legs_at(three, pose[None]))  # fmt: skip
@@ -399,19 +399,19 @@ def test_estimates_have_the_errors_asked_for(eye):
     drawing = eye.true.theta + 1e-3 * np.sin(np.arange(len(sigma)))
     rng = np.random.default_rng(0)
     true, identified, cad, hand = estimates(eye.true, drawing, unsure, 300, rng, 0.05, 0.1)
-    assert np.all(true.seen.theta == eye.true.theta)
-    off = identified.seen.theta - eye.true.theta
+    assert np.all(true.view.theta == eye.true.theta)
+    off = identified.view.theta - eye.true.theta
     np.testing.assert_allclose(off.std(axis=0), sigma, rtol=0.2)
-    np.testing.assert_allclose(cad.seen.theta, drawing)
+    np.testing.assert_allclose(cad.view.theta, drawing)
     # eq. 15: the drawing lies on the identified base centres as well as it can
     index = [table.names.index(f"legs[{j}].base.center.{x}") for j in range(1, 7) for x in "xyz"]
-    a = [apply(e.seen.T_camera_base[:, None], e.seen.theta[..., index].reshape(-1, 6, 3))
+    a = [apply(e.view.T_camera_base[:, None], e.view.theta[..., index].reshape(-1, 6, 3))
          for e in (identified, cad)]  # fmt: skip
     gap = a[1] - a[0]
     assert np.abs(gap.mean(axis=1)).max() < 1e-12
     assert np.sqrt(np.mean(gap**2)) < 1.2e-3
-    place = inverse(hand.seen.T_camera_base)
-    exact = inverse(estimates(eye.true, drawing, unsure, 2, rng, 0.0, 0.0)[3].seen.T_camera_base)
+    place = inverse(hand.view.T_camera_base)
+    exact = inverse(estimates(eye.true, drawing, unsure, 2, rng, 0.0, 0.0)[3].view.T_camera_base)
     np.testing.assert_allclose(
         np.linalg.norm(place[:, :3, 3] - exact[0, :3, 3], axis=-1), 0.05, atol=1e-9
     )
@@ -430,13 +430,13 @@ SHORT = replace(CLEAN, rate=4.0, duration=8.0)
 
 
 def test_a_study_that_is_well(eye):
-    found = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
-    assert [o.reached for o in found.outcomes] == [6, 6, 6, 6]
-    words = judgement(found)
+    results = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
+    assert [o.reached for o in results.outcomes] == [6, 6, 6, 6]
+    words = judgement(results)
     assert words.usable
     assert "6 of 6 runs" in words.headline
     assert not words.reasons
-    settled = found.outcome("identified").settling
+    settled = results.outcome("identified").settling
     assert np.all(np.abs(settled - np.log(50)) < 1.0)
 
 
@@ -444,25 +444,25 @@ def test_how_far_a_platform_leaves_its_way(eye):
     """By hand millimetres beside it, which neither its end nor the time tells; and by definition
     nothing with the true geometry.
     """
-    found = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
-    true, identified, _, hand = (o.astray for o in found.outcomes)
+    value = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
+    true, identified, _, hand = (o.astray for o in value.outcomes)
     assert true.max() == 0
     assert 1e-3 < np.median(hand) < 10e-3
     assert np.median(identified) < np.median(hand) / 10
     # of a run by itself: the farthest of its samples from all of the true one's
-    runs, ideal = (found.outcome(name).runs.T_base_platform[0] for name in ("hand", "true"))
+    runs, ideal = (value.outcome(name).runs.T_base_platform[0] for name in ("hand", "true"))
     machine = eye.true.machine
     here, there = (platform_joints(machine, T) for T in (runs, ideal))
     nearest = [min(np.sqrt(np.mean(np.sum((p - q) ** 2, axis=-1))) for q in there) for p in here]
     assert hand[0] == pytest.approx(max(nearest), rel=1e-12)
-    assert any("beside its way" in text for text in judgement(found).warnings)
+    assert any("beside its way" in text for text in judgement(value).warnings)
 
 
 def test_the_seed_decides(eye):
     legs = (0, 2, 3, 4)
     loop = replace(SHORT, duration=1.0, noise=EdgeNoise(0.1, 0.1))
     ways = [
-        study_servoing(scene_of(eye, legs), Plan(loop, runs=2, seed=seed)).outcomes[1].runs.way
+        study_servoing(scene_of(eye, legs), Plan(loop, runs=2, seed=seed)).outcomes[1].runs.travel
         for seed in (1, 1, 2)
     ]
     np.testing.assert_array_equal(ways[0], ways[1])
@@ -470,8 +470,8 @@ def test_the_seed_decides(eye):
 
 
 def test_three_legs_are_warned_of(eye):
-    found = study_servoing(scene_of(eye, (0, 1, 2)), Plan(replace(SHORT, law="directions"), runs=8))
-    words = judgement(found)
+    value = study_servoing(scene_of(eye, (0, 1, 2)), Plan(replace(SHORT, law="directions"), runs=8))
+    words = judgement(value)
     assert not words.usable
     assert "legs 1 to 3 should not be used" in words.headline
     warned = " ".join(words.warnings)
@@ -481,8 +481,8 @@ def test_three_legs_are_warned_of(eye):
 
 
 def test_two_legs_are_blind(eye):
-    found = study_servoing(scene_of(eye, (0, 3)), Plan(replace(SHORT, law="directions"), runs=2))
-    words = judgement(found)
+    value = study_servoing(scene_of(eye, (0, 3)), Plan(replace(SHORT, law="directions"), runs=2))
+    words = judgement(value)
     assert not words.usable
     assert "do not show every motion" in words.headline
     assert "stay the same under some motion" in words.reasons[0]
@@ -495,9 +495,9 @@ def test_poses_that_cannot_be_are_refused(eye):
     with pytest.raises(InputError, match="outside of the workspace"):
         check_pose(machine, high, "--goal")
     rps = load_mechanism("3-rps")
-    aside = perturb(rps.home(), np.array([0, 0, 0, 0.03, 0, 0]))
+    offset = perturb(rps.home(), np.array([0, 0, 0, 0.03, 0, 0]))
     with pytest.raises(InputError, match="cannot take this pose"):
-        check_pose(rps, aside, "--start")
+        check_pose(rps, offset, "--start")
 
 
 def test_a_camera_that_sees_too_little_is_refused(eye):

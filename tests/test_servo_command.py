@@ -34,9 +34,9 @@ def test_a_built_in_machine(studied):
     assert sorted(p.name for p in folder.iterdir()) == ["servo.html", "servo.json"]
     document = json.loads((folder / "servo.json").read_text())
     assert document["estimates"] == done.json["estimates"]
-    found = document["estimates"]
-    assert found["true"]["astray_largest"] == 0
-    assert found["hand"]["astray_median"] > 5 * found["identified"]["astray_median"] > 0
+    count = document["estimates"]
+    assert count["true"]["astray_largest"] == 0
+    assert count["hand"]["astray_median"] > 5 * count["identified"]["astray_median"] > 0
     assert document["settings"]["legs"] == [1, 2, 3, 4, 5, 6]
     curves = document["curves"]
     assert {len(values) for values in curves.values()} == {48}
@@ -54,8 +54,8 @@ def test_the_page_is_whole(studied):
     frames = json.loads(re.search(r'id="frames-space">(.*?)</script>', page, re.DOTALL)[1])
     assert len(frames) == 48
     assert frames[0]["traces"] == list(range(7))
-    moved = frames[0]["data"][0]["x"] != frames[-1]["data"][0]["x"]
-    assert moved
+    shifted = frames[0]["data"][0]["x"] != frames[-1]["data"][0]["x"]
+    assert shifted
     assert "Play" in page
     assert "http://" not in re.sub(r'id="plotly">.*?</script>', "", page, flags=re.DOTALL)
 
@@ -82,9 +82,9 @@ def test_the_animation_has_its_pictures(studied, tmp_path):
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom",
                f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000",
                changed.as_uri()]  # fmt: skip
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    title = re.search(r"<title>frames (\d+) ([\d.]+) ([\d.]+)</title>", shown.stdout)
-    assert title, shown.stdout[:500]
+    display = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    title = re.search(r"<title>frames (\d+) ([\d.]+) ([\d.]+)</title>", display.stdout)
+    assert title, display.stdout[:500]
     assert int(title[1]) == 48
     assert float(title[2]) == pytest.approx(float(title[3]), abs=0.5)
 
@@ -101,10 +101,10 @@ def test_words_for_people(tmp_path):
 def test_a_calibration_with_its_camera(demo, tmp_path):
     done = run("servo", demo.calibration, *QUICK, "-o", tmp_path / "out", "--json")
     assert done.code in (0, 1), done.out
-    found = done.json
-    assert found["station"] == "station1"
-    assert found["estimates"]["identified"]["reached"] >= 2
-    assert "calibration's covariance" in found["origin"]
+    value = done.json
+    assert value["station"] == "station1"
+    assert value["estimates"]["identified"]["reached"] >= 2
+    assert "calibration's covariance" in value["origin"]
     other = run("servo", demo.calibration, *QUICK, "--station", "station9", "-o", tmp_path / "two")
     assert other.code == 2
     assert "no such station" in other.err

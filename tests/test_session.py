@@ -172,9 +172,11 @@ def test_a_configuration_without_photograph_is_a_warning(folder):
 def test_two_stations_need_not_photograph_the_same(folder):
     image(folder / "images/left/0001.png")
     (folder / "images/front/0001.png").unlink()
-    left = SESSION[SESSION.index("  front:") : SESSION.index("    pose:")]
+    remainder = SESSION[SESSION.index("  front:") : SESSION.index("    pose:")]
     with (folder / "session.yaml").open("a") as stream:
-        stream.write(left.replace("  front:", "  left:").replace("images/front", "images/left"))
+        stream.write(
+            remainder.replace("  front:", "  left:").replace("images/front", "images/left")
+        )
     session = load_session(folder)
     assert session.warnings == ()
     assert [len(station.photographs) for station in session.stations] == [2, 1]
@@ -372,8 +374,8 @@ def test_lengths_in_millimetres(folder):
     (folder / "joints.csv").write_text(scaled(1e3))
     message = fault(load_session, folder)
     assert "joints.csv, line 2, column leg1: the readings look like millimetres" in message
-    said = "expected metres, between 0.345 and 0.485. Divide them by 1000, or head the columns leg1"
-    assert said in message
+    text = "expected metres, between 0.345 and 0.485. Divide them by 1000, or head the columns leg1"
+    assert text in message
 
 
 def test_motors_in_degrees(folder):
@@ -390,8 +392,8 @@ def shifted(by, columns=range(6)):
     header, *rows = JOINTS.splitlines()
     for row in rows:
         name, *cells = row.split(",")
-        moved = [float(x) + by * (k in columns) for k, x in enumerate(cells)]
-        header += f"\n{name}," + ",".join(f"{x:.4f}" for x in moved)
+        shifted = [float(x) + by * (k in columns) for k, x in enumerate(cells)]
+        header += f"\n{name}," + ",".join(f"{x:.4f}" for x in shifted)
     return header
 
 

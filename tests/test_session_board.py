@@ -22,9 +22,9 @@ def joined(folder):
     board = "pkmcal: 1\nboard: {file: board.yaml, fixed_to: base}"
     replaced(folder / "session.yaml", "pkmcal: 1", board)
     replaced(folder / "session.yaml", "observe: legs", "observe: [legs, board]")
-    left = "  left: {camera: cameras/front.yaml, images: 'images/left/{configuration}.png', "
+    remainder = "  left: {camera: cameras/front.yaml, images: 'images/left/{configuration}.png', "
     with (folder / "session.yaml").open("a") as stream:
-        stream.write(left + "observe: [board, legs]}\n")
+        stream.write(remainder + "observe: [board, legs]}\n")
     return folder
 
 

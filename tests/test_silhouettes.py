@@ -10,19 +10,24 @@ import pytest
 import yaml
 
 from pkmcal.boards.views import Boards
-from pkmcal.calibration import byhand, turns
+from pkmcal.calibration import handheld, refinement
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.gather import edges_by_camera
-from pkmcal.calibration.recognise import platform_poses, read_photographs
-from pkmcal.calibration.responses import _way
-from pkmcal.calibration.turns import Turns, _scatter_of, _variance, looked_again
+from pkmcal.calibration.camera_refinement import edges_by_camera
+from pkmcal.calibration.camera_responses import _normal_turn
+from pkmcal.calibration.localization import platform_poses, read_photographs
+from pkmcal.calibration.refinement import (
+    RefinementResult,
+    _scatter_of,
+    _variance,
+    imputation_variance,
+)
 from pkmcal.geometry.rigid import angle_between, inverse, perturb, pose, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe.alone import finest_view, likeliest_near
-from pkmcal.observe.evidence import LAST_REACH
+from pkmcal.observe.image_localization import finest_view, refine_local
+from pkmcal.observe.pose_likelihood import LAST_REACH
 from pkmcal.observe.predict import edge_points, legs_in_camera
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.pages.page import page_html
@@ -73,7 +78,7 @@ def off_truth(view, T, edges):
 def test_silhouettes_lie_on_the_machine(views):
     """From a place a few pixels off they are where it truly is, as far as they say."""
     rng = np.random.default_rng(0)
-    found = []
+    results = []
     for view, T in views:
         near = perturb(T, rng.normal(size=6) * np.repeat([1e-3, 1e-3], 3))
         look = silhouette_edges(view, near, 7)
@@ -82,8 +87,8 @@ def test_silhouettes_lie_on_the_machine(views):
         assert np.all(edges.coarse)
         assert len(look.points) == len(look.point_edge)
         assert set(look.point_edge.tolist()) == set(range(len(edges)))
-        found.append(off_truth(view, T, edges))
-    off = np.concatenate(found)
+        results.append(off_truth(view, T, edges))
+    off = np.concatenate(results)
     assert len(off) > 40
     # stated with what scatters at most; a machine that is known well is closer
     assert 0.1 < np.sqrt(np.median(np.sum(off**2, axis=1)) / 1.386) < 1
@@ -93,10 +98,10 @@ def test_silhouettes_lie_on_the_machine(views):
 def test_silhouettes_say_how_they_depend_on_the_camera(views):
     """As their pixels' rays turn with its parameters, so do the planes through them."""
     view, T = views[0]
-    look = silhouette_edges(view, T, 0, refine_camera=True)
-    by_camera = look.edges.by_intrinsics
-    seen = Observation(look.edges, (), look.points, look.point_edge, T[None])
-    by_rays = edges_by_camera(seen, [view.camera])
+    edges = silhouette_edges(view, T, 0, refine_camera=True)
+    by_camera = edges.edges.by_intrinsics
+    in_view = Observation(edges.edges, (), edges.points, edges.point_edge, T[None])
+    by_rays = edges_by_camera(in_view, [view.camera])
     size = np.linalg.norm(by_rays[:, 0], axis=-1)
     off = np.linalg.norm((by_camera - by_rays)[:, 0], axis=-1)
     # pixels weigh by how surely they are the machine's, rays all the same
@@ -108,11 +113,15 @@ def test_coarse_edges_say_nothing_of_how_light_is_coded(views):
     view, T = views[0]
     edges = silhouette_edges(view, T, 0).edges
     measured = replace(edges, coarse=np.arange(len(edges)) % 2 == 1)
-    moved = replace(edges, normal=edges.normal + 1e-3 * edges.basis[..., 0])
-    way = _way(measured, replace(moved, coarse=np.arange(len(edges)) % 3 == 2))[..., 0]
-    tells = (np.arange(len(edges)) % 2 == 0) & (np.arange(len(edges)) % 3 < 2)
-    np.testing.assert_allclose(way[tells], np.broadcast_to([1e-3, 0], (tells.sum(), 2)), atol=1e-12)
-    assert not way[~tells].any()
+    shifted = replace(edges, normal=edges.normal + 1e-3 * edges.basis[..., 0])
+    direction = _normal_turn(measured, replace(shifted, coarse=np.arange(len(edges)) % 3 == 2))[
+        ..., 0
+    ]
+    shares = (np.arange(len(edges)) % 2 == 0) & (np.arange(len(edges)) % 3 < 2)
+    np.testing.assert_allclose(
+        direction[shares], np.broadcast_to([1e-3, 0], (shares.sum(), 2)), atol=1e-12
+    )
+    assert not direction[~shares].any()
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -121,12 +130,12 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
     turn = rotation(np.radians(6.0) * np.eye(3)[axis])
     middle = view.machine.base_centers().mean(axis=0) + np.array([0.0, 0.0, 0.15])
     away = T @ pose(turn, middle - turn @ middle)
-    found, evidence = likeliest_near(view, away, LAST_REACH / 4)
-    assert np.degrees(angle_between(found, T)) < 0.7
-    eye = inverse(np.stack([found, T]))[:, :3, 3]
+    values, log_likelihood_ratio = refine_local(view, away, LAST_REACH / 4)
+    assert np.degrees(angle_between(values, T)) < 0.7
+    eye = inverse(np.stack([values, T]))[:, :3, 3]
     assert np.linalg.norm(eye[0] - eye[1]) < 0.02
-    _, here = likeliest_near(view, T, LAST_REACH / 4)
-    assert evidence == pytest.approx(here, rel=0.03)
+    _, here = refine_local(view, T, LAST_REACH / 4)
+    assert log_likelihood_ratio == pytest.approx(here, rel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -138,29 +147,29 @@ def calibration(folder):
 
 def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     """Of a photograph by hand: once each, measured or coarse, and not among what is left out."""
-    found = calibration.observation
-    edges = found.edges
+    value = calibration.observation
+    edges = value.edges
     assert 0 < edges.coarse.sum() < (~edges.coarse).sum()
     each = np.stack([edges.station, edges.leg, edges.tube, edges.side], axis=1)
     assert len(np.unique(each, axis=0)) == len(edges)
     given_up = {
-        (r.station, r.leg, r.tube, r.side) for r in found.rejected if "disagree" not in r.reason
+        (r.station, r.leg, r.tube, r.side) for r in value.rejected if "disagree" not in r.reason
     }
     assert not given_up & set(map(tuple, each.tolist()))
-    assert set(found.point_edge.tolist()) == set(range(len(edges)))
+    assert set(value.point_edge.tolist()) == set(range(len(edges)))
     # and told apart
-    told = outcome_of(calibration)
-    rows = json.loads(told.texts["calibration.json"])["residuals"]
+    values = outcome_of(calibration)
+    rows = json.loads(values.texts["calibration.json"])["residuals"]
     coarse = [row[rows["columns"].index("coarse")] for row in rows["edges"]]
     assert coarse == edges.coarse.tolist()
     count = int(edges.coarse.sum())
-    said = f"{len(edges) - count} edges measured and {count} told by silhouettes"
-    page = page_html(told)
-    assert said in page
+    text = f"{len(edges) - count} edges measured and {count} told by silhouettes"
+    page = page_html(values)
+    assert text in page
     # what depends on where they were looked for is in the deviations, and said
-    variance = calibration.measurements.look_variance
+    variance = calibration.measurements.imputation_covariance
     assert 0.02 < variance < 2
-    assert calibration.estimate.statistics.look_scatter == pytest.approx(np.sqrt(variance))
+    assert calibration.estimate.statistics.imputation_scatter == pytest.approx(np.sqrt(variance))
     assert f"results scatter by {np.sqrt(variance):.1f} of the deviations" in page
 
 
@@ -168,7 +177,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
 def tripod_calibration(beside):
     """Of the photographs of the camera on the tripod alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(turns, "LOOKS_AGAIN", 2)
+        patch.setattr(refinement, "IMPUTATION_PASSES", 2)
         return calibrate_session(beside[0].parent / "tripod")
 
 
@@ -176,9 +185,9 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
     """Machines that scatter as noise lets them have one, twice as far apart they have four."""
     calibration = tripod_calibration
     machine, state = calibration.session.machine, calibration.estimate.state
-    measurements = replace(calibration.measurements, look_variance=0.0)
+    measurements = replace(calibration.measurements, imputation_covariance=0.0)
     estimate = bundle(machine, measurements, state)
-    again = bundle(machine, replace(measurements, look_variance=1.0), state)
+    again = bundle(machine, replace(measurements, imputation_covariance=1.0), state)
     n = len(estimate.state.theta)
     noise = (again.joint_covariance - estimate.joint_covariance)[:n, :n]
     value, vectors = np.linalg.eigh(noise)
@@ -193,7 +202,7 @@ def turns_of(calibration, shading, photographs):
     """What the last look left, had its edges been shaded by so many px, as light moves them."""
     estimate = calibration.estimate
     noise = replace(estimate.edge_noise, shading=np.full_like(estimate.edge_noise.shading, shading))
-    return Turns(
+    return RefinementResult(
         calibration.observation,
         calibration.measurements,
         replace(estimate, edge_noise=noise),
@@ -203,18 +212,18 @@ def turns_of(calibration, shading, photographs):
     )
 
 
-def looked_from_machines_as_likely(calibration, found):
-    seen = SimpleNamespace(session=calibration.session, boards=Boards())
-    return looked_again(seen, found, np.random.default_rng(0), lambda *_: None)
+def looked_from_machines_as_likely(calibration, value):
+    visible = SimpleNamespace(session=calibration.session, boards=Boards())
+    return imputation_variance(visible, value, np.random.default_rng(0), lambda *_: None)
 
 
 @pytest.mark.parametrize(("times", "asked"), [(0.9, False), (1.1, True)])
 def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, asked):
     photographs = read_photographs(tripod_calibration.session)
-    found = turns_of(tripod_calibration, times * POLISHED_SHADING, photographs)
-    ended = looked_from_machines_as_likely(tripod_calibration, found)
-    assert (ended is found) != asked
-    assert (ended.measurements.look_variance > 0) == asked
+    value = turns_of(tripod_calibration, times * POLISHED_SHADING, photographs)
+    ended = looked_from_machines_as_likely(tripod_calibration, value)
+    assert (ended is value) != asked
+    assert (ended.measurements.imputation_covariance > 0) == asked
 
 
 def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration):
@@ -223,9 +232,9 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibratio
         replace(p, images=[np.full_like(image, 90) for image in p.images])
         for p in read_photographs(tripod_calibration.session)
     ]
-    found = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
-    ended = looked_from_machines_as_likely(tripod_calibration, found)
-    assert ended.estimate.statistics.look_scatter == 1
+    value = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
+    ended = looked_from_machines_as_likely(tripod_calibration, value)
+    assert ended.estimate.statistics.imputation_scatter == 1
 
 
 @pytest.fixture(scope="module")
@@ -252,26 +261,26 @@ def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, mon
     photographs, T = read_photographs(session), beside[1]
     assert [len(p.images) for p in photographs] == [1, 1, 1, 1, 4]
     found_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
-    seen = byhand.place(session, photographs, Boards(), np.random.default_rng(0))
-    known = seen.known
-    assert [len(p.images) for p in seen.photographs] == [1, 1, 1, 1, 4]
-    assert sorted(known.edges) == [0, 1, 2, 3, 4]
+    case = handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
+    scene = case.scene
+    assert [len(p.images) for p in case.photographs] == [1, 1, 1, 1, 4]
+    assert sorted(scene.edges) == [0, 1, 2, 3, 4]
     for k, p in enumerate(photographs):
-        assert set(known.edges[k].configuration.tolist()) == {p.configuration[0]}
+        assert set(scene.edges[k].configuration.tolist()) == {p.configuration[0]}
     # and lie there where the machine truly is
     one = photographs[4].select(np.arange(1))
     poses = platform_poses(session)
     view = finest_view(session.machine, one, session.joints, poses)
-    off = off_truth(view, T[4], known.edges[4])
+    off = off_truth(view, T[4], scene.edges[4])
     assert np.median(np.abs(off)) < 1
 
 
 def test_without_photographs_by_hand_none_is_searched(tripod_calibration):
     session = tripod_calibration.session
     rng = np.random.default_rng(0)
-    found = byhand.localize(session, read_photographs(session), Boards(), rng)
-    assert found.recognition is not None
-    assert found.places == {}
+    value = handheld.localize(session, read_photographs(session), Boards(), rng)
+    assert value.recognition is not None
+    assert value.places == {}
 
 
 def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
@@ -280,23 +289,23 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
     """
     estimate, session = calibration.estimate, calibration.session
     rng = np.random.default_rng(0)
-    drawn = list(turns._as_likely(session, calibration.measurements, estimate, rng))
+    drawn = list(refinement._as_likely(session, calibration.measurements, estimate, rng))
     away = np.stack([one.state.theta - estimate.state.theta for one in drawn])
-    assert len(drawn) == turns.LOOKS_AGAIN
+    assert len(drawn) == refinement.IMPUTATION_PASSES
     np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-4)
     for one in drawn:
-        cameras = calibration.cameras.moved(one)
-        seen = [replace(p, camera=cameras.at_station(p.station)) for p in read_photographs(session)]
-        looks = turns._looked(session, seen, one, {}, 1.0, True)
-        moved = [look.moved for look in looks]
-        assert 0.01 < np.median(moved) < 0.4
+        cameras = calibration.cameras.updated(one)
+        case = [replace(p, camera=cameras.at_station(p.station)) for p in read_photographs(session)]
+        passes = refinement._measurement_pass(session, case, one, {}, 1.0, True)
+        shifted = [station_edges.shift for station_edges in passes]
+        assert 0.01 < np.median(shifted) < 0.4
 
 
 def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
     """By how far the last look moved it, in its deviations."""
-    found = turns_of(tripod_calibration, 0.0, ())
-    assert list(found._replace(change=0.9 * turns.SETTLED_MACHINE_CHANGE).doubts) == []
-    (reason,) = found._replace(change=2.5).doubts
+    results = turns_of(tripod_calibration, 0.0, ())
+    assert list(results._replace(change=0.9 * refinement.SETTLED_MACHINE_CHANGE).reasons) == []
+    (reason,) = results._replace(change=2.5).reasons
     assert reason.code == "estimate.unsettled"
     assert reason.facts["change"] == 2.5
 

@@ -107,8 +107,8 @@ def test_silhouettes_are_where_the_edge_normals_say(a, b, radius, view):
         # the lit area of seven pixels across the edge gives its place without any fit
         first = np.rint(wanted).astype(int) - 3
         lit = image[rows[:, None], first[:, None] + np.arange(7)].sum(axis=1)
-        found = first + 6.5 - lit if pixel is low else first - 0.5 + lit
-        error = found - wanted
+        value = first + 6.5 - lit if pixel is low else first - 0.5 + lit
+        error = value - wanted
         assert len(error) > 150
         assert abs(error.mean()) < 0.005
         halves = [part.mean() for part in np.array_split(error, 2)]
@@ -128,14 +128,14 @@ def test_a_pixel_has_the_mean_over_its_area():
     ]
     lamp = Lamp(np.array([0.6, -1.0, 0.4]), radius=0.001, power=0.7, reach=1.3, shadows=True)
 
-    def seen(scale):
+    def in_view(scale):
         middle = [100 * scale - 0.5, 75 * scale - 0.5]
         parameters = np.array([178.0 * scale, 178.0 * scale, *middle, 0, 0, 0, 0, 0])
         camera = camera_models()["pinhole"]((200 * scale, 150 * scale), parameters)
         return picture(parts, PixelRays.of(camera), Lighting((lamp,), 0.1, 0.05))
 
-    mean = seen(4).reshape(150, 4, 200, 4).mean(axis=(1, 3))
-    off = seen(1) - mean
+    mean = in_view(4).reshape(150, 4, 200, 4).mean(axis=(1, 3))
+    off = in_view(1) - mean
     border = np.abs(np.gradient(mean, axis=1)) > 0.02
     assert np.count_nonzero(border) > 1000
     assert np.ptp(mean) > 0.5
@@ -148,12 +148,12 @@ def test_a_pixel_has_the_mean_over_its_area():
 def test_nearer_shapes_hide_farther_ones(view):
     upright, level = between((0, 0, -0.2), (0, 0, 0.2), 0.03), ((-0.2, 0, 0), (0.2, 0, 0))
     middle = tuple(np.rint(CAMERA.project(apply(FRONT, np.zeros(3)))).astype(int)[::-1])
-    for depth, seen in ((-0.1, 0.7), (0.1, 0.3)):
+    for depth, in_view in ((-0.1, 0.7), (0.1, 0.3)):
         shift = np.array([0, depth, 0])
         other = between(level[0] + shift, level[1] + shift, 0.03)
         parts = [glowing(upright, 0.3), glowing(other, 0.7)]
         for order in (parts, parts[::-1]):
-            assert picture(order, view)[middle] == seen
+            assert picture(order, view)[middle] == in_view
 
 
 def test_every_shape_is_entered_on_its_surface_facing_the_ray():
@@ -252,24 +252,24 @@ def test_a_style_changes_the_legs_alone_and_no_silhouette(machine):
         pose, readings = truth.T_base_platform[0], truth.joints[0]
         return finish, machine_parts(machine, discs_of(machine), finish, pose, readings, as_built)
 
-    def seen(parts):
+    def in_view(parts):
         return picture([*parts, *room.parts], view, room.lighting, station)
 
     finish, mixed = parts("mixed")
     legs = [part for part in mixed if part.material in (finish.paint, finish.steel)]
     on_legs = picture([glowing(part.shape) for part in legs], view, DARK, station) > 0
-    usual = seen(mixed)
+    usual = in_view(mixed)
     for style in ("matte", "dark", "metal"):
-        differs = np.abs(seen(parts(style)[1]) - usual)
+        differs = np.abs(in_view(parts(style)[1]) - usual)
         assert np.mean(differs[on_legs] > 0.02) > 0.2
         # other borders are looked at through other points of their pixels
         assert differs[~on_legs].max() < 0.1
-    assert seen(parts("dark")[1])[on_legs].mean() < 0.5 * usual[on_legs].mean()
+    assert in_view(parts("dark")[1])[on_legs].mean() < 0.5 * usual[on_legs].mean()
     _, built = parts("mixed", as_built=True)
     # a motor, a ring and a cable for each leg, and nothing else moved
     assert len(built) == len(mixed) + machine.n_legs * (2 + CABLE_PIECES)
     # they hide a part of the legs, or shade it
-    assert 0.02 < np.mean(np.abs(seen(built) - usual)[on_legs] > 0.05) < 0.5
+    assert 0.02 < np.mean(np.abs(in_view(built) - usual)[on_legs] > 0.05) < 0.5
 
 
 def test_noise_of_a_photograph_is_as_stated():
@@ -323,13 +323,13 @@ def _check_exact(machine, T_camera_base, poses, edges, e):
 def test_an_outward_shift_moves_edges_by_pixels(setting):
     machine, T_camera_base, poses = setting
     rng = np.random.default_rng(0)
-    sharp, moved = (
+    sharp, shifted = (
         simulate_edges(
             machine, T_camera_base, CAMERA, poses, EdgeNoise(1e-9, 1e-9, outward=px), rng
         )[0]
         for px in (0.0, 0.2)
     )
-    turn = np.einsum("nij,ni->nj", sharp.basis, moved.normal - sharp.normal)
+    turn = np.einsum("nij,ni->nj", sharp.basis, shifted.normal - sharp.normal)
     np.testing.assert_allclose(turn, 0.2 * sharp.shift, atol=2e-7)
     # the middle of the edge: the first basis vector is its ray; a pixel outward lies on the plane
     middle = sharp.basis[:, :, 0]
@@ -337,7 +337,7 @@ def test_an_outward_shift_moves_edges_by_pixels(setting):
     by_pixel, _ = CAMERA.ray_jacobians(pixel)
     outward = np.einsum("nij,ni->nj", by_pixel, sharp.normal)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    off = np.sum(CAMERA.ray(pixel + 0.2 * outward) * moved.normal, axis=1) * 600
+    off = np.sum(CAMERA.ray(pixel + 0.2 * outward) * shifted.normal, axis=1) * 600
     assert np.abs(off).max() < 0.02
 
 
@@ -436,8 +436,10 @@ def test_a_session_loads_back(simulated, machine):
     np.testing.assert_array_equal(session.joints, truth.readings)
     np.testing.assert_array_equal(session.machine.values, machine.values)
     assert [s.name for s in session.stations] == list(truth.stations)
-    found = [[s, p.configuration] for s, st in enumerate(session.stations) for p in st.photographs]
-    np.testing.assert_array_equal(found, truth.photographs)
+    results = [
+        [s, p.configuration] for s, st in enumerate(session.stations) for p in st.photographs
+    ]
+    np.testing.assert_array_equal(results, truth.photographs)
     np.testing.assert_array_equal(session.stations[0].camera.parameters, SMALL.parameters)
     for station, T in zip(session.stations, truth.T_camera_base, strict=True):
         off = pose_difference(inverse(station.T_camera_base), inverse(T))
@@ -451,8 +453,13 @@ def test_a_session_loads_back(simulated, machine):
 def test_truth_is_consistent_and_reads_back(simulated, machine):
     folder, truth = simulated
     again = load_truth(folder, machine)
-    for kept in (truth, again):
-        c = closure(kept.machine.layout, kept.machine.values, kept.joints, kept.T_base_platform)
+    for retained in (truth, again):
+        c = closure(
+            retained.machine.layout,
+            retained.machine.values,
+            retained.joints,
+            retained.T_base_platform,
+        )
         assert np.abs(c.rows.value).max() < 1e-12
     np.testing.assert_array_equal(again.machine.values, truth.machine.values)
     np.testing.assert_array_equal(again.T_camera_base, truth.T_camera_base)

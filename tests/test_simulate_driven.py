@@ -98,8 +98,8 @@ def test_a_cranks_axis_is_where_its_arm_turns_about(name):
         arm = a - drives.foot
         np.testing.assert_allclose(np.linalg.norm(arm, axis=1), drives.arm, atol=1e-12)
         np.testing.assert_allclose(np.sum(arm * drives.axis, axis=1), 0, atol=1e-12)
-    told = [leg.base.arm for leg in machine.document.legs]
-    np.testing.assert_allclose(drives.arm, told, atol=1e-12)
+    rows = [leg.base.arm for leg in machine.document.legs]
+    np.testing.assert_allclose(drives.arm, rows, atol=1e-12)
     np.testing.assert_allclose(np.abs(np.sum(drives.axis * machine.base_axes(), axis=1)), 1)
 
 
@@ -272,20 +272,20 @@ def mixed(tmp_path_factory):
 
 
 def test_forearms_and_board_in_photographs(mixed):
-    found = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
-    errors = compare_with_truth(found, mixed)
-    assert found.verdict.usable
-    assert found.estimate.statistics.n_poses >= 6 * 2
-    assert len(found.observation.edges) > 40
+    value = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
+    errors = compare_with_truth(value, mixed)
+    assert value.verdict.usable
+    assert value.estimate.statistics.n_poses >= 6 * 2
+    assert len(value.observation.edges) > 40
     assert errors.calibrated.position < errors.drawing.position / 10
     assert errors.calibrated.orientation < errors.drawing.orientation / 10
 
 
 @pytest.mark.slow
 def test_forearms_alone_in_photographs(mixed):
-    found = pkmcal.calibrate(observing(mixed, "legs"))
-    errors = compare_with_truth(found, mixed)
-    assert found.estimate.statistics.n_poses == 0
+    value = pkmcal.calibrate(observing(mixed, "legs"))
+    errors = compare_with_truth(value, mixed)
+    assert value.estimate.statistics.n_poses == 0
     assert errors.calibrated.position < errors.drawing.position / 5
 
 
@@ -334,13 +334,13 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
     folder = photographed(tmp_path / "s", name, camera, 20, board, 1)
     sigma = []
     for words in ("legs", "board", ["legs", "board"]):
-        found = pkmcal.calibrate(observing(folder, words))
-        drawing = found.session.machine
-        z = whitened(drawing, found.estimate, load_truth(folder, drawing))
+        value = pkmcal.calibrate(observing(folder, words))
+        drawing = value.session.machine
+        z = whitened(drawing, value.estimate, load_truth(folder, drawing))
         assert np.sqrt(np.mean(z**2)) < 1.3
-        errors = compare_with_truth(found, folder)
+        errors = compare_with_truth(value, folder)
         assert errors.calibrated.position < errors.drawing.position
-        sigma.append(np.sqrt(np.diag(found.estimate.covariance)))
+        sigma.append(np.sqrt(np.diag(value.estimate.covariance)))
     kinematic = np.array(drawing.parameters.kinds) != "radius"
     legs, board, both = (np.median(s[kinematic & (s > 1e-9)]) for s in sigma)
     assert both < min(legs, board)
@@ -352,7 +352,7 @@ def test_a_home_that_a_limb_does_not_reach_is_told_with_its_file(tmp_path):
     path = tmp_path / "short.yaml"
     path.write_text(re.sub(r"constant: [\d.]+", "constant: 0.01", text, count=1))
     result = run("simulate", str(tmp_path / "out"), "--mechanism", str(path), "--size", "64x64")
-    told = " ".join((result.out + result.err).split())
+    values = " ".join((result.out + result.err).split())
     assert result.code == 2
-    assert "short.yaml: mechanism '6-rus' cannot take its home pose: joint 1 cannot reach" in told
+    assert "short.yaml: mechanism '6-rus' cannot take its home pose: joint 1 cannot reach" in values
     assert not (tmp_path / "out").exists()

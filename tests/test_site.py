@@ -24,9 +24,9 @@ class Links(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         del tag
-        found = dict(attrs)
-        self.links += [found[key] for key in ("href", "src") if found.get(key)]
-        self.marks |= {found[key] for key in ("id", "name") if found.get(key)}
+        results = dict(attrs)
+        self.links += [results[key] for key in ("href", "src") if results.get(key)]
+        self.marks |= {results[key] for key in ("id", "name") if results.get(key)}
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +55,10 @@ def test_every_link_leads_somewhere(site):
                 continue
             name, _, mark = link.partition("#")
             there = (path.parent / name).resolve()
-            known = pages.get(there)
-            if not there.exists() or (mark and known and mark not in known.marks):
+            reference_values = pages.get(there)
+            if not there.exists() or (
+                mark and reference_values and mark not in reference_values.marks
+            ):
                 lost.append(f"{path.name}: {link}")
     assert not lost
 
@@ -84,11 +86,11 @@ def test_the_page_of_python_has_every_public_name(site):
 def test_docstrings_are_typeset(site):
     """Sections of numpydoc become lists, and no role of Sphinx is printed as it is written."""
     text = (site / "api.html").read_text("utf-8")
-    shown = re.sub(r"<[^>]+>", "", text)
-    assert not re.search(r":(class|data|func|meth|mod):", shown)
-    assert not re.search(r"^-{4,}$", shown, re.MULTILINE)
+    display = re.sub(r"<[^>]+>", "", text)
+    assert not re.search(r":(class|data|func|meth|mod):", display)
+    assert not re.search(r"^-{4,}$", display, re.MULTILINE)
     for name in ("calibrate", "load_session", "load_mechanism", "load_camera", "plan", "study"):
-        own = shown[shown.index(f"{name}(\n") :]
+        own = display[display.index(f"{name}(\n") :]
         assert re.match(r".*?\bParameters:", own, re.DOTALL), name
         assert own.index("Parameters:") < 2000, name
 

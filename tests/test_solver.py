@@ -81,7 +81,7 @@ def test_damped_step_equals_dense_marquardt():
 
 def test_reduced_normal_is_the_schur_complement():
     linear = random_linear(np.random.default_rng(2))
-    rows, left = rows_on_shared(linear, eliminate(linear))
+    rows, residual = rows_on_shared(linear, eliminate(linear))
     normal = rows.mT @ rows
     for run in range(3):
         jac, value = dense(linear, run)
@@ -90,7 +90,7 @@ def test_reduced_normal_is_the_schur_complement():
         np.testing.assert_allclose(normal[run], schur, atol=1e-11)
         g = jac.T @ value
         g = g[:na] - full[:na, na:] @ np.linalg.solve(full[na:, na:], g[na:])
-        np.testing.assert_allclose(rows[run].T @ left[run], g, atol=1e-11)
+        np.testing.assert_allclose(rows[run].T @ residual[run], g, atol=1e-11)
 
 
 def in_strips(rng, sharp, runs=2, k=11, own=3, na=9):
@@ -132,13 +132,13 @@ def test_products_of_strips_are_those_of_their_rows(damping, sharp):
     rows, damping = in_strips(np.random.default_rng(12), sharp), np.full(2, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
-    whole, (jac, left) = (
+    whole, (jac, remainder) = (
         normal_equations([rows], damping),
         rows_on_shared(*with_damping(linear, damping)),
     )
-    normal, gradient = jac.mT @ jac, (jac.mT @ left[..., None])[..., 0]
-    for found, by_rows in ((whole.matrix, normal), (whole.gradient, gradient)):
-        np.testing.assert_allclose(found, by_rows, atol=1e-9 * np.abs(by_rows).max())
+    normal, gradient = jac.mT @ jac, (jac.mT @ remainder[..., None])[..., 0]
+    for item, by_rows in ((whole.matrix, normal), (whole.gradient, gradient)):
+        np.testing.assert_allclose(item, by_rows, atol=1e-9 * np.abs(by_rows).max())
     steps = whole.step(damping), damped_step(linear, damping)
     np.testing.assert_allclose(steps[0][0], steps[1][0], rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(steps[0][1][0], steps[1][1], rtol=1e-8, atol=1e-10)
@@ -172,9 +172,9 @@ def test_typical_number_of_steps():
     rng = np.random.default_rng(4)
     assembled, truth = make_scene(rng, runs=20, configurations=8).batch(rng)
     start = replace(truth, z=0 * truth.z)
-    found = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
-    assert set(found.solution.stop) == {Stop.CONVERGED}
-    assert found.solution.steps.max() <= 10
+    solution = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
+    assert set(solution.solution.stop) == {Stop.CONVERGED}
+    assert solution.solution.steps.max() <= 10
 
 
 def rosenbrock(x, runs):
@@ -185,9 +185,9 @@ def rosenbrock(x, runs):
 
 
 def test_a_curved_valley_is_followed():
-    found = minimise_dense(rosenbrock, np.array([[-1.2, 1.0], [3.0, -4.0], [1.0, 1.0]]))
-    assert set(found.stop) == {Stop.CONVERGED}
-    np.testing.assert_allclose(found.state, 1, atol=1e-7)
+    actual_names = minimise_dense(rosenbrock, np.array([[-1.2, 1.0], [3.0, -4.0], [1.0, 1.0]]))
+    assert set(actual_names.stop) == {Stop.CONVERGED}
+    np.testing.assert_allclose(actual_names.state, 1, atol=1e-7)
 
 
 def test_a_minimum_with_residual_left():
@@ -197,15 +197,15 @@ def test_a_minimum_with_residual_left():
         value = np.concatenate([x**2 + 0.1, x - 1], axis=1)
         return value, np.stack([2 * x, np.ones_like(x)], axis=1)
 
-    found = minimise_dense(rows, np.array([[5.0], [-3.0]]))
-    x = found.state
-    assert set(found.stop) == {Stop.CONVERGED}
+    values = minimise_dense(rows, np.array([[5.0], [-3.0]]))
+    x = values.state
+    assert set(values.stop) == {Stop.CONVERGED}
     np.testing.assert_allclose(2 * x * (x**2 + 0.1), 1 - x, atol=1e-6)
 
 
 def test_step_limit_is_told():
-    found = minimise_dense(rosenbrock, np.array([[-1.2, 1.0]]))
-    assert found.steps[0] > 3
+    values = minimise_dense(rosenbrock, np.array([[-1.2, 1.0]]))
+    assert values.steps[0] > 3
     limited = minimise(Dense(rosenbrock, np.arange(1)), np.array([[-1.2, 1.0]]), max_steps=2)
     assert limited.stop == (Stop.STEPS,)
     assert "step limit" in limited.stop[0].value
@@ -216,8 +216,8 @@ def test_nothing_predictable_is_told():
     rng = np.random.default_rng(5)
     assembled, truth = make_scene(rng).batch(rng)
     broken = replace(truth, T_base_platform=truth.T_base_platform * np.nan)
-    found = minimise(assembled.problem, broken)
-    assert found.stop == (Stop.NOT_FINITE,)
+    solution = minimise(assembled.problem, broken)
+    assert solution.stop == (Stop.NOT_FINITE,)
 
 
 def test_an_uphill_jacobian_stalls():
@@ -225,9 +225,9 @@ def test_an_uphill_jacobian_stalls():
         value, jac = rosenbrock(x, runs)
         return value, -jac
 
-    found = minimise_dense(rows, np.array([[-1.2, 1.0]]))
-    assert found.stop == (Stop.STALLED,)
-    np.testing.assert_array_equal(found.state, [[-1.2, 1.0]])
+    values = minimise_dense(rows, np.array([[-1.2, 1.0]]))
+    assert values.stop == (Stop.STALLED,)
+    np.testing.assert_array_equal(values.state, [[-1.2, 1.0]])
 
 
 @pytest.mark.parametrize("column", [0, 3])

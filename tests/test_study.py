@@ -117,8 +117,8 @@ def test_a_machine_of_another_size_is_the_same_machine(name):
     readings = one.inverse(one.home()[None])
     expected = one.forward(readings)
     expected[..., :3, 3] *= 2
-    found = two.forward(np.where(lengths, 2.0, 1.0) * readings)
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    forward_kinematics = two.forward(np.where(lengths, 2.0, 1.0) * readings)
+    np.testing.assert_allclose(forward_kinematics, expected, atol=1e-9)
     factor = np.where(lengths, 2.0, 1.0)[:, None]
     np.testing.assert_allclose(two.joint_ranges, factor * one.joint_ranges)
     np.testing.assert_array_equal(two.parameters.tolerance, one.parameters.tolerance)
@@ -164,8 +164,8 @@ def test_a_session_gives_its_cameras_stations_and_noise(demo):
     assert design.T_camera_base.shape == (3, 4, 4)
     plan = captured(design, np.random.default_rng(0))
     np.testing.assert_array_equal(plan.T_camera_base, design.T_camera_base)
-    moved = cells_of(subject, parsed(subject, ["stations=2"]))[0].setting.design
-    assert moved.T_camera_base is None
+    shifted = cells_of(subject, parsed(subject, ["stations=2"]))[0].setting.design
+    assert shifted.T_camera_base is None
 
 
 def test_a_session_without_photographs_can_be_studied(session):
@@ -231,8 +231,8 @@ def test_the_tool_of_the_truth_is_not_off():
 )
 def test_stated_deviations_hold(subject, vary, one_process):
     """A few runs: errors over stated deviations are about one, for parameters and tool."""
-    found = study(subject, vary, runs=10)
-    cell, sample = found.found[0], found.results[0].samples[JOINT_ESTIMATE_KEY]
+    value = study(subject, vary, runs=10)
+    cell, sample = value.found[0], value.results[0].samples[JOINT_ESTIMATE_KEY]
     assert cell.failed.value == 0
     assert 0.7 < cell.chi2 < 1.1
     for name in ("parameters", "tool"):
@@ -254,8 +254,8 @@ def test_stated_deviations_hold(subject, vary, one_process):
 def test_coverage(subject, vary):
     """95 % intervals of all parameters and of the tool's pose cover 93 to 97 %."""
     cell = study(subject, vary, runs=500).found[0]
-    for found in (cell.covered, cell.covered_tool):
-        assert 0.93 <= found.value <= 0.97
+    for item in (cell.covered, cell.covered_tool):
+        assert 0.93 <= item.value <= 0.97
 
 
 def test_edges_that_scatter_more_than_stated_are_told():
@@ -267,7 +267,7 @@ def test_edges_that_scatter_more_than_stated_are_told():
     sharp = replace(problem.data, white=10 * problem.data.white)
     assembled = replace(data.assembled, problem=replace(problem, data=sharp))
     usual, noisy = (
-        setting.solve(batch, one)[JOINT_ESTIMATE_KEY].told
+        setting.solve(batch, one)[JOINT_ESTIMATE_KEY].extra
         for one in (data, replace(data, assembled=assembled))
     )
     np.testing.assert_allclose(usual["scale"], 1, atol=0.25)
@@ -286,7 +286,7 @@ def test_wrong_deviations_are_told():
     assert covered(error, 0.5 * sigma).mean() < 0.75
     tool = rng.normal(size=(40, 5, 6))
     sample = judged(np.stack([error, 0.5 * sigma]), np.stack([tool, np.ones_like(tool)]),
-                    Fitted(error, told={"chi2": np.ones(40), "failed": np.zeros(40)}))  # fmt: skip
+                    Fitted(error, extra={"chi2": np.ones(40), "failed": np.zeros(40)}))  # fmt: skip
     assert sample.values["covered"].mean() < 0.75
     assert sample.values["covered_tool"].mean() > 0.9
 
@@ -307,12 +307,12 @@ def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
     assert "Too few calibrations of some combinations can be used" in done.out
     assert "axis noise 1000: 100 % of the calibrations fail" in done.out
     assert "nan" not in done.out
-    told = json.loads((tmp_path / "study.json").read_text())
-    good, bad = told["combinations"]
+    values = json.loads((tmp_path / "study.json").read_text())
+    good, bad = values["combinations"]
     assert good["deviations_hold"] is True
     assert bad["deviations_hold"] is None
     assert bad["position"] == {"value": None, "standard_error": None}
-    assert told["gains"] == []
+    assert values["gains"] == []
     page = (tmp_path / "study.html").read_text()  # of which a browser reads every plot
     figures = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
     assert len(figures) == 2
@@ -335,16 +335,16 @@ def test_one_run_tells_no_standard_error():
 
 def test_parameters_keep_their_names_where_legs_and_boards_are_compared(one_process):
     """With legs the tubes' radii are parameters as well, between the others."""
-    found = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
-    told = [cell["covered_by_parameter"] for cell in study_document(found)["combinations"]]
-    for names, cell in zip(told, found.cells, strict=True):
+    results = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
+    entries = [cell["covered_by_parameter"] for cell in study_document(results)["combinations"]]
+    for names, cell in zip(entries, results.cells, strict=True):
         assert list(names) == [name for name, _ in cell.setting.parameters]
     radius = "legs[1].tubes[1].radius"
-    assert radius in told[1]
-    assert radius not in told[0]
-    head, *lines = found.summary().splitlines()
-    assert head == f"{found.subject.name}, 2 calibrations a combination"
-    for line, cell in zip(lines, found.found, strict=True):
+    assert radius in entries[1]
+    assert radius not in entries[0]
+    head, *lines = results.summary().splitlines()
+    assert head == f"{results.subject.name}, 2 calibrations a combination"
+    for line, cell in zip(lines, results.found, strict=True):
         assert line.startswith(f"  {in_words(cell.values)}: tool ")
         assert f"stated {brief(1e3 * cell.position_sigma)} mm, " in line
 

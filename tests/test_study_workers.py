@@ -84,9 +84,9 @@ def test_a_study_that_is_stopped_goes_on(tmp_path, how, whole, one_process):
     )
     assert pages[0] == pages[1]
     assert times == (1, 1)
-    kept = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
-    assert len(kept) == BATCHES
-    assert finished.items() <= kept.items()
+    retained = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
+    assert len(retained) == BATCHES
+    assert finished.items() <= retained.items()
     assert not list(stopped.glob("batches/.*"))
 
 
@@ -112,9 +112,9 @@ class Counting:
     def solve(self, batch, data):
         return {JOINT_ESTIMATE_KEY: data}
 
-    def judge(self, batch, data, found):
+    def judge(self, batch, data, value):
         time.sleep(self.takes)
-        return {JOINT_ESTIMATE_KEY: Sample({"x": found[JOINT_ESTIMATE_KEY]})}
+        return {JOINT_ESTIMATE_KEY: Sample({"x": value[JOINT_ESTIMATE_KEY]})}
 
 
 def test_workers_that_die_are_replaced(monkeypatch):
@@ -130,14 +130,14 @@ def test_workers_that_die_are_replaced(monkeypatch):
     monkeypatch.setattr(workers, "cores", lambda: 2)
     done: list[float] = []
 
-    def told(_text, share):
+    def report(_text, share):
         done.append(share)
         if len(done) == 75:
             begun[0].kill()
 
     setting = JointByAxes(poses=4, batch=2)
     # long enough for the one in its place to begin, too
-    many = engine.run(Counting(takes=0.02), 750, 1, told)
+    many = engine.run(Counting(takes=0.02), 750, 1, report)
     assert len(done) == 150
     assert len(begun) == 2  # beside this process one, and the one in its place
     monkeypatch.setattr(workers, "cores", lambda: 1)
@@ -173,10 +173,10 @@ def test_what_is_kept_is_what_was_done(tmp_path):
     done = tasks.work(task)
     with Store.opened(tmp_path, "counting", [], 0) as store:
         store.save(0, 0, done)
-        found = store.load(0, 0, task.batch)
-        assert found.wall == done.wall
+        value = store.load(0, 0, task.batch)
+        assert value.wall == done.wall
         np.testing.assert_array_equal(
-            found.samples[JOINT_ESTIMATE_KEY].values["x"],
+            value.samples[JOINT_ESTIMATE_KEY].values["x"],
             done.samples[JOINT_ESTIMATE_KEY].values["x"],
         )
         assert store.load(0, 1, task.batch) is None
@@ -276,13 +276,13 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, one_pro
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as local:
 
-        def told(_text, share):
+        def report(_text, share):
             if share > 0.2 and not killed:
                 killed.append(next(iter(local.workers.values())).pid)
                 os.kill(killed[0], signal.SIGKILL)
 
         many = study("a", ["configurations=5"], runs=200, scheduler=local.scheduler_address,
-                     out=tmp_path / "cluster", progress=told)  # fmt: skip
+                     out=tmp_path / "cluster", progress=report)  # fmt: skip
     assert killed
     one = study("a", ["configurations=5"], runs=200)
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")

@@ -109,10 +109,10 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
     path.write_bytes(text.encode())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(documents, "TEXT_BLOCK_BYTES", block)
-        found = list(documents.text_blocks(path, "t.csv"))
+        value = list(documents.text_blocks(path, "t.csv"))
     whole = text[1:].replace("\r\n", "\n").replace("\r", "\n")
-    assert "".join(found) == whole
-    assert all(part.endswith("\n") for part in found[:-1])
+    assert "".join(value) == whole
+    assert all(part.endswith("\n") for part in value[:-1])
 
 
 @pytest.mark.parametrize(

@@ -54,9 +54,9 @@ def detections(board, T_camera_board, seed=0, noise=NOISE, camera=CAMERA):
     ]
 
 
-def seen(board, found, rows=None, camera=CAMERA):
-    rows = np.arange(len(found)) if rows is None else np.asarray(rows)
-    return board_views(2, camera, rows, board, found)
+def seen(board, value, rows=None, camera=CAMERA):
+    rows = np.arange(len(value)) if rows is None else np.asarray(rows)
+    return board_views(2, camera, rows, board, value)
 
 
 def chi2(error, whiten):
@@ -92,8 +92,8 @@ def test_rendered_boards(board):
     """Whole photographs: the errors are no larger than their covariances say."""
     truth = poses_around(6, seed=3)
     images = [render(CAMERA, T, board, seed=k) for k, T in enumerate(truth)]
-    found = detect_in(images, board, [f"{k}.png" for k in range(6)])
-    poses = one_a_configuration(seen(board, found), mount=0)[0]
+    result = detect_in(images, board, [f"{k}.png" for k in range(6)])
+    poses = one_a_configuration(seen(board, result), mount=0)[0]
     error = pose_difference(poses.T_station_target, truth)
     value = chi2(error, poses.whiten)
     # 36 squares; sigma is by what the corner's fit leaves, which is a little too large
@@ -117,11 +117,11 @@ def test_a_hidden_part_costs_certainty_not_truth(board):
 
 def test_outlying_corners_lose_their_weight(board):
     T = poses_around(3)
-    found = detections(board, T)
-    spoilt = found[1].pixels.copy()
+    value = detections(board, T)
+    spoilt = value[1].pixels.copy()
     spoilt[[3, 17, 40]] += [[6.0, -4.0], [-5.0, 5.0], [8.0, 0.0]]
-    found[1] = replace(found[1], pixels=spoilt)
-    views = seen(board, found)
+    value[1] = replace(value[1], pixels=spoilt)
+    views = seen(board, value)
     assert np.all(views.poses.weight[1, [3, 17, 40]] == 0)
     assert views.poses.weight[1].sum() > 40
     poses = one_a_configuration(views, 0)[0]
@@ -129,10 +129,10 @@ def test_outlying_corners_lose_their_weight(board):
 
 
 def test_photographs_without_a_board_are_rejected_with_the_reason(board):
-    found = detections(board, poses_around(3))
+    values = detections(board, poses_around(3))
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
-    found[1] = Detection("0001.png", CAMERA.image_size, *none, reason="nothing is recognised")
-    views = seen(board, found, rows=[4, 5, 6])
+    values[1] = Detection("0001.png", CAMERA.image_size, *none, reason="nothing is recognised")
+    views = seen(board, values, rows=[4, 5, 6])
     (item,) = views.rejected
     assert (item.station, item.configuration, item.leg) == (2, 5, -1)
     assert item.reason == "the board: nothing is recognised"
@@ -168,17 +168,17 @@ def test_a_board_that_looks_the_same_turned_round():
 
 
 def test_mirrored_photographs(board):
-    found = [replace(d, mirrored=True) for d in detections(board, poses_around(2))]
+    results = [replace(d, mirrored=True) for d in detections(board, poses_around(2))]
     with pytest.raises(InputError, match="mirror images") as caught:
-        seen(board, found)
+        seen(board, results)
     assert caught.value.where == "0000.png and 0001.png"
 
 
 def test_one_mirrored_photograph_is_named_alone(board):
-    found = detections(board, poses_around(3))
-    found[1] = replace(found[1], mirrored=True)
+    value = detections(board, poses_around(3))
+    value[1] = replace(value[1], mirrored=True)
     with pytest.raises(InputError) as caught:
-        seen(board, found)
+        seen(board, value)
     assert caught.value.where == "0001.png"
     assert "Flip this photograph alone" in str(caught.value)
     assert "2 other photographs" in str(caught.value)
@@ -187,9 +187,9 @@ def test_one_mirrored_photograph_is_named_alone(board):
 def test_corners_that_are_not_this_boards(board):
     """The photographs' squares are half as long again one way."""
     stretched = replace(board, points=board.points * [1.5, 1.0, 1.0])
-    found = detections(stretched, poses_around(3))
+    value = detections(stretched, poses_around(3))
     with pytest.raises(InputError, match="do not lie as the board file") as caught:
-        seen(board, found)
+        seen(board, value)
     assert "px rms off their places (a ChArUco board of 9x7 squares)" in caught.value.found
 
 
@@ -207,8 +207,8 @@ def test_slow_ways_are_tried_on_some_chessboards_only(tmp_path, monkeypatch):
     kinds = {kind: board_of(tmp_path, FILES[kind]) for kind in ("chessboard", "charuco")}
     for kind, most, count in (("chessboard", 3, 3), ("chessboard", 0, 0), ("charuco", 9, 0)):
         tried.clear()
-        found = detect_in(images, kinds[kind], [str(k) for k in range(9)])
-        assert len(detect_again(images, kinds[kind], found, most)) == 9
+        value = detect_in(images, kinds[kind], [str(k) for k in range(9)])
+        assert len(detect_again(images, kinds[kind], value, most)) == 9
         assert len(tried) == count
         assert sorted(tried) == (["0", "4", "8"] if count else [])
 
@@ -311,8 +311,8 @@ def test_all_camera_models_see_a_still_board(board):
     for model in ("fisheye", "unified"):
         camera = CAMERAS[model]
         place = before(place=(-0.12, -0.09, 0.2))
-        found = detections(board, np.tile(place, (4, 1, 1)), camera=camera)
-        stood = standing_board(seen(board, found, camera=camera))
+        values = detections(board, np.tile(place, (4, 1, 1)), camera=camera)
+        stood = standing_board(seen(board, values, camera=camera))
         assert stood.agreed.all()
         error = pose_difference(stood.T_camera_board, place)
         assert error @ np.linalg.solve(stood.covariance, error) < 24

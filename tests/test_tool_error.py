@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.calibration.toolmap import map_of
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, laid_over
-from pkmcal.identify.compared import compare
+from pkmcal.identify.comparison import compare
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.identify.tool import tool_error
@@ -56,24 +56,24 @@ def drawn_poses(case, draws=1500):
         other = machine.with_values(machine.values + half @ rng.normal(size=len(half)))
         base = laid_over(other.base_centers(), machine.base_centers())
         platform = laid_over(other.platform_centers(), machine.platform_centers())
-        found = other.forward(joints, inverse(base) @ case.poses @ platform)
-        out.append(pose_difference(base @ found @ inverse(platform), case.poses))
+        forward_kinematics = other.forward(joints, inverse(base) @ case.poses @ platform)
+        out.append(pose_difference(base @ forward_kinematics @ inverse(platform), case.poses))
     return np.array(out)
 
 
 def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
     """Each drawn machine is laid over by all joint centres, with no word of derivatives."""
-    told = tool_error(
+    values = tool_error(
         small.drawing, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
     )
-    found = drawn_poses(small)
-    scatter = np.einsum("dni,dnj->nij", found, found) / len(found)
-    scale = np.sqrt(np.einsum("nii->ni", told.covariance)) + 1e-15
-    off = (scatter - told.covariance) / (scale[:, :, None] * scale[:, None])
+    count = drawn_poses(small)
+    scatter = np.einsum("dni,dnj->nij", count, count) / len(count)
+    scale = np.sqrt(np.einsum("nii->ni", values.covariance)) + 1e-15
+    off = (scatter - values.covariance) / (scale[:, :, None] * scale[:, None])
     # 1500 draws leave 3.7 % on a variance; four and a half of them, for 432 numbers
     assert np.abs(off).max() < 0.165
     drawn = np.sqrt(np.trace(scatter[:, 3:, 3:], axis1=1, axis2=2))
-    np.testing.assert_allclose(told.position, drawn, rtol=0.06)
+    np.testing.assert_allclose(values.position, drawn, rtol=0.06)
 
 
 def test_what_frames_do_is_in_no_sigma_where_only_boards_saw_the_machine(small):
@@ -82,34 +82,34 @@ def test_what_frames_do_is_in_no_sigma_where_only_boards_saw_the_machine(small):
 
     by = generators(small.machine.layout, small.machine.values) @ freedoms(small.machine)
     covariance = 1e-6 * by @ by.T
-    told = tool_error(small.drawing, small.machine, covariance, small.poses, legs_seen=False)
+    values = tool_error(small.drawing, small.machine, covariance, small.poses, legs_observed=False)
     loose = tool_error(small.drawing, small.machine, covariance, small.poses)
     assert loose.position.min() > 1e-4
-    assert told.position.max() < 1e-9
+    assert values.position.max() < 1e-9
 
 
 def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
     machine, drawing = small.machine, small.drawing
-    told = tool_error(drawing, machine, small.covariance, small.poses)
+    values = tool_error(drawing, machine, small.covariance, small.poses)
     joints = machine.inverse(small.poses)
     base = laid_over(drawing.base_centers(), machine.base_centers())
     platform = laid_over(drawing.platform_centers(), machine.platform_centers())
     before = base @ drawing.forward(joints) @ inverse(platform)
     distance = np.linalg.norm(before[:, :3, 3] - small.poses[:, :3, 3], axis=1)
-    np.testing.assert_allclose(told.off_position, distance, rtol=1e-9)
+    np.testing.assert_allclose(values.off_position, distance, rtol=1e-9)
     assert distance.max() > 1e-4
     turn = before[:, :3, :3] @ small.poses[:, :3, :3].mT
     angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    np.testing.assert_allclose(told.off_orientation, angle, atol=1e-7)
+    np.testing.assert_allclose(values.off_orientation, angle, atol=1e-7)
 
 
 def test_frames_by_some_of_the_poses(small):
     """Fitted on all poses or on those that are asked for alone, the same where these are all."""
     arguments = small.drawing, small.machine, small.covariance
-    whole = tool_error(*arguments, small.poses, legs_seen=False)
-    named = tool_error(*arguments, small.poses, legs_seen=False, fitted=np.arange(12))
-    some = tool_error(*arguments, small.poses, legs_seen=False, fitted=np.arange(6))
-    alone = tool_error(*arguments, small.poses[:6], legs_seen=False)
+    whole = tool_error(*arguments, small.poses, legs_observed=False)
+    named = tool_error(*arguments, small.poses, legs_observed=False, fitted=np.arange(12))
+    some = tool_error(*arguments, small.poses, legs_observed=False, fitted=np.arange(6))
+    alone = tool_error(*arguments, small.poses[:6], legs_observed=False)
     np.testing.assert_array_equal(whole.position, named.position)
     np.testing.assert_allclose(some.position[:6], alone.position, rtol=1e-9)
     assert np.abs(some.position - whole.position).max() > 1e-3 * whole.position.max()
@@ -119,20 +119,20 @@ def test_poses_out_of_reach_are_nan(small):
     far = small.poses.copy()
     machine = load_mechanism("delta")
     far = np.stack([machine.home(), perturb(machine.home(), np.array([0, 0, 0, 2.0, 0, 0]))])
-    told = tool_error(machine, machine, known(machine), far)
-    assert np.isfinite(told.position[0])
-    assert np.isnan(told.position[1])
-    assert np.isnan(told.off_position[1])
+    values = tool_error(machine, machine, known(machine), far)
+    assert np.isfinite(values.position[0])
+    assert np.isnan(values.position[1])
+    assert np.isnan(values.off_position[1])
 
 
 def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
     save(calibrated, tmp_path / "out")
     poses = calibrated.estimate.state.T_base_platform[:3]
-    told, again = calibrated.tool_error(poses), load(tmp_path / "out").tool_error(poses)
-    assert (told.position > 0).all()
-    np.testing.assert_allclose(again.position, told.position, rtol=1e-9)
-    np.testing.assert_allclose(again.off, told.off, rtol=1e-6, atol=1e-12)
-    assert (told.off_position > 1.5 * told.position).all()  # the drawing was off by more
+    values, again = calibrated.tool_error(poses), load(tmp_path / "out").tool_error(poses)
+    assert (values.position > 0).all()
+    np.testing.assert_allclose(again.position, values.position, rtol=1e-9)
+    np.testing.assert_allclose(again.off, values.off, rtol=1e-6, atol=1e-12)
+    assert (values.off_position > 1.5 * values.position).all()  # the drawing was off by more
     with pytest.raises(InputError, match="what are no poses"):
         calibrated.tool_error(poses[0])
 
@@ -172,12 +172,12 @@ def test_a_map_of_a_region(small):
     place = made.after.T_base_platform[:, :3, 3]
     assert place[:, 0].min() > -0.021
     assert place[:, 1].max() < 0.041
-    told = made.document()
-    assert told["region"] == {"x": (-0.02, 0.03), "y": (0.0, 0.04), "z": None, "turn": None}
+    entries = made.document()
+    assert entries["region"] == {"x": (-0.02, 0.03), "y": (0.0, 0.04), "z": None, "turn": None}
     even = made.after.position[: made.spread]
-    assert told["sigma"]["position"]["worst"] == pytest.approx(even.max())
-    assert told["sigma"]["position"]["median"] == pytest.approx(np.median(even))
-    assert told["drawing_off"]["position"]["worst"] == pytest.approx(
+    assert entries["sigma"]["position"]["worst"] == pytest.approx(even.max())
+    assert entries["sigma"]["position"]["median"] == pytest.approx(np.median(even))
+    assert entries["drawing_off"]["position"]["worst"] == pytest.approx(
         made.after.off_position[: made.spread].max()
     )
 
@@ -199,12 +199,12 @@ def test_the_page_shows_every_cell_with_its_number():
     heats = [trace for trace in slices.figure["data"] if trace["type"] == "heatmap"]
     assert len(heats) == 3 * len(made.slices) == 12
     cut, heat = made.slices[1], heats[2 * 4 + 1]  # the calibrated row comes last
-    shown = np.array(heat["customdata"], dtype=float)
+    visible = np.array(heat["customdata"], dtype=float)
     assert heat["name"] == "Calibrated, σ"
     there = cut.rows >= 0
-    np.testing.assert_array_equal(np.isfinite(shown), there)
+    np.testing.assert_array_equal(np.isfinite(visible), there)
     expected = made.after.position[cut.rows[there]] * 1e3
-    np.testing.assert_allclose(shown[there], expected, rtol=1e-3)
+    np.testing.assert_allclose(visible[there], expected, rtol=1e-3)
     np.testing.assert_allclose(10 ** np.array(heat["z"], float)[there], expected, rtol=5e-3)
     assert len(space.figure["data"][0]["x"]) == 250
     assert "known to" in part.text[0]
@@ -261,8 +261,8 @@ def test_a_machine_without_a_map_says_why():
 def test_frames_are_no_error(small):
     """Those by three joints in place of the truth's: other numbers, the same machine."""
     state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
-    told = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
-    other = small.machine.with_values(told.theta)
+    values = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
+    other = small.machine.with_values(values.theta)
     joints = small.machine.inverse(small.poses)
     plain = np.linalg.norm((other.forward(joints) - small.poses)[:, :3, 3], axis=1)
     assert plain.min() > 1e-4
@@ -282,7 +282,7 @@ def test_errors_beside_a_known_machine_are_those_of_its_poses(small):
     k = small.drawing.parameters.of_kind("offset")
     np.testing.assert_allclose(error.offset, (small.drawing.values - small.machine.values)[k])
     # by the poses too, where no legs tell where the joints are: never further apart
-    by_poses = compare(small.drawing, small.machine, joints, legs_seen=False)
+    by_poses = compare(small.drawing, small.machine, joints, legs_observed=False)
     assert np.sum(by_poses.position**2) < np.sum(error.position**2)
 
 

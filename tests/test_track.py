@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.control.laws import task_of
-from pkmcal.control.seen import legs_at, seen_machine, true_edges
+from pkmcal.control.machine_view import legs_at, machine_view, true_edges
 from pkmcal.control.track import (
     Sight,
     corrected_pose,
@@ -39,7 +39,7 @@ def view(request):
     """A lab, its photograph at AT, and what is looked for."""
     camera, T = (PERSPECTIVE, BESIDE) if request.param == "perspective" else (MIRROR, WITHIN)
     lab = Lab(MACHINE, camera, T)
-    return lab, lab.photograph(AT, READINGS), Sight(seen_machine(MACHINE, T), camera)
+    return lab, lab.photograph(AT, READINGS), Sight(machine_view(MACHINE, T), camera)
 
 
 def root(lines):
@@ -53,18 +53,18 @@ def root(lines):
 
 def test_edges_are_found_within_their_sigma(view):
     lab, image, sight = view
-    found = track(sight, first_track_state(sight.seen), image, READINGS)
-    assert found.found.sum() >= 5
-    truth = true_edges(sight.seen, AT)[found.found]
-    lines = found.lines
-    turn = np.swapaxes(lines.basis[found.found], -1, -2) @ truth[..., None]
-    whitened = np.linalg.solve(root(lines)[found.found], turn)[..., 0]
+    value = track(sight, first_track_state(sight.view), image, READINGS)
+    assert value.valid.sum() >= 5
+    truth = true_edges(sight.view, AT)[value.valid]
+    lines = value.lines
+    turn = np.swapaxes(lines.basis[value.valid], -1, -2) @ truth[..., None]
+    whitened = np.linalg.solve(root(lines)[value.valid], turn)[..., 0]
     assert np.abs(whitened).max() < 4.5
     assert np.sqrt(np.mean(whitened**2)) < 1.5
     # no more than a pixel and a half, where a leg was seen at all
     focal = lab.camera.parameters[0]
     assert np.abs(turn[..., 0, 0]).max() * focal < 1.5
-    off = pose_difference(found.T_base_platform, AT)
+    off = pose_difference(value.T_base_platform, AT)
     assert np.linalg.norm(off[3:]) < 1.2e-3
     assert np.rad2deg(np.linalg.norm(off[:3])) < 0.3
 
@@ -78,12 +78,12 @@ def test_large_photographs_are_binned():
     larger = PERSPECTIVE.parameters * np.r_[3.0, 3, 3, 3, np.ones(len(PERSPECTIVE.parameters) - 4)]
     larger[2:4] += 1
     camera = replace(PERSPECTIVE, image_size=(1920, 1440), parameters=larger)
-    truth, outward = true_edges(seen_machine(MACHINE, BESIDE), AT), []
+    truth, outward = true_edges(machine_view(MACHINE, BESIDE), AT), []
     for picture, eye, shift in ((small, PERSPECTIVE, 0.2), (image, camera, 0.6)):
-        seen, pixels = seen_machine(MACHINE, BESIDE), first_binning(eye.image_size)
-        sight = Sight(seen, eye, shift, pixels)
-        at = track(sight, first_track_state(sight.seen), picture, READINGS)
-        assert at.found.sum() >= 5
+        view, pixels = machine_view(MACHINE, BESIDE), first_binning(eye.image_size)
+        sight = Sight(view, eye, shift, pixels)
+        at = track(sight, first_track_state(sight.view), picture, READINGS)
+        assert at.valid.sum() >= 5
         outward.append(np.sum(at.lines.basis[..., 0] * (at.lines.normal - truth), axis=-1) / PIXEL)
     apart = np.abs(outward[0] - outward[1])
     assert np.nanmax(apart) < 0.25
@@ -94,9 +94,9 @@ def test_a_photograph_late_by_a_millimetre_is_followed(view):
     """The readings have gone on; the next photograph profits from what this one showed."""
     _, image, sight = view
     later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3
-    first = track(sight, first_track_state(sight.seen), image, later)
+    first = track(sight, first_track_state(sight.view), image, later)
     second = track(sight, first.state, image, later)
-    truth = true_edges(sight.seen, AT)
+    truth = true_edges(sight.view, AT)
     for at in (first, second):
         assert at.found.sum() >= 4
         turn = np.swapaxes(at.lines.basis, -1, -2) @ truth[..., None]
@@ -112,47 +112,47 @@ def test_a_photograph_late_by_a_millimetre_is_followed(view):
 def test_a_first_photograph_several_pixels_off_is_searched():
     lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
     image = lab.photograph(AT, READINGS)
-    sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
+    sight = Sight(machine_view(MACHINE, BESIDE), PERSPECTIVE)
     # a centimetre and two degrees aside: up to nine pixels
-    moved = MACHINE.inverse(perturb(AT, np.array([0, 0, 0.03, 0.01, 0.008, 0]))[None])[0]
-    found = track(sight, first_track_state(sight.seen), image, moved)
-    assert found.state.searched
-    assert found.found.sum() >= 4
-    assert found.beside > 2e-3  # and said
-    truth = true_edges(sight.seen, AT)
-    off = np.linalg.norm((found.lines.normal - truth)[found.found], axis=-1)
+    shifted = MACHINE.inverse(perturb(AT, np.array([0, 0, 0.03, 0.01, 0.008, 0]))[None])[0]
+    value = track(sight, first_track_state(sight.view), image, shifted)
+    assert value.state.searched
+    assert value.valid.sum() >= 4
+    assert value.beside > 2e-3  # and said
+    truth = true_edges(sight.view, AT)
+    off = np.linalg.norm((value.lines.normal - truth)[value.valid], axis=-1)
     assert np.median(off) < 1.5 * PIXEL
 
 
 def test_a_leg_painted_over_is_lost_and_the_others_are_not(view):
     lab, image, sight = view
-    whole = track(sight, first_track_state(sight.seen), image, READINGS)
-    leg = int(np.flatnonzero(whole.found)[0])
+    whole = track(sight, first_track_state(sight.view), image, READINGS)
+    leg = int(np.flatnonzero(whole.valid)[0])
     painted = lab.painted(image, AT, READINGS, [leg])
-    found = track(sight, whole.state, painted, READINGS)
-    assert not found.found[leg]
-    assert found.found.sum() >= whole.found.sum() - 2  # painting may cover a neighbour
-    assert "clear edge" in found.reasons[leg] or "one edge" in found.reasons[leg]
-    assert np.isnan(found.lines.normal[leg]).all()
+    value = track(sight, whole.state, painted, READINGS)
+    assert not value.valid[leg]
+    assert value.valid.sum() >= whole.valid.sum() - 2  # painting may cover a neighbour
+    assert "clear edge" in value.reasons[leg] or "one edge" in value.reasons[leg]
+    assert np.isnan(value.lines.normal[leg]).all()
 
 
 def test_an_empty_photograph_finds_nothing_and_keeps_to_the_readings(view):
     _, image, sight = view
-    state = track(sight, first_track_state(sight.seen), image, READINGS).state
+    state = track(sight, first_track_state(sight.view), image, READINGS).state
     empty = np.full_like(image, 90)
-    found = track(sight, state, empty, READINGS)
-    assert not found.found.any()
-    assert all(found.reasons)
-    np.testing.assert_allclose(found.T_base_platform, AT, atol=1e-9)
-    again = track(sight, found.state, image, READINGS)
-    assert again.found.sum() >= 4
+    value = track(sight, state, empty, READINGS)
+    assert not value.valid.any()
+    assert all(value.reasons)
+    np.testing.assert_allclose(value.T_base_platform, AT, atol=1e-9)
+    again = track(sight, value.state, image, READINGS)
+    assert again.valid.sum() >= 4
 
 
 def test_readings_that_close_no_machine_are_no_edges(view):
     _, image, sight = view
-    found = track(sight, first_track_state(sight.seen), image, READINGS * [2, 1, 1, 0.2, 1, 1])
-    assert not found.closed
-    assert not found.found.any()
+    value = track(sight, first_track_state(sight.view), image, READINGS * [2, 1, 1, 0.2, 1, 1])
+    assert not value.closed
+    assert not value.valid.any()
 
 
 @pytest.mark.parametrize(
@@ -164,9 +164,9 @@ def test_readings_that_close_no_machine_are_no_edges(view):
     ],
 )
 def test_images_that_are_none_are_named(image, words):
-    sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
+    sight = Sight(machine_view(MACHINE, BESIDE), PERSPECTIVE)
     with pytest.raises(InputError, match=words):
-        track(sight, first_track_state(sight.seen), image, READINGS)
+        track(sight, first_track_state(sight.view), image, READINGS)
 
 
 # ------------------------------------------------------------------ edges to lines, exactly
@@ -200,7 +200,7 @@ def turned(edges, turn):
     return replace(edges, normal=normal, basis=tangent_basis(normal, edges.basis[..., 0]))
 
 
-SEEN = seen_machine(MACHINE, BESIDE)
+SEEN = machine_view(MACHINE, BESIDE)
 NEAR = perturb(AT, np.array([1e-3, -1e-3, 1e-3, 5e-4, -5e-4, 3e-4]))
 NEAR_READINGS = MACHINE.inverse(NEAR[None])[0]
 
@@ -209,7 +209,7 @@ def test_lines_of_exact_edges_are_exact_to_second_order():
     rows = edge_misfits(SEEN, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
     rows = replace(rows, information=np.tile(np.eye(2) / 1e-14, (len(rows.leg), 1, 1)))
     lines = leg_lines(SEEN, rows)
-    assert lines.found.all()
+    assert lines.valid.all()
     np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT), atol=1e-5)
 
 
@@ -233,19 +233,19 @@ def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
     rows = edge_misfits(SEEN, READINGS, AT, turned(edges, turn), 0.0)
     lines = leg_lines(SEEN, rows)
     assert not lines.agrees[0]
-    assert lines.found.tolist() == [False, True, True, True, True, True]
+    assert lines.valid.tolist() == [False, True, True, True, True, True]
     assert np.isnan(lines.normal[0]).all()
 
 
 def test_one_side_alone_is_no_leg():
     edges = edges_of(AT, READINGS)
     rows = edge_misfits(SEEN, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
-    assert leg_lines(SEEN, rows).found.tolist() == [True, True, False, True, True, True]
+    assert leg_lines(SEEN, rows).valid.tolist() == [True, True, False, True, True, True]
 
 
 def test_only_the_legs_that_count_are_answered():
-    seen = seen_machine(MACHINE, BESIDE, np.array([4, 1]))
-    lines = leg_lines(seen, edge_misfits(seen, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    view = machine_view(MACHINE, BESIDE, np.array([4, 1]))
+    lines = leg_lines(view, edge_misfits(view, READINGS, AT, edges_of(AT, READINGS), 0.0))
     np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT)[[4, 1]], atol=1e-6)
 
 

@@ -9,17 +9,17 @@ import pytest
 
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.model_errors import UNEVEN_BED
+from pkmcal.calibration.discrepancy_basis import UNEVEN_BED
+from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.results import calibration_document
-from pkmcal.calibration.saved import load
-from pkmcal.calibration.source import load_source
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.check.check import check_session
 from pkmcal.files import json_value
 from pkmcal.geometry.rigid import pose
 from pkmcal.outcome import Level
 from pkmcal.printers.session import write_printer_session
 from pkmcal.report.calibration import report_of, save
-from pkmcal.session.moved import how_far
+from pkmcal.session.station_movement import how_far
 
 SAYS = printers.Settings()
 POINTS, NOISE = 49, 0.008
@@ -56,42 +56,42 @@ def uneven(tmp_path_factory):
     return heights, kit, calibrate_session(kit)
 
 
-def flatness(found):
+def flatness(value):
     """Root mean square height (m) of the true tool over the disc that was probed, where the
     calibrated machine is told to go along a plane, the plane's own tilt and height aside.
     """
     k = np.arange(200)
-    r, a = found.findings.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
+    r, a = value.findings.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
     xy = np.column_stack([r * np.cos(a), r * np.sin(a)])
     there = pose(np.eye(3), np.column_stack([xy, np.zeros(200)]))
-    z = printers.machine(SAYS).forward(found.machine.inverse(there))[:, 2, 3]
+    z = printers.machine(SAYS).forward(value.machine.inverse(there))[:, 2, 3]
     plane = np.column_stack([xy, np.ones(200)])
     return float(np.sqrt(np.mean((z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]) ** 2)))
 
 
 def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
-    _, _, found = uneven
-    assert found.verdict.usable
-    assert found.departures == ()
-    (error,) = found.model_errors
+    _, _, value = uneven
+    assert value.verdict.usable
+    assert value.violations == ()
+    (error,) = value.model_errors
     assert (error.code, error.sure) == (UNEVEN_BED, True)
     assert 1e-3 * SIZE / 3 < error.scale < 3e-3 * SIZE
     assert 1e-3 * LENGTH / 3 < error.length < 3e-3 * LENGTH
-    assert f"discrepancy.{UNEVEN_BED}" in found.verdict.codes
+    assert f"discrepancy.{UNEVEN_BED}" in value.verdict.codes
 
 
 def test_deviations_contain_the_unevenness(uneven):
     """Of the bed as it will be, and of the parameters, all of which are right from the first."""
-    _, _, found = uneven
-    assert flatness(found) < 3 * found.findings.bed.sigma
-    sigma = np.sqrt(np.diag(found.estimate.covariance))
-    off = np.abs(found.machine.values - found.session.machine.values)
+    _, _, value = uneven
+    assert flatness(value) < 3 * value.findings.bed.sigma
+    sigma = np.sqrt(np.diag(value.estimate.covariance))
+    off = np.abs(value.machine.values - value.session.machine.values)
     assert np.all(off <= 3 * sigma + 1e-12)
 
 
 def test_the_map_is_the_bed_as_far_as_its_deviations_say(uneven):
-    heights, _, found = uneven
-    document = json_value(calibration_document(found))
+    heights, _, value = uneven
+    document = json_value(calibration_document(value))
     (error,) = document["model_errors"]
     assert error["code"] == UNEVEN_BED
     table = {name: np.array(values) for name, values in error["surface"].items()}
@@ -102,32 +102,32 @@ def test_the_map_is_the_bed_as_far_as_its_deviations_say(uneven):
     off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
     assert np.sqrt(np.mean((off / table["sigma"]) ** 2)) < 2
     np.testing.assert_allclose(1e3 * plane[:, :2], printers.bed(POINTS)[order], atol=1.0)
-    assert "bed" in [part.name for part in report_of(found).parts]
+    assert "bed" in [part.name for part in report_of(value).parts]
 
 
 def test_check_finds_what_calibrate_finds(uneven):
-    _, kit, found = uneven
+    _, kit, check = uneven
     findings = check_session(kit).findings
     assert all(one.level is not Level.WRONG for one in findings)
-    (warning,) = found.verdict.of(f"discrepancy.{UNEVEN_BED}")
+    (warning,) = check.verdict.of(f"discrepancy.{UNEVEN_BED}")
     assert warning.text in [one.text for one in findings if one.code == warning.code]
 
 
 def test_a_flat_bed_is_flat(tmp_path):
-    found = calibrate_session(kit_of(tmp_path))
-    assert found.verdict.usable
-    assert found.departures == found.model_errors == ()
-    assert "bed" not in [part.name for part in report_of(found).parts]
+    calibration = calibrate_session(kit_of(tmp_path))
+    assert calibration.verdict.usable
+    assert calibration.violations == calibration.model_errors == ()
+    assert "bed" not in [part.name for part in report_of(calibration).parts]
 
 
 def test_a_wrong_motor_is_named_where_it_explains_more_than_an_uneven_bed(tmp_path):
     kit = kit_of(tmp_path, scale=(1.0, 1.0, 1.03))
-    found = calibrate_session(kit)
-    (violation,) = found.departures
+    calibration = calibrate_session(kit)
+    (violation,) = calibration.violations
     assert (violation.code, violation.of) == ("readings.scale", "stepper_c")
     assert abs(violation.value[0] - 0.03) < 4 * violation.sigma[0]
     assert violation.against
-    assert not found.verdict.usable
+    assert not calibration.verdict.usable
     assert violation.finding.text in [one.text for one in check_session(kit).findings]
 
 
@@ -142,7 +142,7 @@ def dropped(tmp_path_factory):
 
 
 def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
-    (violation,) = dropped.departures
+    (violation,) = dropped.violations
     assert violation.code == "station.moved"
     rx, ry, turn, x, y, z = violation.value
     assert np.isnan([turn, x, y]).all()
@@ -157,8 +157,8 @@ def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
 
 def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
     """Neither in a verdict nor in any table of the report."""
-    for found in (dropped, uneven[2]):
-        verdict, parts = found.verdict, report_of(found).parts
+    for item in (dropped, uneven[2]):
+        verdict, parts = item.verdict, report_of(item).parts
         texts = [verdict.headline, *verdict.reasons, *verdict.warnings, *verdict.advice]
         for part in parts:
             texts += part.text
@@ -169,17 +169,17 @@ def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
 
 def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
     """Neither the bed's x, y and turn nor the tool's are numbers with a deviation."""
-    _, _, found = uneven
-    document = json_value(calibration_document(found))
+    _, _, value = uneven
+    document = json_value(calibration_document(value))
     (station,), (target,) = document["stations"], document["targets"]
     for one in (station, target):
         assert one["sigma_translation"][:2] == [None, None]
         assert one["sigma_rotation"][2] is None
-    save(found, tmp_path / "result")
+    save(value, tmp_path / "result")
     loaded = load(tmp_path / "result").stations[0]
     assert np.isinf(loaded.sigma_translation[:2]).all()
     assert dict(load_source(tmp_path / "result").T_base_camera) == {}
-    (places,) = [part for part in report_of(found).parts if part.name == "stations"]
+    (places,) = [part for part in report_of(value).parts if part.name == "stations"]
     (row,) = places.tables[0].rows
     assert row.cells[:2] == ("open", "open")
 

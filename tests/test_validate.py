@@ -12,7 +12,7 @@ import pytest
 
 from conftest import run
 from faults import replaced
-from pkmcal.calibration.aside import (
+from pkmcal.calibration.holdout import (
     by_region,
     chosen,
     clusters,
@@ -21,7 +21,7 @@ from pkmcal.calibration.aside import (
     select,
     spread,
 )
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
@@ -33,12 +33,12 @@ from pkmcal.judge.comparison import (
     promise,
     weighed_mean_and_rms,
 )
-from pkmcal.judge.held import held_machine, too_little
+from pkmcal.judge.fixed_machine import held_machine, too_little
 from pkmcal.judge.holdouts import by_regions, hold_out
 from pkmcal.judge.new_data import repeated_rows
 from pkmcal.judge.paths import straightness
 from pkmcal.judge.prediction import predict
-from pkmcal.judge.words import validation_verdict
+from pkmcal.judge.sentences import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.validation import held_out_part
@@ -79,10 +79,10 @@ def seen_by(machine, data, stations):
 
 
 def judged_on(drawing, estimate, machine, data, stations):
-    found = seen_by(machine, data, stations)
+    value = seen_by(machine, data, stations)
     by_drawing = seen_by(drawing, data, stations)
-    rows = np.flatnonzero(found.seen)
-    return compare_with_drawing(drawing, estimate.covariance, data, found, by_drawing, rows)
+    rows = np.flatnonzero(value.observed)
+    return compare_with_drawing(drawing, estimate.covariance, data, value, by_drawing, rows)
 
 
 def changed(machine, name, by):
@@ -132,7 +132,7 @@ def test_residuals_scatter_as_promised(hexapod):
         chi2.append(judged_on(drawing, estimate, estimate.machine, data, stations).promise)
     share = np.mean([test.chi2 / test.dof for test in chi2])
     assert abs(share - 1) < 0.2  # one calibration in all of them; its error is 4 % of the noise
-    assert all(test.kept for test in chi2)
+    assert all(test.holds for test in chi2)
 
 
 def test_own_readings_have_no_part_in_a_pose(hexapod, new):
@@ -204,16 +204,16 @@ def test_better_than_the_drawing(hexapod, new):
         " same ones from several would tell."
     )
 
-    def told(seen_from):
+    def report(seen_from):
         """What is advised where station ``seen_from(row)`` sees a configuration, for each edge."""
         edges = replace(data.edges, station=seen_from(data.edges))
-        seen = replace(data, edges=edges)
-        (text,) = validation_verdict(judged, (), estimate.machine, seen).advice
+        case = replace(data, edges=edges)
+        (text,) = validation_verdict(judged, (), estimate.machine, case).advice
         return text.partition("better still. ")[2]
 
-    assert told(lambda e: 0 * e.station).startswith("Several stations that see the same")
-    assert told(lambda e: e.leg % 3).startswith("All are seen from several of the 3 stations")
-    some = told(lambda e: np.where(e.configuration < 10, e.leg % 3, e.station))
+    assert report(lambda e: 0 * e.station).startswith("Several stations that see the same")
+    assert report(lambda e: e.leg % 3).startswith("All are seen from several of the 3 stations")
+    some = report(lambda e: np.where(e.configuration < 10, e.leg % 3, e.station))
     assert some.startswith("14 of 24 of these configurations are seen from one of the 3 stations")
 
 
@@ -223,16 +223,16 @@ def test_rows_that_contradict_the_verdict_are_explained(hexapod):
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
     assert not validation_verdict(judged, (), estimate.machine, data).warnings
-    seen, as_drawn = judged.calibrated, judged.figures(judged.drawing)
-    worse = as_drawn.joint_rms[2] / judged.figures(seen).joint_rms[2]
-    off = seen.residuals * np.where(np.arange(6) == 2, 1.1 * worse, 1.0)
-    blurred = replace(judged, calibrated=replace(seen, residuals=off))
-    (told,) = validation_verdict(blurred, (), estimate.machine, data).warnings
+    in_view, as_drawn = judged.calibrated, judged.figures(judged.drawing)
+    worse = as_drawn.joint_rms[2] / judged.figures(in_view).joint_rms[2]
+    off = in_view.residuals * np.where(np.arange(6) == 2, 1.1 * worse, 1.0)
+    blurred = replace(judged, calibrated=replace(in_view, residuals=off))
+    (values,) = validation_verdict(blurred, (), estimate.machine, data).warnings
     promised = f"{1e3 * judged.promise.joint_rms[2]:.2g} mm"
-    assert f"(joint 3: to {promised}) that single rows" in told
-    far = replace(judged, calibrated=replace(seen, position=judged.drawing.position * 1.1))
-    (told,) = validation_verdict(far, (), estimate.machine, data).warnings
-    assert told.startswith("Some directions are seen so badly in these photographs that single")
+    assert f"(joint 3: to {promised}) that single rows" in values
+    far = replace(judged, calibrated=replace(in_view, position=judged.drawing.position * 1.1))
+    (values,) = validation_verdict(far, (), estimate.machine, data).warnings
+    assert values.startswith("Some directions are seen so badly in these photographs that single")
 
 
 def test_a_leg_that_changed_is_named(hexapod):
@@ -271,21 +271,21 @@ def test_a_board_on_an_h4(h4):
     drawing, true, estimate, _, rng = h4
     new = measured(true, papers_poses()[rng.permutation(81)[:12]], rng)
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
-    found = predict(estimate.machine, new.measurements, start)
+    prediction = predict(estimate.machine, new.measurements, start)
     judged = compare_with_drawing(
-        drawing, estimate.covariance, new.measurements, found, None, np.arange(12)
+        drawing, estimate.covariance, new.measurements, prediction, None, np.arange(12)
     )
     verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
     assert "readings at the poses" not in verdict.headline
     assert not verdict.warnings
-    for again, told in ((12, "12 are at poses"), (1, "1 is at a pose")):
+    for again, values in ((12, "12 are at poses"), (1, "1 is at a pose")):
         repeated = np.arange(12) < again
-        said = validation_verdict(judged, (), estimate.machine, new.measurements, repeated)
-        (warning,) = said.warnings
-        assert warning.startswith(f"Of 12 configurations {told} that the calibration used, ")
-        assert ("readings at the poses that it was calibrated from" in said.headline) == (again > 1)
+        text = validation_verdict(judged, (), estimate.machine, new.measurements, repeated)
+        (warning,) = text.warnings
+        assert warning.startswith(f"Of 12 configurations {values} that the calibration used, ")
+        assert ("readings at the poses that it was calibrated from" in text.headline) == (again > 1)
     assert new.measurements.joint_noise == JOINT_NOISE
 
 
@@ -325,9 +325,9 @@ def test_straightness():
     assert straightness(along).largest < 1e-15
     normal = np.array([2.0, -1.0, 0.0]) / np.sqrt(5)
     bent = along + 1e-3 * (np.arange(9) % 2 * 2 - 1)[:, None] * normal
-    found = straightness(bent)
-    assert found.rms == pytest.approx(1e-3, rel=0.02)
-    assert found.rms <= found.largest < 1.2e-3
+    value = straightness(bent)
+    assert value.rms == pytest.approx(1e-3, rel=0.02)
+    assert value.rms <= value.largest < 1.2e-3
 
 
 # regions and hold-outs
@@ -342,10 +342,10 @@ def test_regions_are_whole_named_and_the_same_again():
     )
     points = points_of_poses(machine, poses)
     rows = np.arange(100, 115)
-    found = regions(points, rows, 3)
-    assert sorted(np.concatenate([r.rows for r in found])) == sorted(rows)
-    assert {len(r.rows) for r in found} == {5}
-    names = {tuple(r.rows // 5): r.name for r in found}
+    values = regions(points, rows, 3)
+    assert sorted(np.concatenate([r.rows for r in values])) == sorted(rows)
+    assert {len(r.rows) for r in values} == {5}
+    names = {tuple(r.rows // 5): r.name for r in values}
     assert names[(21,) * 5].startswith("towards +x")
     assert "high" in names[(22,) * 5]
     assert np.array_equal(clusters(points, 3), clusters(points.copy(), 3))
@@ -355,22 +355,22 @@ def test_regions_are_whole_named_and_the_same_again():
 def test_held_out_regions_know_nothing_of_their_readings(hexapod):
     drawing, _, estimate, data = hexapod
     region = chosen(drawing, estimate, data, 5)
-    found = hold_out(drawing, data, estimate, region)
-    assert list(found.left_out.rows) == list(region.rows)
-    assert not found.estimate.configurations[region.rows].any()
+    value = hold_out(drawing, data, estimate, region)
+    assert list(value.left_out.rows) == list(region.rows)
+    assert not value.estimate.configurations[region.rows].any()
     spoiled = data.joints.copy()
     spoiled[region.rows] += 1e-3
     other = hold_out(drawing, replace(data, joints=spoiled), estimate, region)
-    assert np.allclose(other.estimate.machine.values, found.estimate.machine.values, atol=1e-9)
-    shift = other.left_out.calibrated.residuals - found.left_out.calibrated.residuals
+    assert np.allclose(other.estimate.machine.values, value.estimate.machine.values, atol=1e-9)
+    shift = other.left_out.calibrated.residuals - value.left_out.calibrated.residuals
     assert np.abs(shift - 1e-3).max() < 1e-4
 
 
 def test_regions_judged_together(hexapod):
     drawing, _, estimate, data = hexapod
-    found = by_regions(drawing, data, estimate, 3)
-    assert sum(len(item.left_out.rows) for item in found) == estimate.configurations.sum()
-    verdict = validation_verdict(None, found, drawing, data)
+    count = by_regions(drawing, data, estimate, 3)
+    assert sum(len(item.left_out.rows) for item in count) == estimate.configurations.sum()
+    verdict = validation_verdict(None, count, drawing, data)
     assert verdict.usable, verdict
     assert "of regions that it did not see" in verdict.headline
 
@@ -416,9 +416,9 @@ def test_a_pose_under_several_names_is_held_out_whole(hexapod):
     whole, again = photographed_again(estimate, data)
     out = chosen(drawing, whole, again, 5).rows
     assert list(np.unique(out % 22, return_counts=True)[1]) == [3] * 5
-    found = by_region(drawing, whole, again, 4)
-    assert sum(len(region.rows) for region in found) == 66
-    for region in found:
+    count = by_region(drawing, whole, again, 4)
+    assert sum(len(region.rows) for region in count) == 66
+    for region in count:
         assert set(np.unique(region.rows % 22, return_counts=True)[1]) == {3}
     with pytest.raises(InputError, match=r"found 12, expected 1 to 11, for 22 poses seen"):
         chosen(drawing, whole, again, 12)
@@ -429,18 +429,18 @@ def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
     item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
     joints = data.joints.copy()
 
-    def said():
+    def text():
         session = SimpleNamespace(
             machine=drawing,
             joints=joints,
             joint_noise=data.joint_noise,
             document={"joints": {"columns": drawing.joint_names}},
         )
-        return " ".join(held_out_part(item, session).said)
+        return " ".join(held_out_part(item, session).terminal_text)
 
-    assert said().startswith("On 4 configurations held out")
+    assert text().startswith("On 4 configurations held out")
     joints[item.region.rows[1]] = joints[item.region.rows[0]] + data.joint_noise
-    assert said().startswith("On 4 configurations of 3 poses held out")
+    assert text().startswith("On 4 configurations of 3 poses held out")
 
 
 # the commands
@@ -451,10 +451,10 @@ def kept(demo, tmp_path_factory):
     """The demonstration's session calibrated without three configurations, and validated."""
     folder = tmp_path_factory.mktemp("validate")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.turns.LOOKS_AGAIN", 2)
+        patch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
         made = run("calibrate", demo.session, "--holdout", 3, "-o", folder / "c", "--json")
-    found = run("validate", folder / "c", demo.session, "-o", folder / "v", "--json")
-    return SimpleNamespace(folder=folder, made=made, found=found)
+    value = run("validate", folder / "c", demo.session, "-o", folder / "v", "--json")
+    return SimpleNamespace(folder=folder, made=made, found=value)
 
 
 def test_calibrate_with_some_held_out(kept):
@@ -468,8 +468,8 @@ def test_calibrate_with_some_held_out(kept):
     for station in document["session"]["stations"].values():
         names = [Path(photograph).stem for photograph in station["photographs"]]
         used = len(names) - len({*names} & {*unused})
-        told = f"{used} of {len(names)}" if used < len(names) else f"{used}"
-        assert f"{station['camera']}, pinhole, {told} photographs" in report
+        values = f"{used} of {len(names)}" if used < len(names) else f"{used}"
+        assert f"{station['camera']}, pinhole, {values} photographs" in report
     assert (
         "held out, the calibrated machine predicts"
         in (kept.folder / "c" / "report.html").read_text()
@@ -518,10 +518,10 @@ def test_the_drawing_is_the_drawing_again(kept, demo):
     from pkmcal.judge.validate import drawing_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
-    found = drawing_of(load(kept.folder / "c"))
-    assert np.array_equal(found.parameters.drawing, drawn.parameters.drawing)
-    assert np.array_equal(found.values, drawn.values)
-    assert np.array_equal(found.parameters.free_matrix(), drawn.parameters.free_matrix())
+    values = drawing_of(load(kept.folder / "c"))
+    assert np.array_equal(values.parameters.drawing, drawn.parameters.drawing)
+    assert np.array_equal(values.values, drawn.values)
+    assert np.array_equal(values.parameters.free_matrix(), drawn.parameters.free_matrix())
 
 
 def test_the_same_photographs(demo, session):

@@ -27,33 +27,33 @@ def poses_of(machine, count, seed=0):
         steps[:, :2] = 0.0
     freedoms = machine.layout.motion
     poses = perturb(machine.home(), steps @ freedoms @ freedoms.T)
-    found = kinematics.on_manifold(machine.layout, machine.values, poses)
-    good = found.converged & (found.singularity > 0.1)
-    good &= np.isfinite(machine.inverse(found.T_base_platform)).all(axis=-1)
+    valid = kinematics.on_manifold(machine.layout, machine.values, poses)
+    good = valid.converged & (valid.singularity > 0.1)
+    good &= np.isfinite(machine.inverse(valid.T_base_platform)).all(axis=-1)
     assert good.sum() >= count
-    return found.T_base_platform[good][:count]
+    return valid.T_base_platform[good][:count]
 
 
 def test_the_inverse_jacobian_is_the_inverse_kinematics_derivative(machine):
     """Sixth-order differences; cranks near their limit bend as the root does."""
     for T in [machine.home(), *poses_of(machine, 3)]:
         oracle = differences(lambda d, T=T: machine.inverse(perturb(T, d)), 6, 2e-4)
-        found = machine.inverse_jacobian(T)
-        assert found.shape == (machine.n_joints, 6)
-        np.testing.assert_allclose(found, oracle, rtol=1e-8, atol=1e-8 * np.abs(oracle).max())
+        value = machine.inverse_jacobian(T)
+        assert value.shape == (machine.n_joints, 6)
+        np.testing.assert_allclose(value, oracle, rtol=1e-8, atol=1e-8 * np.abs(oracle).max())
 
 
 def test_the_forward_jacobian_is_the_forward_kinematics_derivative(machine):
     for T in [machine.home(), *poses_of(machine, 3, 1)]:
         readings = machine.inverse(T)
 
-        def moved(d, T=T, readings=readings):
+        def shifted(d, T=T, readings=readings):
             return pose_difference(machine.forward(readings + d, T), T)
 
-        oracle = differences(moved, machine.n_joints, 2e-4)
-        found = machine.forward_jacobian(T)
-        assert found.shape == (6, machine.n_joints)
-        np.testing.assert_allclose(found, oracle, rtol=1e-8, atol=1e-8 * np.abs(oracle).max())
+        oracle = differences(shifted, machine.n_joints, 2e-4)
+        value = machine.forward_jacobian(T)
+        assert value.shape == (6, machine.n_joints)
+        np.testing.assert_allclose(value, oracle, rtol=1e-8, atol=1e-8 * np.abs(oracle).max())
 
 
 def test_the_two_jacobians_undo_each_other(machine):
@@ -82,8 +82,8 @@ def test_what_no_motor_moves_stays(machine):
             twist = column / np.abs(column).max()
             offs = []
             for sign in (-1, 1):
-                moved = perturb(T, sign * step * twist)
-                c = kinematics.closure_at(machine.layout, machine.values, moved)
+                shifted = perturb(T, sign * step * twist)
+                c = kinematics.closure_at(machine.layout, machine.values, shifted)
                 offs.append(kinematics.undriven(c)[0])
             # a twist that the machine cannot make would leave 1e-5 here
             assert np.abs(np.array(offs)).max(initial=0.0) < 100 * step**2
@@ -96,9 +96,9 @@ def test_a_batch_of_machines(machine):
     theta = machine.values + 1e-4 * rng.normal(size=(2, 1, len(machine.values)))
     if machine.layout.shares_motors:  # a pose of one machine's rods is not another's
         theta = np.broadcast_to(machine.values, theta.shape)
-    found = inverse_jacobian(machine.layout, theta, poses)
+    results = inverse_jacobian(machine.layout, theta, poses)
     looped = [machine.with_values(row[0]).inverse_jacobian(poses) for row in theta]
-    np.testing.assert_allclose(found, looped, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(results, looped, rtol=1e-10, atol=1e-12)
 
 
 def test_a_hexapods_rows_are_the_papers():
@@ -155,8 +155,8 @@ def test_at_a_serial_singularity_the_twist_tells_no_rate():
     b = centre + q * axis + rod * side
     T = machine.home()
     T[:3, 3] = b - T[:3, :3] @ machine.platform_centers()[0]
-    moved = perturb(T, np.concatenate([np.zeros(3), -1e-4 * side]))
-    at, near = machine.inverse_jacobian(T)[0], machine.inverse_jacobian(moved)[0]
+    shifted = perturb(T, np.concatenate([np.zeros(3), -1e-4 * side]))
+    at, near = machine.inverse_jacobian(T)[0], machine.inverse_jacobian(shifted)[0]
     assert np.isnan(at).all() or np.abs(at).max() > 1e6  # rounding decides on which side T lies
     assert np.isfinite(near).all()
     assert np.abs(near).max() > 20
@@ -186,19 +186,19 @@ def test_amplification_is_the_most_and_least_over_all_directions(machine):
     rng = np.random.default_rng(6)
     T = poses_of(machine, 1, 7)[0]
     point = np.array([0.02, -0.01, 0.03])
-    found = machine.amplification(T, point)
+    value = machine.amplification(T, point)
     rates = rng.normal(size=(20_000, machine.n_joints))
     rates /= np.linalg.norm(rates, axis=1, keepdims=True)
     twist = rates @ machine.forward_jacobian(T).T
     speed = np.linalg.norm(twist[:, 3:] + np.cross(twist[:, :3], T[:3, :3] @ point), axis=1)
     turning = np.linalg.norm(twist[:, :3], axis=1)
-    assert speed.max() <= found.fastest * (1 + 1e-9)
-    assert speed.max() > 0.9 * found.fastest
-    assert turning.max() <= found.quickest_turn * (1 + 1e-9) + 1e-12
-    assert turning.max() >= 0.85 * found.quickest_turn - 1e-12
+    assert speed.max() <= value.fastest * (1 + 1e-9)
+    assert speed.max() > 0.9 * value.fastest
+    assert turning.max() <= value.quickest_turn * (1 + 1e-9) + 1e-12
+    assert turning.max() >= 0.85 * value.quickest_turn - 1e-12
     if machine.n_joints == machine.layout.free[3:].sum():
-        assert speed.min() >= found.slowest * (1 - 1e-9)
-        assert speed.min() < 1.3 * found.slowest + 1e-3 * found.fastest
+        assert speed.min() >= value.slowest * (1 - 1e-9)
+        assert speed.min() < 1.3 * value.slowest + 1e-3 * value.fastest
     # the motors' power is the platform's: forces by J^T, about the point
     shift = np.eye(6)
     shift[3:, :3] = -skew(T[:3, :3] @ point)
@@ -206,12 +206,12 @@ def test_amplification_is_the_most_and_least_over_all_directions(machine):
     forces = rng.normal(size=(20_000, 3))
     forces /= np.linalg.norm(forces, axis=1, keepdims=True)
     felt = np.abs(forces @ at_point[3:]).max(axis=0)
-    assert np.all(felt <= found.force * (1 + 1e-9))
-    assert np.all(felt >= 0.98 * found.force)
+    assert np.all(felt <= value.force * (1 + 1e-9))
+    assert np.all(felt >= 0.98 * value.force)
     np.testing.assert_allclose(
-        found.torque, np.linalg.norm(at_point[:3], axis=0), rtol=1e-12, atol=1e-15
+        value.torque, np.linalg.norm(at_point[:3], axis=0), rtol=1e-12, atol=1e-15
     )
-    assert found.condition >= 1
+    assert value.condition >= 1
 
 
 def test_a_machine_of_three_square_guides_amplifies_nothing():
@@ -225,26 +225,26 @@ def test_a_machine_of_three_square_guides_amplifies_nothing():
         ((0, 0, 100), (0, 0, 0), rod),
     ]
     machine = machine_of("translation", legs, "home: {position: [0.0, 0.0, 0.0]}\n")
-    found = machine.amplification(machine.home())
-    np.testing.assert_allclose([found.fastest, found.slowest, found.condition], 1.0, atol=1e-12)
-    np.testing.assert_allclose(found.force, 1.0, atol=1e-12)
-    assert found.quickest_turn == found.slowest_turn == 0.0
+    values = machine.amplification(machine.home())
+    np.testing.assert_allclose([values.fastest, values.slowest, values.condition], 1.0, atol=1e-12)
+    np.testing.assert_allclose(values.force, 1.0, atol=1e-12)
+    assert values.quickest_turn == values.slowest_turn == 0.0
 
 
 def test_the_map_grows_without_bound_towards_a_singular_pose():
     machine = hexapod()
     poses = np.stack([yawed(degrees) for degrees in (0, 60, 89, 89.9, 90)])
-    found = machine.amplification(poses)
-    assert np.all(np.diff(found.condition[:4]) > 0)
-    assert found.condition[3] == pytest.approx(10 * found.condition[2], rel=0.02)
-    assert np.isnan(found.condition[4])
-    assert np.isnan(found.force[4]).all()
+    values = machine.amplification(poses)
+    assert np.all(np.diff(values.condition[:4]) > 0)
+    assert values.condition[3] == pytest.approx(10 * values.condition[2], rel=0.02)
+    assert np.isnan(values.condition[4])
+    assert np.isnan(values.force[4]).all()
 
 
 def test_small_machines_amplify_in_their_own_freedoms():
     """A planar machine neither lifts nor tilts, a tripod does not turn."""
     flat, three = planar(), tripod()
-    found = flat.amplification(flat.home())
-    assert found.slowest > 0.1
-    assert found.quickest_turn == found.slowest_turn > 0
+    value = flat.amplification(flat.home())
+    assert value.slowest > 0.1
+    assert value.quickest_turn == value.slowest_turn > 0
     assert three.amplification(three.home()).quickest_turn == 0.0

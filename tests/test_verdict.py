@@ -9,12 +9,12 @@ import pytest
 
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
-from pkmcal.identify.unidentified import Findings, explain, seen_legs
-from pkmcal.identify.verdict import LEFT_OPEN, NOMINAL_ERROR_LEFT, judge, no_gain
+from pkmcal.identify.unidentified import Findings, explain, observed_legs
+from pkmcal.identify.verdict import NOMINAL_ERROR_SHARE, UNIDENTIFIABLE, judge, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
@@ -36,9 +36,9 @@ def judged(scene, *views):
     observation = Observation(
         edges, (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    told = identifiability(as_ended(measurements, estimate)[1], estimate.machine)
-    seen = seen_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
-    findings = explain(told, estimate, seen, conditions(machine, seen))
+    values = identifiability(linearize_at_solution(measurements, estimate)[1], estimate.machine)
+    observed = observed_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
+    findings = explain(values, estimate, observed, conditions(machine, observed))
     return observation, estimate, findings, judge(observation, estimate, findings)
 
 
@@ -57,7 +57,7 @@ def apart():
 def test_a_whole_session_may_be_used(whole):
     _, _, findings, verdict = whole
     assert verdict.usable
-    assert findings.told.unidentified == ()
+    assert findings.identifiability.unidentified == ()
     assert verdict.warnings == ()
 
 
@@ -69,8 +69,8 @@ def test_light_that_moves_single_edges_is_warned_of(whole):
         verdict = judge(observation, replace(estimate, edge_noise=noise), findings)
         return verdict.of("edges.polished")
 
-    (said,) = said_of(0.08, 0.2)
-    assert said.facts["value"] == 0.08
+    (text,) = said_of(0.08, 0.2)
+    assert text.facts["value"] == 0.08
     assert said_of(0.02, 0.2) == ()  # painted tubes tell enough beside polished rods
 
 
@@ -78,7 +78,7 @@ def test_stations_apart_are_refused_with_words_and_advice(apart):
     _, _, findings, verdict = apart
     assert not verdict.usable
     # the poses' noise turns the platform a little, so that the rank is full but for a trace
-    assert findings.told.weak[-1].information < 0.05
+    assert findings.identifiability.weak[-1].information < 0.05
     assert findings.unidentified[0].dimensions == 3
     reason = next(r for r in verdict.reasons if r.startswith("Legs 2 and 5 are never seen"))
     assert "Within the drawing's tolerances this moves the platform by" in reason
@@ -90,7 +90,7 @@ def test_stations_apart_are_refused_with_words_and_advice(apart):
 def test_one_configuration_is_refused(name):
     scene = make(name, n=1, n_stations=3)
     _, _, findings, verdict = judged(scene)
-    assert findings.told.unidentified
+    assert findings.identifiability.unidentified
     assert not verdict.usable
     assert any("Photograph more configurations" in r for r in verdict.reasons)
 
@@ -98,9 +98,9 @@ def test_one_configuration_is_refused(name):
 def test_heave_alone_is_said():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart"), 12))
     _, _, _, verdict = judged(scene)
-    said = " ".join(verdict.reasons + verdict.warnings)
-    assert "How far apart the legs stand and how thick their tubes are" in said
-    assert "Turn the platform in some configurations" in said
+    text = " ".join(verdict.reasons + verdict.warnings)
+    assert "How far apart the legs stand and how thick their tubes are" in text
+    assert "Turn the platform in some configurations" in text
 
 
 def test_what_does_not_move_the_platform_is_a_note():
@@ -126,7 +126,7 @@ def sentence(moves, *names, matters=True):
 
 def test_the_share_of_the_drawings_error_decides(whole):
     observation, estimate, findings, _ = whole
-    least = LEFT_OPEN * findings.by_drawing
+    least = UNIDENTIFIABLE * findings.by_drawing
 
     def verdict(*open_):
         return judge(observation, estimate, replace(findings, unidentified=open_))
@@ -145,7 +145,7 @@ def test_the_share_of_the_drawings_error_decides(whole):
 def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     """Few photographs: the deviation says it, and what is open is a small part of it."""
     observation, estimate, findings, _ = whole
-    open_ = (sentence(2 * LEFT_OPEN * findings.by_drawing),)
+    open_ = (sentence(2 * UNIDENTIFIABLE * findings.by_drawing),)
     findings = replace(findings, unidentified=open_)
     assert not judge(observation, estimate, findings).usable
     unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
@@ -157,11 +157,11 @@ def test_a_result_that_is_no_gain_is_refused(whole):
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):
-        factor = share * NOMINAL_ERROR_LEFT * findings.by_drawing / sigma
+        factor = share * NOMINAL_ERROR_SHARE * findings.by_drawing / sigma
         unsure = replace(estimate, joint_covariance=factor**2 * estimate.joint_covariance)
-        found = judge(observation, unsure, findings)
-        assert found.usable == usable
-        assert len(found.reasons) == (not usable)
+        value = judge(observation, unsure, findings)
+        assert value.usable == usable
+        assert len(value.reasons) == (not usable)
     assert no_gain(np.nan, 1.0)
     assert not no_gain(0.0, 0.0)
 
@@ -187,7 +187,7 @@ def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
 def test_what_is_not_identified_stands_in_the_file(apart):
     _, estimate, findings, _ = apart
     document = identifiability_of(findings)
-    assert document["rank"] + len(findings.told.unidentified) == (
+    assert document["rank"] + len(findings.identifiability.unidentified) == (
         document["n_parameters"] - document["n_frames"]
     )
     first = document["unidentified"][0]
@@ -195,6 +195,6 @@ def test_what_is_not_identified_stands_in_the_file(apart):
     assert set(first["parameters"]) <= set(estimate.machine.parameters.names)
     assert {"equation", "needed", "available", "met", "text"} == set(document["conditions"][0])
     assert "never seen together" in json_text(document)
-    said = unidentified(estimate, findings)
-    assert said[0] == f"{first['text']} {first['advice']}"
+    text = unidentified(estimate, findings)
+    assert text[0] == f"{first['text']} {first['advice']}"
     assert isinstance(findings, Findings)

@@ -28,8 +28,8 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, board_for, load_truth
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.view import server
-from pkmcal.view.keep import PoseFile
-from pkmcal.view.viewed import Viewed
+from pkmcal.view.content import Viewed
+from pkmcal.view.pose_file import PoseFile
 from rendered import rendered
 from test_report_page import CHROMIUM, Found
 
@@ -58,11 +58,11 @@ class Page:
         self.app = server.application(self.subject, TOKEN, PORT)
 
     def request(self, path, content=None, kind="http", **headers):
-        said = {"host": f"127.0.0.1:{PORT}", **headers}
+        text = {"host": f"127.0.0.1:{PORT}", **headers}
         scope = {
             "type": kind, "method": "GET" if content is None else "POST", "path": path,
             "raw_path": path.encode(), "query_string": b"", "root_path": "", "scheme": "http",
-            "headers": [(k.encode(), v.encode()) for k, v in said.items()],
+            "headers": [(k.encode(), v.encode()) for k, v in text.items()],
             "http_version": "1.1", "client": None, "server": ("127.0.0.1", PORT),
             "extensions": {"websocket.http.response": {}},
         }  # fmt: skip
@@ -138,8 +138,8 @@ def test_without_the_token_nothing_is_told(page, path, token):
 )
 def test_a_page_of_somebody_else_is_refused(page, headers):
     assert page.get(**headers).status == 403
-    asked = b'{"station": 0, "photograph": 0}'
-    assert page.request(f"/{TOKEN}/save", asked, **headers).status == 403
+    query = b'{"station": 0, "photograph": 0}'
+    assert page.request(f"/{TOKEN}/save", query, **headers).status == 403
 
 
 def test_sockets_are_refused(page):
@@ -180,7 +180,7 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
 
 
 def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
-    monkeypatch.setattr("pkmcal.view.viewed.WIDEST_VIEWED_PICTURE", 100)
+    monkeypatch.setattr("pkmcal.view.content.WIDEST_VIEWED_PICTURE", 100)
     image = cv2.imdecode(np.frombuffer(page.get("photograph/0/0").content, np.uint8), 0)
     assert image.shape[1] == 100
 
@@ -232,8 +232,8 @@ def test_a_joint_comes_to_where_it_is_pulled(page):
     """One joint, then another in a second photograph: both stay."""
     first = {"photograph": 0, "end": "platform", "leg": 2, "pixel": [300, 200]}
     answer = page.ask("overlay", pins=[first])
-    moved = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
-    assert (moved["x"], moved["y"]) == (300, 200)
+    shifted = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
+    assert (shifted["x"], shifted["y"]) == (300, 200)
     base = page.ask("overlay", photograph=1, pose=answer["pose"])["joints"]
     other = next(j for j in base if (j["end"], j["leg"]) == ("base", 5))
     second = {"photograph": 1, "end": "base", "leg": 5, "pixel": [other["x"] + 20, other["y"] - 9]}
@@ -282,9 +282,9 @@ def test_no_pose_is_too_odd(page):
 # ------------------------------------------------------------------ what is found
 
 
-def off(found, true):
+def off(value, true):
     """Angle (degrees) and distance (mm) of a pose from the truth."""
-    error = pose_difference(inverse(np.array(found)), inverse(true))
+    error = pose_difference(inverse(np.array(value)), inverse(true))
     return np.rad2deg(np.linalg.norm(error[:3])), 1e3 * np.linalg.norm(error[3:])
 
 
@@ -295,23 +295,23 @@ def test_the_machine_snaps_to_its_place(page, truth):
     true = truth.T_camera_base[0]
     rough = perturb(true, np.array([0.03, -0.04, 0.05, 0.03, -0.02, 0.05]))
     assert off(rough, true)[1] > 50
-    found = page.ask("fit", pose=rough.tolist())
-    assert found["recognised"]
-    assert found["said"].startswith("Recognised in 4 photographs")
-    angle, distance = off(found["pose"], true)
+    value = page.ask("fit", pose=rough.tolist())
+    assert value["recognised"]
+    assert value["said"].startswith("Recognised in 4 photographs")
+    angle, distance = off(value["pose"], true)
     assert angle < 1.0
     assert distance < 15
-    seen = page.ask("found", pose=found["pose"])
-    assert seen["told"][0].startswith("It fits: ")
-    assert len(seen["edges"]) > 2 * len(seen["missed"])
+    visible = page.ask("found", pose=value["pose"])
+    assert visible["told"][0].startswith("It fits: ")
+    assert len(visible["edges"]) > 2 * len(visible["missed"])
     assert page.ask("found", pose=rough.tolist())["told"][0].startswith("It does not fit: ")
 
 
 def test_the_machine_is_found_from_nowhere(page, truth):
     away = pose(np.eye(3), np.array([0.0, 0.0, 3.0]))
-    found = page.ask("fit", pose=away.tolist(), anywhere=True)
-    assert found["recognised"]
-    assert off(found["pose"], truth.T_camera_base[0])[0] < 1.0
+    value = page.ask("fit", pose=away.tolist(), anywhere=True)
+    assert value["recognised"]
+    assert off(value["pose"], truth.T_camera_base[0])[0] < 1.0
 
 
 def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
@@ -323,23 +323,23 @@ def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
     opened = Page(session)
     before = opened.ask("overlay")["pose"]
-    found = opened.ask("fit")
-    assert not found["recognised"]
-    assert found["said"].startswith("Not ")
-    assert found["pose"] == before
+    value = opened.ask("fit")
+    assert not value["recognised"]
+    assert value["said"].startswith("Not ")
+    assert value["pose"] == before
 
 
 def test_what_a_calibration_found_is_shown_with_its_judgement(page, demo):
-    seen = page.ask("found", shown="calibration")
-    assert seen["median"] < 0.5
+    visible = page.ask("found", shown="calibration")
+    assert visible["median"] < 0.5
     saved = page.subject.saved.document
     rows = {tuple(r[2:5]): r for r in saved["residuals"]["edges"] if r[:2] == [1, 1]}
     assert rows
-    told = [edge["tip"] for edge in seen["edges"] if "residual" in edge["tip"]]
-    assert len(told) > 0.8 * len(rows)
+    values = [edge["tip"] for edge in visible["edges"] if "residual" in edge["tip"]]
+    assert len(values) > 0.8 * len(rows)
     _, _, leg, tube, side, weight, *_ = next(iter(rows.values()))
     tip = next(
-        t for t in told if t.startswith(f"Leg {leg}, tube {tube}, {['right', 'left'][side - 1]}")
+        t for t in values if t.startswith(f"Leg {leg}, tube {tube}, {['right', 'left'][side - 1]}")
     )
     assert tip.endswith(f"weight {weight:.2f}")
 
@@ -350,12 +350,14 @@ def test_reasons_of_what_was_left_out_are_told(page, monkeypatch):
     group = {"reason": "a cable hangs there", "cases": [[name, configuration, 3, 1, 2]]}
     document = {**saved.document, "rejected": [group]}
     monkeypatch.setitem(page.subject.__dict__, "saved", replace(saved, document=document))
-    seen = page.ask("found", shown="calibration")
-    told = [
-        e["tip"] for e in (*seen["edges"], *seen["missed"]) if "a cable hangs there" in e["tip"]
+    visible = page.ask("found", shown="calibration")
+    rows = [
+        e["tip"]
+        for e in (*visible["edges"], *visible["missed"])
+        if "a cable hangs there" in e["tip"]
     ]
-    assert len(told) == 1
-    assert told[0].startswith("Leg 3, tube 1, left edge: ")
+    assert len(rows) == 1
+    assert rows[0].startswith("Leg 3, tube 1, left edge: ")
 
 
 def test_a_boards_corners_are_shown(tmp_path):
@@ -365,9 +367,9 @@ def test_a_boards_corners_are_shown(tmp_path):
     text = (folder / "session.yaml").read_text()
     (folder / "session.yaml").write_text(text.replace("fixed_to: base", "fixed_to: platform"))
     opened = Page(folder)
-    seen = opened.ask("found")
-    assert len(seen["corners"]) > 5
-    assert seen["told"] == [f"The board: {len(seen['corners'])} corners found."]
+    visible = opened.ask("found")
+    assert len(visible["corners"]) > 5
+    assert visible["told"] == [f"The board: {len(visible['corners'])} corners found."]
     assert "no legs to be recognised" in opened.post("fit").json()["message"]
 
 
@@ -405,9 +407,9 @@ def test_cameras_are_those_that_the_calibration_left(demo, session, tmp_path):
     document = json.loads((folder / "calibration.json").read_text())
     document["stations"][0]["focal_scale"] = 1.01
     (folder / "calibration.json").write_text(json.dumps(document))
-    shown = Page(session, folder).subject.calibrated(0, 0).camera
-    np.testing.assert_allclose(shown.parameters[:2], 1.01 * camera.parameters[:2])
-    np.testing.assert_array_equal(shown.parameters[2:], camera.parameters[2:])
+    visible = Page(session, folder).subject.calibrated(0, 0).camera
+    np.testing.assert_allclose(visible.parameters[:2], 1.01 * camera.parameters[:2])
+    np.testing.assert_array_equal(visible.parameters[2:], camera.parameters[2:])
 
 
 # ------------------------------------------------------------------ what is written
@@ -419,8 +421,8 @@ def test_the_pose_is_written_and_nothing_else(session, truth):
     file.write_text(text + "# the end\n")
     opened = Page(session)
     true = truth.T_camera_base[0]
-    said = opened.ask("save", pose=true.tolist())["said"]
-    assert said == "The pose of station1 is in session.yaml; nothing else in it changed."
+    words = opened.ask("save", pose=true.tolist())["said"]
+    assert words == "The pose of station1 is in session.yaml; nothing else in it changed."
     number = re.compile(r"(?<=[\[ ,])-?\d+\.\d+(?=[\],])")
     before, after = text + "# the end\n", file.read_text()
     assert number.sub("#", after) == number.sub("#", before)
@@ -468,23 +470,25 @@ def test_nothing_is_written_through_a_link(session, tmp_path, truth):
 
 def test_the_command_serves_until_it_is_interrupted(demo):
     words = [sys.executable, "-m", "pkmcal", "view", str(demo.session), "--json"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as told:
-        url = json.loads(told.stdout.readline())["url"]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as values:
+        url = json.loads(values.stdout.readline())["url"]
         host, _, token = url.removeprefix("http://").rstrip("/").partition("/")
         assert host.startswith("127.0.0.1:")
         assert len(token) >= 32
         with urllib.request.urlopen(url, timeout=60) as answer:
             assert answer.status == 200
-        told.send_signal(signal.SIGINT)
-        assert told.wait(60) == 0
-        assert told.stdout.read() == told.stderr.read() == ""
+        values.send_signal(signal.SIGINT)
+        assert values.wait(60) == 0
+        assert values.stdout.read() == values.stderr.read() == ""
 
 
 def test_answers_are_sent_at_once():
     """asyncio sends without delay (TCP_NODELAY) where it knows the protocol, else 40 ms later."""
-    with server.listening_socket(0) as found:
-        assert found.getsockname()[0] == "127.0.0.1"
-        assert found.proto == socket.IPPROTO_TCP
+    with server.listening_socket(0) as socket_:
+        assert socket_.getsockname()[0] == "127.0.0.1"
+        assert socket_.proto == socket.IPPROTO_TCP
 
 
 def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
@@ -574,18 +578,18 @@ async function pulled(target, from, to) {
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
     """One walks, pulls, takes back, pulls two joints to their places, and the machine snaps."""
     template, before = server._template, (session / "session.yaml").read_text()
-    with server.listening_socket(0) as found:
-        port = found.getsockname()[1]
+    with server.listening_socket(0) as socket_:
+        port = socket_.getsockname()[1]
         subject = Viewed(load_session(session), demo.calibration)
         pane = subject.drawn(0, 0)
-        seen = pane.camera.project(apply(truth.T_camera_base[0], pane.points)).round(1).tolist()
-        places = [["platform", 2, seen[1][1]], ["base", 5, seen[0][4]]]
+        visible = pane.camera.project(apply(truth.T_camera_base[0], pane.points)).round(1).tolist()
+        places = [["platform", 2, visible[1][1]], ["base", 5, visible[0][4]]]
         more = {"view.js": f"const PLACES = {json.dumps(places)};{ACT}"}
         monkeypatch.setattr(server, "_template", lambda name: template(name) + more.get(name, ""))
         app = server.application(subject, TOKEN, port)
         # a thread of its own has no signals to be ended by: it ends with the tests
         threading.Thread(
-            target=server.serve_until_interrupted, args=(app, found), daemon=True
+            target=server.serve_until_interrupted, args=(app, socket_), daemon=True
         ).start()
         done = subprocess.run(
             [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",

@@ -86,7 +86,7 @@ def sources() -> list[Path]:
 def test_the_words_of_a_name_are_read():
     assert words("_ToldBy_x2Y") == {"", "told", "by", "x2", "y"}
     assert is_banned("_told")
-    assert is_banned("MachineTold")
+    assert is_banned("FoundPose")
     assert is_banned("left")
     assert not is_banned("left_margin")
     assert not is_banned("T_camera_base")

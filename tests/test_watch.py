@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.saved import Known
+from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
@@ -31,12 +31,12 @@ from pkmcal.judge.changes import (
     common_level,
     detectable,
     explained,
-    look_for_changes,
     made_tests,
+    test_for_changes,
     twice_log_odds,
 )
-from pkmcal.judge.held import Evidence, Trust, evidence, hold
-from pkmcal.judge.words import LookedAt, watch_verdict
+from pkmcal.judge.fixed_machine import Evidence, Trust, change_evidence, hold
+from pkmcal.judge.sentences import ComparedSession, watch_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulation import Settings
@@ -110,7 +110,9 @@ class Watched:
         """Of one session of ``machine``, held against a calibration of the true one."""
         calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
         start = start_state(calibrated, data, self.pool.T_camera_base)
-        return evidence(hold(calibrated, data, start, Trust.full(data)), Known(self.covariance))
+        return change_evidence(
+            hold(calibrated, data, start, Trust.full(data)), CalibrationPrior(self.covariance)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +137,7 @@ def moved(machine, **by):
 
 def looked(n=FEW):
     """The circumstances of n new configurations."""
-    return LookedAt(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
+    return ComparedSession(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
 
 
 def board_case(name, rng, **model):
@@ -151,8 +153,8 @@ def by_board(estimate, machine, poses, rng):
     """Evidence of a board on a machine's platform in some poses."""
     data = measured(machine, poses, rng).measurements
     start = start_state(estimate.machine, data, T_CAMERA_BASE[None])
-    return evidence(
-        hold(estimate.machine, data, start, Trust.full(data)), Known(estimate.covariance)
+    return change_evidence(
+        hold(estimate.machine, data, start, Trust.full(data)), CalibrationPrior(estimate.covariance)
     )
 
 
@@ -168,7 +170,7 @@ def h4():
 def test_an_unchanged_machine_gives_unit_noise(unchanged, watched):
     """w is noise of unit variance, calibration's errors included: chi-square as it should be."""
     every = whole_machine(watched.true)
-    tests = [chi_square(found, every) for found in unchanged]
+    tests = [chi_square(results, every) for results in unchanged]
     dof = sum(t.dof for t in tests)
     assert dof > SESSIONS * 20
     assert abs(sum(t.chi2 for t in tests) - dof) < 4 * np.sqrt(2 * dof)
@@ -187,9 +189,9 @@ def test_each_legs_test_is_uniform_in_chance(unchanged, watched):
 
 def test_false_alarms_of_all_tests_together(unchanged, watched):
     """At a level of 0.2, of 50 machines that did not change 10 are flagged, give or take."""
-    asked = [whole_machine(watched.true), *whole_legs(watched.true), *zeros(watched.true)]
-    level = common_level(unchanged[0], asked)
-    least = np.array([min(chi_square(f, c).chance for c in asked) for f in unchanged])
+    queries = [whole_machine(watched.true), *whole_legs(watched.true), *zeros(watched.true)]
+    level = common_level(unchanged[0], queries)
+    least = np.array([min(chi_square(f, c).chance for c in queries) for f in unchanged])
     flagged = int(np.sum(least < level.single(0.2)))
     assert abs(flagged - 10) < 4 * np.sqrt(SESSIONS * 0.2 * 0.8)
     assert level.single(0.2) > 0.2 / level.count  # Bonferroni would be too careful
@@ -202,23 +204,27 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
     every, factor = whole_machine(watched.true), []
     for k in range(8):
         rng = np.random.default_rng([k, 8])
-        calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
+        calibrated, data = watched.calibrated(rng), watched.observed(watched.true, rng)
         start = start_state(calibrated, data, watched.pool.T_camera_base)
         held = hold(calibrated, data, start, Trust.full(data))
-        exact = evidence(held, Known(0 * watched.covariance))
-        found = chi_square(exact, every)
-        factor.append(found.chi2 / found.dof)
+        exact = change_evidence(held, CalibrationPrior(0 * watched.covariance))
+        value = chi_square(exact, every)
+        factor.append(value.chi2 / value.dof)
     assert np.mean(factor) > 1.4
 
 
 def test_other_frames_and_cameras_change_nothing(watched):
     """A test knows neither where the base frame is nor where the camera stands."""
     rng = np.random.default_rng(2)
-    data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
+    data, calibrated = watched.observed(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
-    first = evidence(hold(calibrated, data, start, Trust.full(data)), Known(watched.covariance))
+    first = change_evidence(
+        hold(calibrated, data, start, Trust.full(data)), CalibrationPrior(watched.covariance)
+    )
     away = replace(start, T_camera_base=perturb(start.T_camera_base, 0.01 * rng.normal(size=6)))
-    again = evidence(hold(calibrated, data, away, Trust.full(data)), Known(watched.covariance))
+    again = change_evidence(
+        hold(calibrated, data, away, Trust.full(data)), CalibrationPrior(watched.covariance)
+    )
     every = whole_machine(calibrated)
     assert chi_square(again, every).chi2 == pytest.approx(chi_square(first, every).chi2, abs=1e-4)
     frames = generators(calibrated.layout, calibrated.values) @ freedoms(calibrated)
@@ -232,14 +238,16 @@ def test_other_frames_and_cameras_change_nothing(watched):
 def test_the_regression_predicts_what_a_change_does(watched, by):
     """The same data, seen with a machine that has changed: w moves by X times the change."""
     rng = np.random.default_rng(6)
-    data = watched.seen(watched.true, rng)
+    data = watched.observed(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
-    seen = [
-        evidence(hold(machine, data, start, Trust.full(data)), Known(watched.covariance))
+    in_view = [
+        change_evidence(
+            hold(machine, data, start, Trust.full(data)), CalibrationPrior(watched.covariance)
+        )
         for machine in (watched.true, moved(watched.true, leg3_length__offset=-by))
     ]
     cause = whole_legs(watched.true)[2]
-    changes = [change(found, cause) for found in seen]
+    changes = [change(results, cause) for results in in_view]
     off = changes[1].value - changes[0].value
     index = watched.true.parameters.index
     at = index("legs[3].length.offset") - index("legs[3].base.center.x")
@@ -250,7 +258,7 @@ def test_the_regression_predicts_what_a_change_does(watched, by):
 
 def test_a_changed_offset_is_found_and_named(watched):
     rng = np.random.default_rng(21)
-    judged = look_for_changes(
+    judged = test_for_changes(
         watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
     )
     verdict = watch_verdict(judged, looked())
@@ -258,7 +266,7 @@ def test_a_changed_offset_is_found_and_named(watched):
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (2,))
     assert abs(first.change.value[0] - 1e-3) < 4 * first.change.sigma[0]
-    assert judged.left.chance > 1e-3
+    assert judged.rest.chance > 1e-3
     assert not verdict.usable
     assert "leg 3 has changed" in verdict.headline
     assert "the zero of leg 3's reading by +" in verdict.reasons[0]
@@ -268,8 +276,8 @@ def test_a_changed_offset_is_found_and_named(watched):
 def test_a_joint_that_moved(watched):
     rng = np.random.default_rng(22)
     now = moved(watched.true, leg2_base__center__x=2e-3, leg2_base__center__y=-1e-3)
-    found = watched.evidence(now, rng, few=8)
-    judged = look_for_changes(found, watched.true, ALPHA)
+    value = watched.evidence(now, rng, few=8)
+    judged = test_for_changes(value, watched.true, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
@@ -283,7 +291,7 @@ def test_two_changes_are_both_named(watched):
     """The first single cause that is found resembles both; all pairs tell."""
     rng = np.random.default_rng(23)
     now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
-    judged = look_for_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
+    judged = test_for_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
     verdict = watch_verdict(judged, looked(8))
@@ -295,7 +303,7 @@ def test_warming_is_told_from_a_leg(watched):
     machine = watched.true
     lengths = np.array([k not in ("radius", "scale") for k in machine.parameters.kinds])
     warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
-    judged = look_for_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
+    judged = test_for_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
     verdict = watch_verdict(judged, looked())
@@ -307,25 +315,25 @@ def test_causes_that_look_alike_are_all_named(watched):
     """Three configurations hardly tell a leg's zero from its joints."""
     rng = np.random.default_rng(26)
     now = moved(watched.true, leg4_platform__center__z=1.2e-3)
-    judged = look_for_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
+    judged = test_for_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
     finding = judged.findings[0]
-    alike = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
-    assert ("platform", (3,)) in alike
-    assert len(alike) > 1
+    similar = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
+    assert ("platform", (3,)) in similar
+    assert len(similar) > 1
     assert "These data cannot tell that from" in watch_verdict(judged, looked(3)).reasons[0]
 
 
 def test_detectable_changes_are_detected_so_often(watched):
     """Power by simulation of the regression: as many as promised."""
-    found = watched.evidence(watched.true, np.random.default_rng(31))
+    values = watched.evidence(watched.true, np.random.default_rng(31))
     leg = whole_legs(watched.true)[2]
     along = zeros(watched.true)[2].columns[:, 0]
     level = ALPHA / 14
-    size = detectable(found, leg, along, level)
+    size = detectable(values, leg, along, level)
     rng = np.random.default_rng(32)
     count = 400
     draws = [
-        replace(found, w=found.by @ (size * along) + rng.standard_normal(len(found.w)))
+        replace(values, w=values.by @ (size * along) + rng.standard_normal(len(values.w)))
         for _ in range(count)
     ]
     share = np.mean([chi_square(draw, leg).chance < level for draw in draws])
@@ -335,13 +343,13 @@ def test_detectable_changes_are_detected_so_often(watched):
 
 
 def test_what_is_not_seen_is_not_detected(watched):
-    found = watched.evidence(watched.true, np.random.default_rng(31))
+    values = watched.evidence(watched.true, np.random.default_rng(31))
     frames = generators(watched.true.layout, watched.true.values)[:, 0]
     blind = Cause("zero", (0,), frames[:, None], np.array([1e-3]), "m")
-    assert chi_square(found, blind).dof == 0
-    assert chi_square(found, blind).chance == 1.0
-    assert detectable(found, blind, frames, ALPHA) == np.inf
-    assert change(found, blind).sigma[0] == np.inf
+    assert chi_square(values, blind).dof == 0
+    assert chi_square(values, blind).chance == 1.0
+    assert detectable(values, blind, frames, ALPHA) == np.inf
+    assert change(values, blind).sigma[0] == np.inf
 
 
 # tests made together
@@ -366,14 +374,14 @@ def test_chances_of_several_tests():
 
 def test_likelihood_prefers_the_usual_size():
     """Two causes that explain the same, one by 0.8 tolerances and one by 8."""
-    found = replace(flat(), w=np.array([25.0, 0, 0, 0, 0, 0]))
+    values = replace(flat(), w=np.array([25.0, 0, 0, 0, 0, 0]))
     near = Cause("zero", (0,), np.eye(3)[:, [0]] * 3e-2, np.array([1e-3]), "m")
     far = Cause("zero", (1,), np.eye(3)[:, [0]] * 3e-3, np.array([1e-3]), "m")
-    assert chi_square(found, near).chi2 == chi_square(found, far).chi2 == 625.0
-    assert change(found, far).value[0] == pytest.approx(10 * change(found, near).value[0])
-    assert twice_log_odds(found, near) > twice_log_odds(found, far) + 5
+    assert chi_square(values, near).chi2 == chi_square(values, far).chi2 == 625.0
+    assert change(values, far).value[0] == pytest.approx(10 * change(values, near).value[0])
+    assert twice_log_odds(values, near) > twice_log_odds(values, far) + 5
     wide = joined_causes([near, Cause("zero", (2,), np.eye(3)[:, [2]], np.array([1e-3]), "m")])
-    assert twice_log_odds(found, wide) < twice_log_odds(found, near)
+    assert twice_log_odds(values, wide) < twice_log_odds(values, near)
 
 
 def test_nothing_explains_noise():
@@ -412,13 +420,13 @@ def test_passive_legs_have_no_zero():
 def test_an_h4_by_its_board(h4):
     true, estimate, rng = h4
     poses = papers_poses()[rng.permutation(81)]
-    same = look_for_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
+    same = test_for_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(same, looked(5))
     assert verdict.usable, verdict
     assert "motor's zero by 0." in verdict.headline
     assert "°" in verdict.headline
     now = moved(true, leg2_base__angle=0.02)
-    judged = look_for_changes(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
+    judged = test_for_changes(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (1,))
     assert abs(first.change.value[0] - 0.02) < 4 * first.change.sigma[0]
@@ -427,7 +435,7 @@ def test_an_h4_by_its_board(h4):
 def test_too_few_poses_of_a_board(h4):
     """One pose of a board tells no more than where camera and board are."""
     true, estimate, rng = h4
-    judged = look_for_changes(
+    judged = test_for_changes(
         by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA
     )
     verdict = watch_verdict(judged, looked(1))
@@ -448,13 +456,13 @@ def test_a_planar_machine_by_its_board():
     case = measured(true, poses[:50], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    same = look_for_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
+    same = test_for_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
     assert not same.changed
     now = moved(true, leg2_length__offset=3e-3)
-    judged = look_for_changes(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
+    judged = test_for_changes(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
     first = judged.findings[0]
-    alike = {(s.cause.part, s.cause.legs) for s in (first.suspect, *first.others)}
-    assert ("zero", (1,)) in alike
+    similar = {(s.cause.part, s.cause.legs) for s in (first.suspect, *first.others)}
+    assert ("zero", (1,)) in similar
 
 
 def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
@@ -467,7 +475,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     case = measured(true, poses[:40], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    judged = look_for_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
+    judged = test_for_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(judged, looked(3))
     assert not verdict.usable
     assert not judged.changed
@@ -476,9 +484,9 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
 
 def test_poses_that_cannot_be_found(watched, monkeypatch):
     rng = np.random.default_rng(1)
-    data = watched.seen(watched.true, rng)
+    data = watched.observed(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
-    module = "pkmcal.judge.held.minimise"
+    module = "pkmcal.judge.fixed_machine.minimise"
     monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))
     with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
         hold(watched.true, data, start, Trust.full(data))
@@ -487,7 +495,7 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
 def test_a_family_that_sees_nothing():
     machine = load_mechanism("gough-stewart")
     blind = Evidence(np.zeros(3), np.zeros((3, len(machine.parameters))))
-    judged = look_for_changes(blind, machine, ALPHA)
+    judged = test_for_changes(blind, machine, ALPHA)
     assert judged.tests == ()
     assert not judged.changed
     verdict = watch_verdict(judged, looked(1))
@@ -500,8 +508,8 @@ def test_a_family_that_sees_nothing():
 
 def least_chance(watched, machine, k):
     """Of all tests of one session of a machine."""
-    found = watched.evidence(machine, np.random.default_rng([k, 77]))
-    legs, zero, _ = made_tests(found, watched.true)
+    values = watched.evidence(machine, np.random.default_rng([k, 77]))
+    legs, zero, _ = made_tests(values, watched.true)
     return min(t.adjusted for t in (*legs, *zero) if t and t.dof)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.saved import Known, load
+from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
@@ -20,7 +20,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.judge import new_data
 from pkmcal.judge.causes import magnification, magnified
 from pkmcal.judge.changes import change
-from pkmcal.judge.held import Trust, evidence, hold
+from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.watch import watch_machine
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
@@ -108,9 +108,9 @@ def test_an_unchanged_machine(demo, later):
     assert done.json["verdict"]["headline"] in page.replace("&#39;", "'")
     assert "Still as calibrated" in page
     assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
-    kept = json.loads((later.folder / "w" / "watch.json").read_text())
-    assert kept["pkmcal_watch"] == 1
-    assert kept["legs"] == done.json["legs"]
+    retained = json.loads((later.folder / "w" / "watch.json").read_text())
+    assert retained["pkmcal_watch"] == 1
+    assert retained["legs"] == done.json["legs"]
 
 
 def test_a_changed_machine_in_words(demo, later):
@@ -128,17 +128,20 @@ def test_a_changed_machine_in_words(demo, later):
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):
     """Two of four are known by the content of their photographs."""
     session = load_session(later.same)
-    known = list(session.configurations[:2])
+    reference_values = list(session.configurations[:2])
 
     def listed(document):
-        for entry, name in zip(document["configurations"], known, strict=False):
+        for entry, name in zip(document["configurations"], reference_values, strict=False):
             entry["photographs"] = digests(session)[name]
 
     spoiled(calibration, listed)
-    found = watch_machine(calibration, session)
-    assert found.document()["known_configurations"] == known
-    assert found.document()["configurations"] == list(session.configurations[2:])
-    assert f"made from configuration {known[0]} and {known[1]}" in found.verdict.warnings[0]
+    value = watch_machine(calibration, session)
+    assert value.document()["known_configurations"] == reference_values
+    assert value.document()["configurations"] == list(session.configurations[2:])
+    assert (
+        f"made from configuration {reference_values[0]} and {reference_values[1]}"
+        in value.verdict.warnings[0]
+    )
 
 
 def test_the_calibrations_own_session(demo, session):
@@ -205,15 +208,15 @@ def stayed(demo, later):
 
 
 def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
-    found = [
+    results = [
         run("watch", demo.calibration, stayed.folder, "-o", tmp_path / str(k), "--json", *more)
         for k, more in enumerate([(), ("--same-place", stayed.name)])
     ]
-    assert [done.code for done in found] == [0, 0]
-    assert found[0].json["same_place"] == []
-    assert found[1].json["same_place"] == [stayed.name]
-    assert found[1].json["moved_stations"] == []
-    least = [np.mean([leg["detectable"]["zero"] for leg in done.json["legs"]]) for done in found]
+    assert [done.code for done in results] == [0, 0]
+    assert results[0].json["same_place"] == []
+    assert results[1].json["same_place"] == [stayed.name]
+    assert results[1].json["moved_stations"] == []
+    least = [np.mean([leg["detectable"]["zero"] for leg in done.json["legs"]]) for done in results]
     assert least[1] < 0.8 * least[0]
     page = (tmp_path / "1" / "watch.html").read_text()
     assert f"Left in place: {stayed.name}" in page
@@ -230,11 +233,11 @@ def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, st
         return new_data.measured_new_data(saved, session.without({0: "no place"}), *rest)
 
     monkeypatch.setattr("pkmcal.judge.watch.measured_new_data", without_the_first)
-    found = watch_machine(load(demo.calibration), whole, same_place=[stayed.name])
-    assert found.same_place == (stayed.name,)
-    assert not found.moved
-    assert not found.judged.changed
-    assert [one.station.name for one in found.session.rejected] == ["by hand/1"]
+    value = watch_machine(load(demo.calibration), whole, same_place=[stayed.name])
+    assert value.same_place == (stayed.name,)
+    assert not value.stations_moved
+    assert not value.judged.changed
+    assert [one.station.name for one in value.session.rejected] == ["by hand/1"]
 
 
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
@@ -245,7 +248,7 @@ def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
     )  # fmt: skip
     assert done.code == 0
     assert done.json["same_place"] == []
-    assert [moved["name"] for moved in done.json["moved_stations"]] == [stayed.name]
+    assert [shifted["name"] for shifted in done.json["moved_stations"]] == [stayed.name]
     assert "does not stand where the calibration had it" in done.json["verdict"]["warnings"][0]
 
 
@@ -267,18 +270,18 @@ def seen_through(camera, wrong, edges):
     # the tangent plane at a normal is the plane of the edge's rays
     one, other = edges.basis[..., 0], edges.basis[..., 1]
     first = (np.abs(one[:, 2]) > np.abs(other[:, 2]))[:, None]
-    ahead, aside = np.where(first, one, other), np.where(first, other, one)
+    ahead, offset = np.where(first, one, other), np.where(first, other, one)
     ahead = ahead * np.sign(ahead[:, 2:])
-    rays = ahead[:, None] + np.array([-0.1, 0.0, 0.1])[:, None] * aside[:, None]
+    rays = ahead[:, None] + np.array([-0.1, 0.0, 0.1])[:, None] * offset[:, None]
     pixels = camera.project(rays)
-    told = wrong.ray(pixels)
-    normal = np.cross(told[:, 0], told[:, 2])
+    values = wrong.ray(pixels)
+    normal = np.cross(values[:, 0], values[:, 2])
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
     normal = normal * np.sign(np.sum(normal * edges.normal, axis=1))[:, None]
-    shown = replace(edges, normal=normal, basis=tangent_basis(normal, told[:, 1]))
+    visible = replace(edges, normal=normal, basis=tangent_basis(normal, values[:, 1]))
     at = np.repeat(np.arange(len(edges)), 3)
     none = np.zeros((1, 4, 4))
-    return Observation(shown, (), pixels.reshape(-1, 2), at, none)
+    return Observation(visible, (), pixels.reshape(-1, 2), at, none)
 
 
 def test_a_cameras_magnification_is_told():
@@ -300,9 +303,11 @@ def test_a_cameras_magnification_is_told():
         start = start_state(drawing, data, truth.T_camera_base)
         wide = magnified(data, observed, (camera, camera))
         exact = np.diag(np.full(len(drawing.parameters), 1e-12))
-        found = evidence(hold(drawing, data, start, Trust.full(data), wide), Known(exact))
-        assert found.by.shape[1] == len(drawing.parameters) + 1
-        got.append(change(found, cause))
+        count = change_evidence(
+            hold(drawing, data, start, Trust.full(data), wide), CalibrationPrior(exact)
+        )
+        assert count.by.shape[1] == len(drawing.parameters) + 1
+        got.append(change(count, cause))
     assert got[1].sigma[0] < longer / 4
     assert got[1].value[0] - got[0].value[0] == pytest.approx(longer, rel=0.05)
 
@@ -317,16 +322,16 @@ def test_half_a_millimetre_in_five_photographs(tmp_path):
     settings = Settings(stations=3, configurations=8)
     truth = simulate_session(tmp_path / "before", drawing, camera, settings, seed=11)
     save(calibrate_session(tmp_path / "before"), tmp_path / "calibration")
-    kept = load(tmp_path / "calibration")
+    retained = load(tmp_path / "calibration")
     for seed in range(5):
         folder = tmp_path / f"same{seed}"
         photographed(folder, drawing, truth.machine, camera, 100 + seed, configurations=5)
-        assert watch_machine(kept, folder).verdict.usable
+        assert watch_machine(retained, folder).verdict.usable
     off = changed(truth.machine, "legs[3].length.offset", 0.5e-3)
     folder = photographed(tmp_path / "off", drawing, off, camera, 303, stations=2, configurations=5)
-    found = watch_machine(kept, folder)
-    first = found.judged.findings[0].suspect
-    assert not found.verdict.usable
-    assert "leg 3 has changed" in found.verdict.headline
+    value = watch_machine(retained, folder)
+    first = value.judged.findings[0].suspect
+    assert not value.verdict.usable
+    assert "leg 3 has changed" in value.verdict.headline
     assert (first.cause.part, first.cause.legs) == ("zero", (2,))
     assert abs(first.change.value[0] - 0.5e-3) < 3 * first.change.sigma[0]

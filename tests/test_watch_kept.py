@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.saved import Known
+from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
-from pkmcal.judge.changes import change, chi_square, detectable, look_for_changes
-from pkmcal.judge.held import Trust, evidence, hold
-from pkmcal.judge.watch import tests_with_kept as judged_with_kept
-from pkmcal.judge.words import LookedAt, Names, watch_verdict
+from pkmcal.judge.changes import change, chi_square, detectable, test_for_changes
+from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
+from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
+from pkmcal.judge.watch import tests_with_fixed_stations as judged_with_kept
 from pkmcal.measurements import Measurements
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from test_watch import ALPHA, CAMERA, half_of, made_calibration, moved, photographs_of
@@ -55,10 +55,10 @@ class Left:
         )
         data = Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
         held = hold(calibrated, data, start_state(calibrated, data, now), Trust.full(data))
-        return held, Known(self.joint[: self.n + 6, : self.n + 6], (0,), there)
+        return held, CalibrationPrior(self.joint[: self.n + 6, : self.n + 6], (0,), there)
 
     def evidence(self, machine, rng, **more):
-        return evidence(*self.looked(machine, rng, **more))
+        return change_evidence(*self.looked(machine, rng, **more))
 
 
 @pytest.fixture(scope="module")
@@ -75,12 +75,12 @@ def unchanged(left):
 def test_an_unchanged_machine_gives_unit_noise(left, unchanged):
     """With the calibration's errors of machine and place in the noise, and not without."""
     every = whole_machine(left.true)
-    tests = [chi_square(evidence(*looked), every) for looked in unchanged]
+    tests = [chi_square(change_evidence(*remeasured), every) for remeasured in unchanged]
     dof = sum(t.dof for t in tests)
     assert dof > SESSIONS * 30
     assert abs(sum(t.chi2 for t in tests) - dof) < 4 * np.sqrt(2 * dof)
-    exact = [evidence(h, replace(k, covariance=0 * k.covariance)) for h, k in unchanged]
-    sharp = [chi_square(found, every) for found in exact]
+    exact = [change_evidence(h, replace(k, covariance=0 * k.covariance)) for h, k in unchanged]
+    sharp = [chi_square(results, every) for results in exact]
     assert sum(t.chi2 for t in sharp) > 1.3 * sum(t.dof for t in sharp)
 
 
@@ -89,38 +89,38 @@ def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
     machine have in common that tells: known apart, both as well as they are, they tell no more than
     the machine alone.
     """
-    held, kept = unchanged[0]
-    apart, n = kept.covariance.copy(), left.n
+    held, retained = unchanged[0]
+    apart, n = retained.covariance.copy(), left.n
     apart[n:, :n] = apart[:n, n:] = 0.0
     sizes = [
-        np.mean([detectable(found, z, z.columns[:, 0], ALPHA / 14) for z in zeros(left.true)])
-        for known in (kept, replace(kept, covariance=apart), kept.only(()))
-        for found in (evidence(held, known),)
+        np.mean([detectable(item, z, z.columns[:, 0], ALPHA / 14) for z in zeros(left.true)])
+        for reference_values in (retained, replace(retained, covariance=apart), retained.only(()))
+        for item in (change_evidence(held, reference_values),)
     ]
     assert sizes[0] < 0.55 * sizes[2]
     assert sizes[1] > 0.85 * sizes[2]
 
 
 def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchanged):
-    held, kept = unchanged[1]
-    alone = evidence(held, Known(left.joint[: left.n, : left.n]))
-    none = evidence(held, kept.only(()))
+    held, retained = unchanged[1]
+    alone = change_evidence(held, CalibrationPrior(left.joint[: left.n, : left.n]))
+    none = change_evidence(held, retained.only(()))
     np.testing.assert_array_equal(none.w, alone.w)
-    assert none.kept == ()
+    assert none.fixed_stations == ()
 
 
 def test_frames_of_machine_and_camera_together_change_nothing(left, unchanged):
     """A turn of the base frame moves the base joints and the camera, and shows in no residual; of
     the joints alone it is seen now.
     """
-    held, kept = unchanged[2]
-    found, basis = evidence(held, kept), freedoms(left.true)
+    held, retained = unchanged[2]
+    value, basis = change_evidence(held, retained), freedoms(left.true)
     joints = generators(left.true.layout, held.machine.values) @ basis
-    camera = station_generators(kept.T_camera_base)[0] @ basis
-    columns = stations_moved(found)[0].columns
-    by_camera = np.linalg.inv(_by_twist(kept.T_camera_base[0])) @ camera
-    both = found.along(np.concatenate([joints, by_camera]))
-    assert np.abs(both).max() < 1e-3 * np.abs(found.along(joints)).max()
+    camera = station_generators(retained.T_camera_base)[0] @ basis
+    columns = stations_moved(value)[0].columns
+    by_camera = np.linalg.inv(_by_twist(retained.T_camera_base[0])) @ camera
+    both = value.along(np.concatenate([joints, by_camera]))
+    assert np.abs(both).max() < 1e-3 * np.abs(value.along(joints)).max()
     assert columns.shape == (left.n + 6, 6)
 
 
@@ -141,8 +141,8 @@ def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
     """By 5 mm and half a degree: its shift is told within its deviations."""
     by = np.array([0.0, 8e-3, 0.0, 3e-3, 0.0, 4e-3])
     for k in range(4):
-        held, kept = left.looked(left.true, np.random.default_rng([k, 9]), by=by)
-        judged, rest, gone = judged_with_kept(held, kept, ALPHA)
+        held, retained_rows = left.looked(left.true, np.random.default_rng([k, 9]), by=by)
+        judged, rest, gone = judged_with_kept(held, retained_rows, ALPHA)
         assert [s.station for s in gone] == [0]
         assert rest.stations == ()
         assert not judged.changed
@@ -150,7 +150,9 @@ def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
         off = gone[0].change.value - expected
         assert off @ np.linalg.solve(gone[0].change.covariance, off) < 25  # of 6 degrees: 3e-4
         names = Names(("camera",), ("front",))
-        around = LookedAt(tuple("abcde"), np.zeros(5, bool), np.ones(5, bool), 1.0, names, gone)
+        around = ComparedSession(
+            tuple("abcde"), np.zeros(5, bool), np.ones(5, bool), 1.0, names, gone
+        )
         verdict = watch_verdict(judged, around)
         assert verdict.usable
         assert "camera front does not stand where the calibration had it" in verdict.warnings[0]
@@ -158,16 +160,16 @@ def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
 
 def test_a_leg_that_changed_is_not_taken_for_the_camera(left):
     """0.5 mm, which without the camera's place is found every other time."""
-    found = 0
+    count = 0
     for k in range(6):
         now = moved(left.true, leg3_length__offset=5e-4)
-        held, kept = left.looked(now, np.random.default_rng([k, 11]))
-        judged, rest, gone = judged_with_kept(held, kept, ALPHA)
+        held, retained_rows = left.looked(now, np.random.default_rng([k, 11]))
+        judged, rest, gone = judged_with_kept(held, retained_rows, ALPHA)
         assert gone == ()
         assert rest.stations == (0,)
         named = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
-        found += ("zero", (2,)) in named
-    assert found >= 5
+        count += ("zero", (2,)) in named
+    assert count >= 5
 
 
 def test_a_change_moves_the_evidence_as_the_regression_says(left):
@@ -188,7 +190,7 @@ def test_false_alarms_of_200_sessions(left):
     """At 0.01, 0.05 and 0.1."""
     chances = []
     for k in range(200):
-        judged = look_for_changes(
+        judged = test_for_changes(
             left.evidence(left.true, np.random.default_rng([k, 13])), left.true, ALPHA
         )
         chances.append(min(t.adjusted for t in judged.tests))

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration import recognise, turns
-from pkmcal.calibration.recognise import mistake_in, platform_poses, read_photographs
+from pkmcal.calibration import localization, refinement
+from pkmcal.calibration.localization import mistake_in, platform_poses, read_photographs
 from pkmcal.geometry.rigid import perturb
+from pkmcal.observe import image_batches as passing
 from pkmcal.observe import legs
-from pkmcal.observe import photographs as passing
+from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.image_batches import Placed, windows
 from pkmcal.observe.legs import measure, measure_stations, search, search_stations
-from pkmcal.observe.photographs import Placed, windows
-from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import load_session
 from test_observe_drawing import FRONT, poses, redrawn
 from test_observe_measure import taken
@@ -63,24 +63,24 @@ LOOKS = {
 }
 
 
-def same(look, other):
+def same(edges, other):
     """Two looks show the same."""
-    assert look.rejected == other.rejected
+    assert edges.rejected == other.rejected
     for field in fields(other.edges):
-        ours, theirs = (getattr(one.edges, field.name) for one in (look, other))
+        ours, theirs = (getattr(one.edges, field.name) for one in (edges, other))
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(look.point_edge, other.point_edge)
-    np.testing.assert_allclose(look.points, other.points, atol=1e-9)
-    np.testing.assert_allclose(look.moved, other.moved, atol=1e-12)
-    np.testing.assert_allclose(look.blur, other.blur, atol=1e-12)
+    np.testing.assert_array_equal(edges.point_edge, other.point_edge)
+    np.testing.assert_allclose(edges.points, other.points, atol=1e-9)
+    np.testing.assert_allclose(edges.shift, other.shift, atol=1e-12)
+    np.testing.assert_allclose(edges.blur, other.blur, atol=1e-12)
 
 
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
 def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
     monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", window)
-    photographs, seen, fresh = many()
-    look(photographs, seen)
+    photographs, visible, fresh = many()
+    look(photographs, visible)
     assert fresh.most == window
     assert fresh.alive == 0
     # each once, and a window's for the blur where that is not known
@@ -89,27 +89,27 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 
 @pytest.mark.parametrize("name", ["search", "refine"])
 def test_windows_change_nothing(monkeypatch, name):
-    photographs, seen, _ = many()
-    whole = LOOKS[name](photographs, seen)
+    photographs, visible, _ = many()
+    whole = LOOKS[name](photographs, visible)
     monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
-    found = LOOKS[name](photographs, seen)
-    same(found, whole)
+    value = LOOKS[name](photographs, visible)
+    same(value, whole)
 
 
 def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
-    photographs, seen, _ = many()
+    photographs, visible, _ = many()
     monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
     few = photographs.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
-    of_few = LOOKS["measure"](photographs.select(few), seen[few]).blur
-    assert LOOKS["measure"](photographs, seen).blur == of_few
+    of_few = LOOKS["measure"](photographs.select(few), visible[few]).blur
+    assert LOOKS["measure"](photographs, visible).blur == of_few
 
 
 def test_large_photographs_have_small_windows(monkeypatch):
-    photographs, seen, _ = many()
+    photographs, visible, _ = many()
     width, height = photographs.camera.image_size
     monkeypatch.setattr(passing, "WINDOW_BYTES", 5 * width * height)
-    placed = [Placed(photographs, FRONT, seen)]
+    placed = [Placed(photographs, FRONT, visible)]
     assert [len(window.images) for window in windows(placed)] == [5, 5, 5, 3]
     monkeypatch.setattr(passing, "WINDOW_BYTES", 1)  # one may take more
     assert photographs.window == 1
@@ -121,9 +121,9 @@ def stations():
     """
     longer = replace(taken().camera, parameters=taken().camera.parameters * 1.0001)
     soft = taken([gaussian_filter(image, 0.6) for image in taken().images])
-    first, seen, _ = many()
+    first, visible, _ = many()
     made = [
-        (replace(first, station=2), FRONT, seen),
+        (replace(first, station=2), FRONT, visible),
         (replace(soft, station=5), perturb(FRONT, np.array([0, 0, 0, 5e-4, 0, 0])), poses()),
         (replace(taken(), station=7), FRONT, poses()),
         (replace(taken(), station=8, camera=longer), FRONT, poses()),
@@ -149,8 +149,8 @@ def test_stations_of_one_camera_share_windows(monkeypatch, most, expected):
 def test_photographs_that_are_looked_at_otherwise_do_not(other):
     usual = Placed(taken(), FRONT, poses())
     others = replace(taken(), station=1, **other)
-    seen = [(w.response, w.binning) for w in windows([usual, usual._replace(photographs=others)])]
-    assert seen == [(p.response, p.binning) for p in (usual.photographs, others)]
+    case = [(w.response, w.binning) for w in windows([usual, usual._replace(photographs=others)])]
+    assert case == [(p.response, p.binning) for p in (usual.photographs, others)]
 
 
 @pytest.mark.parametrize("most", [8, 32])
@@ -159,13 +159,13 @@ def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
     monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
     drawn = redrawn(0, 0.0005)
     coarse, fine = search_stations(stations(), drawn), measure_stations(stations(), drawn, known)
-    for (p, T, seen), whole, exact in zip(stations(), coarse, fine, strict=True):
-        same(whole, search(p, drawn, T, seen))
-        same(exact, measure(p, drawn, T, seen, known.get(p.station)))
+    for (p, T, in_view), whole, exact in zip(stations(), coarse, fine, strict=True):
+        same(whole, search(p, drawn, T, in_view))
+        same(exact, measure(p, drawn, T, in_view, known.get(p.station)))
         assert (exact.edges.station == p.station).all()
-    told = dict(zip((2, 5, 7, 8), (look.blur for look in fine), strict=True))
-    assert told.items() >= known.items()
-    assert known or told[5] > told[7] + 0.1
+    entries = dict(zip((2, 5, 7, 8), (station_edges.blur for station_edges in fine), strict=True))
+    assert entries.items() >= known.items()
+    assert known or entries[5] > entries[7] + 0.1
 
 
 def test_tables_look_at_each_photograph_once_and_share_their_memory():
@@ -176,27 +176,33 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
     assert np.shares_memory(some.tables.picture, tables.tables.picture)
     place = np.array([100.0, 200.0])
     for k, own in enumerate((7, 2)):
-        alike = [t.look(np.array(3), place, np.array(n))[0] for t, n in ((some, k), (tables, own))]
-        assert alike[0] == alike[1]
+        same = [
+            t.look_up(np.array(3), place, np.array(n))[0] for t, n in ((some, k), (tables, own))
+        ]
+        assert same[0] == same[1]
 
 
 @pytest.mark.parametrize(("enough", "each"), [(0.0, [1, 1, 1]), (np.inf, [3])])
 def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enough, each):
     """With the same result, in their order."""
-    monkeypatch.setattr(turns, "KEPT_PHOTOGRAPH_BYTES", enough)
+    monkeypatch.setattr(refinement, "CACHED_IMAGE_BYTES", enough)
     photographs = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
     counts: list[int] = []
 
-    def look(some):
+    def measure(some):
         threads.add(get_ident())
         counts.append(len(some))
-        return [legs.joined_looks([], 0.5 + one.station, 0.0) for one in some]
+        return [legs.joined_passes([], 0.5 + one.station, 0.0) for one in some]
 
-    assert [seen.blur for seen in turns._looked_at(photographs, look)] == [0.5, 1.5, 2.5]
+    assert [in_view.blur for in_view in refinement._search_pass(photographs, measure)] == [
+        0.5,
+        1.5,
+        2.5,
+    ]
     assert (get_ident() in threads) == (enough > 0)
     assert counts == each
-    assert turns._looked_at([], look) == []
+    assert refinement._search_pass([], measure) == []
 
 
 # ------------------------------------------------------------------ a session
@@ -210,44 +216,44 @@ def session(demo):
 def test_so_many_bytes_of_a_session_stay_decoded(session, monkeypatch):
     sizes = [np.prod(station.camera.image_size) for station in session.stations]
     each = len(session.stations[0].photographs)
-    monkeypatch.setattr(recognise, "KEPT_PHOTOGRAPH_BYTES", int(sizes[0] * each + sizes[1]))
-    kept = [
+    monkeypatch.setattr(localization, "CACHED_IMAGE_BYTES", int(sizes[0] * each + sizes[1]))
+    retained = [
         [p.images[k] is p.images[k] for k in range(len(p.images))]
         for p in read_photographs(session)
     ]
-    assert kept[0] == [True] * each
-    assert kept[1] == [True] + [False] * (each - 1)
-    assert not any(kept[2])
+    assert retained[0] == [True] * each
+    assert retained[1] == [True] + [False] * (each - 1)
+    assert not any(retained[2])
 
 
 def test_the_machine_is_looked_for_in_some_of_many_photographs(session, monkeypatch):
     """Spread over all of them, each under its own name."""
-    monkeypatch.setattr(recognise, "MOST_AT_A_STATION", 3)
-    monkeypatch.setattr(recognise, "FEWEST_AT_A_STATION", 2)
-    tables, seen = [], []
+    monkeypatch.setattr(localization, "MOST_AT_A_STATION", 3)
+    monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 2)
+    tables, in_view = [], []
 
     def counted(images):
         tables.append(len(images))
         return distance_tables(images)
 
-    monkeypatch.setattr(recognise, "distance_tables", counted)
-    monkeypatch.setattr(recognise, "mistake", lambda stations, _rng: seen.extend(stations))
+    monkeypatch.setattr(localization, "distance_tables", counted)
+    monkeypatch.setattr(localization, "mistake", lambda stations, _rng: in_view.extend(stations))
     photographs, rng = read_photographs(session), np.random.default_rng(0)
     assert all(len(p.images) == 4 for p in photographs)
     rngs = rng.spawn(len(photographs))
-    found = recognise.recognise(session, photographs, platform_poses(session), rngs)
+    results = localization.recognise(session, photographs, platform_poses(session), rngs)
     assert tables == [3] * len(photographs)
-    assert [numbers.tolist() for numbers in found.seen] == [[0, 1, 3]] * len(photographs)
-    mistake_in(session, photographs, found, rng)
-    for station in seen:
+    assert [numbers.tolist() for numbers in results.used] == [[0, 1, 3]] * len(photographs)
+    mistake_in(session, photographs, results, rng)
+    for station in in_view:
         names = [session.configurations[k] for k in station.view.configuration]
         assert [name in file for name, file in zip(names, station.files, strict=True)] == [True] * 3
 
 
 def test_many_stations_share_the_photographs_that_are_looked_at(session, monkeypatch):
-    monkeypatch.setattr(recognise, "MOST_IN_ALL", 2 * len(session.stations))
-    monkeypatch.setattr(recognise, "FEWEST_AT_A_STATION", 1)
+    monkeypatch.setattr(localization, "MOST_IN_ALL", 2 * len(session.stations))
+    monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 1)
     photographs = read_photographs(session)
     rngs = np.random.default_rng(0).spawn(len(photographs))
-    found = recognise.recognise(session, photographs, platform_poses(session), rngs)
-    assert [len(numbers) for numbers in found.seen] == [2] * len(photographs)
+    results = localization.recognise(session, photographs, platform_poses(session), rngs)
+    assert [len(numbers) for numbers in results.used] == [2] * len(photographs)

@@ -24,7 +24,12 @@ from pkmcal.identify.motions import (
 )
 from pkmcal.identify.sentences import MOST_SENTENCES
 from pkmcal.identify.tool import _around, platform_by_parameters, pose_by_parameters
-from pkmcal.identify.unidentified import describe, direction_vectors, seen_legs, seen_through_boards
+from pkmcal.identify.unidentified import (
+    describe,
+    direction_vectors,
+    observed_by_boards,
+    observed_legs,
+)
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
 from pkmcal.mechanisms.carriers.slider import Slider
@@ -56,8 +61,8 @@ def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=No
     draw = table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
     theta = table.drawing + errors * table.free_matrix() @ draw
     poses = moved(machine, rng, n) if poses is None else poses
-    found = kinematics.on_manifold(machine.layout, theta, poses)
-    poses = found.T_base_platform[found.converged]
+    value = kinematics.on_manifold(machine.layout, theta, poses)
+    poses = value.T_base_platform[value.converged]
     joints = machine.with_values(theta).inverse(poses)[None]
     ends = limb_ends(machine.layout, theta[None, None], joints, poses[None])
     index = _index(rng, machine, len(poses), n_stations, 1.0)
@@ -87,11 +92,11 @@ def told_of(scene: Scene, *views):
         )  # fmt: skip
     assembled = assemble(scene.machine, measurements, default_gauge(scene.machine))
     state = batch_of(scene.machine, assembled, scene.state())
-    told = identifiability(Information(assembled.problem, state), scene.machine)
+    values = identifiability(Information(assembled.problem, state), scene.machine)
     edges = measurements.edges
-    seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
-    null = direction_vectors(told.unidentified, machine)
-    return told, seen, describe(Situation(machine, seen, scene.poses[0]), null)
+    observed = observed_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
+    null = direction_vectors(values.unidentified, machine)
+    return values, observed, describe(Situation(machine, observed, scene.poses[0]), null)
 
 
 # ------------------------------------------------------------------ whole sessions and poor ones
@@ -99,8 +104,8 @@ def told_of(scene: Scene, *views):
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps", "6-spu-passive"])
 def test_a_whole_session_leaves_nothing_open(name):
-    told, _, sentences = told_of(make(name))
-    assert told.unidentified == ()
+    values, _, sentences = told_of(make(name))
+    assert values.unidentified == ()
     assert sentences == ()
 
 
@@ -108,8 +113,8 @@ def test_a_whole_session_leaves_nothing_open(name):
 def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     """Cameras measure angles; what tells lengths is readings, each unsure by its scale."""
     machine = load_mechanism(name)
-    told, _, sentences = told_of(make(name, machine=machine))
-    assert len(told.unidentified) == 1
+    values, _, sentences = told_of(make(name, machine=machine))
+    assert len(values.unidentified) == 1
     (size,) = sentences
     assert size.text.startswith("The size of everything is known from the drawing only, by the")
     scales = {f"legs[{j + 1}].scale" for j in range(machine.n_legs)}
@@ -124,19 +129,19 @@ def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     [("gough-stewart", "Legs 1 to 6"), ("3-rpr", "Legs 1 to 3"), ("3-rps", "Legs 1 to 3")],
 )
 def test_one_configuration_lets_every_leg_slide_along_itself(name, legs):
-    told, _, sentences = told_of(make(name, n=1, n_stations=2))
+    values, _, sentences = told_of(make(name, n=1, n_stations=2))
     slide = next(s for s in sentences if "grow and shift along itself" in s.text)
     assert slide.text.startswith(f"{legs} keep nearly one direction each")
     assert slide.dimensions == 2 * load_mechanism(name).n_legs
     assert "more configurations" in slide.advice
-    assert sum(s.dimensions for s in sentences) == len(told.unidentified)
+    assert sum(s.dimensions for s in sentences) == len(values.unidentified)
     assert any(s.matters for s in sentences)
 
 
 def test_heave_alone_leaves_the_depth_of_all_legs():
     machine = load_mechanism("gough-stewart")
-    told, _, sentences = told_of(make("gough-stewart", poses=heaved(machine)))
-    assert len(told.unidentified) == 1
+    values, _, sentences = told_of(make("gough-stewart", poses=heaved(machine)))
+    assert len(values.unidentified) == 1
     assert len(sentences) == 1
     assert sentences[0].text.startswith(
         "How far apart the legs stand and how thick their tubes are"
@@ -147,7 +152,7 @@ def test_heave_alone_leaves_the_depth_of_all_legs():
 def test_stations_without_shared_legs_are_said():
     poses = moved(load_mechanism("gough-stewart"), np.random.default_rng(1), 8, turn=0.0)
     scene = make("gough-stewart", poses=poses)
-    told, _, sentences = told_of(scene, [1, 3, 4, 6], [1, 3, 4, 6], [2, 5])
+    values, _, sentences = told_of(scene, [1, 3, 4, 6], [1, 3, 4, 6], [2, 5])
     group = sentences[0]
     assert group.text.startswith(
         "Legs 2 and 5 are never seen together with the others: legs 2 and 5 as a whole can shift"
@@ -157,7 +162,7 @@ def test_stations_without_shared_legs_are_said():
     assert group.matters
     assert group.advice.startswith("Add a station that sees legs 2 and 5 together with legs 1, 3,")
     assert "board: {fixed_to: base}" in group.advice
-    assert sum(s.dimensions for s in sentences) == len(told.unidentified)
+    assert sum(s.dimensions for s in sentences) == len(values.unidentified)
 
 
 def test_heave_with_stations_apart_also_turns_one_group():
@@ -171,31 +176,31 @@ def test_heave_with_stations_apart_also_turns_one_group():
 
 
 def test_platform_turns_join_stations_that_share_no_leg():
-    told, _, sentences = told_of(make("gough-stewart", n_stations=2), [1, 2, 3], [4, 5, 6])
-    assert told.unidentified == ()
+    values, _, sentences = told_of(make("gough-stewart", n_stations=2), [1, 2, 3], [4, 5, 6])
+    assert values.unidentified == ()
     assert sentences == ()
 
 
 def test_a_leg_nobody_sees_stands_on_its_readings():
     scene = make("gough-stewart", n=4)
     without = [1, 2, 4, 5, 6]
-    told, _, sentences = told_of(scene, without, without, without)
+    rows, _, sentences = told_of(scene, without, without, without)
     assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no photograph"]
-    assert sentences[0].dimensions == len(told.unidentified) == 5
+    assert sentences[0].dimensions == len(rows.unidentified) == 5
     assert sentences[0].matters
     assert sentences[0].advice.startswith("Photograph leg 3")
     assert all(name.startswith("legs[3]") for name in sentences[0].parameters)
 
 
 def test_a_passive_leg_nobody_sees_moves_nothing():
-    told, _, sentences = told_of(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
+    values, _, sentences = told_of(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
     assert len(sentences) == 1
     assert sentences[0].text == (
         "Leg 7 is in no photograph, so that nothing tells where its joints are."
         " This does not move the platform."
     )
     assert not sentences[0].matters
-    assert sentences[0].dimensions == len(told.unidentified) == 8
+    assert sentences[0].dimensions == len(values.unidentified) == 8
 
 
 def test_common_turns_of_parallel_axes_move_nothing():
@@ -239,8 +244,8 @@ def seen_from(*views, legs=6):
 def test_a_leg_grows_along_the_way_that_it_has_at_its_readings(name):
     """With carriages and cranks where they were, and not at reading zero."""
     machine = load_mechanism(name)
-    way = kinematics.closure_at(machine.layout, machine.values, machine.home()).rows.u[0]
-    change = {f"legs[1].base.center.{c}": -v for c, v in zip("xyz", way, strict=True)}
+    sense = kinematics.closure_at(machine.layout, machine.values, machine.home()).rows.u[0]
+    change = {f"legs[1].base.center.{c}": -v for c, v in zip("xyz", sense, strict=True)}
     change |= {n: 1.0 for n in machine.parameters.names if n.startswith("legs[1].length")}
     around = Situation(machine, np.ones((1, machine.n_legs), bool), machine.home()[None])
     (sentence,) = describe(around, unit(machine, change)[None])
@@ -259,8 +264,8 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
     for leg in (1, 4):
         row = machine.parameters.index(f"legs[{leg + 1}].base.center.x")
         change[row : row + 3] = np.cross(axis, centres[leg] - centres[0])
-    seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
-    (sentence,) = describe(Situation(machine, seen, poses), change[None])
+    in_view = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    (sentence,) = describe(Situation(machine, in_view, poses), change[None])
     assert sentence.text.startswith(
         "Of the others, only legs 1 and 4 are ever seen together with legs 2 and 5: the base joints"
         " of legs 2 and 5 can turn about the axis through joints 1 and 4 against the others."
@@ -292,8 +297,8 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
 )  # fmt: skip
 def test_single_changes_have_their_names(change, text):
     machine, poses = hexapod()
-    seen = np.ones((2, 6), bool)
-    (sentence,) = describe(Situation(machine, seen, poses), unit(machine, change)[None])
+    visible = np.ones((2, 6), bool)
+    (sentence,) = describe(Situation(machine, visible, poses), unit(machine, change)[None])
     assert sentence.text.startswith(text)
 
 
@@ -334,11 +339,11 @@ def test_a_leg_growing_into_its_base_is_found():
 
 def test_any_basis_of_the_space_gives_the_same_words():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
-    told, seen, expected = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+    values, in_view, expected = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
     machine = scene.machine.with_values(scene.theta[0])
-    null = direction_vectors(told.unidentified, machine)
+    null = direction_vectors(values.unidentified, machine)
     mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
-    again = describe(Situation(machine, seen, scene.poses[0]), mix @ null)
+    again = describe(Situation(machine, in_view, scene.poses[0]), mix @ null)
     assert [s.text for s in again] == [s.text for s in expected]
 
 
@@ -364,9 +369,9 @@ def test_many_open_directions_stay_readable():
 def test_what_the_drawing_knows_better_is_not_called_free():
     machine, poses = hexapod()
     null = unit(machine, {"legs[3].length.offset": 1.0})[None]
-    seen = np.ones((1, 6), bool)
-    (weak,) = describe(Situation(machine, seen, poses), null, np.array([0.5]))
-    (open_,) = describe(Situation(machine, seen, poses), null)
+    visible = np.ones((1, 6), bool)
+    (weak,) = describe(Situation(machine, visible, poses), null, np.array([0.5]))
+    (open_,) = describe(Situation(machine, visible, poses), null)
     assert weak.text.startswith("The length offset of leg 3 is known from the drawing only.")
     assert "smaller tolerances" in weak.advice
     assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
@@ -385,10 +390,10 @@ def test_what_is_said_about_fixed_can_be_written_there(name):
 def test_all_legs_are_fixed_in_one_entry_beside_what_is_fixed_already():
     machine = load_mechanism("gough-stewart")
     document = machine.document.model_copy(update={"fixed": ("legs[1].base.center.z",)})
-    seen = np.ones((1, 6), bool)
+    visible = np.ones((1, 6), bool)
 
     def advice(change, document):
-        around = Situation(replace(machine, document=document), seen, hexapod()[1])
+        around = Situation(replace(machine, document=document), visible, hexapod()[1])
         (sentence,) = describe(around, unit(machine, change)[None])
         return re.search(r"; or (.*) the mechanism file if", sentence.advice)[1]
 
@@ -402,12 +407,12 @@ def test_all_legs_are_fixed_in_one_entry_beside_what_is_fixed_already():
 
 def test_a_model_is_fixed_where_its_own_entries_stand():
     """Of the file's own ``fixed`` nothing holds where a model of it was asked for."""
-    seen = np.ones((1, 3), bool)
+    visible = np.ones((1, 3), bool)
 
     def advice(model):
         machine = load_mechanism("linear-delta", model=model)
         change = unit(machine, {f"legs[{j}].length.constant": 1.0 for j in (1, 2)})[None]
-        around = Situation(machine, seen, moved(machine, np.random.default_rng(0), 5))
+        around = Situation(machine, visible, moved(machine, np.random.default_rng(0), 5))
         (sentence,) = describe(around, change)
         return re.search(r"; or (.*) if the drawing", sentence.advice)[1]
 
@@ -433,19 +438,19 @@ def test_how_far_the_platform_moves_agrees_with_the_forward_solution(name):
     a, b = (T[:, None, :3, :3] @ joints[..., None] for T in (poses, there))
     a, b = (p[..., 0] + T[:, None, :3, 3] for p, T in ((a, poses), (b, there)))
 
-    def left(frames):
+    def remainder(frames):
         """Displacements of the joints once B's base and platform frame are laid over A's."""
         base, platform = perturb(np.eye(4)[None], frames[:6][None]), frames[6:]
         own = perturb(np.eye(4)[None], platform[None])
         T = base @ there @ own
         return (T[:, None, :3, :3] @ joints[..., None])[..., 0] + T[:, None, :3, 3] - a
 
-    fitted = least_squares(lambda x: left(x).ravel() * 1e3, np.zeros(12), x_scale=1e-5).x
-    found = float(np.sqrt(np.mean(np.sum(left(fitted) ** 2, axis=-1))))
-    told = float(np.linalg.norm(platform_by_parameters(machine, few) @ change))
+    fitted = least_squares(lambda x: remainder(x).ravel() * 1e3, np.zeros(12), x_scale=1e-5).x
+    values = float(np.sqrt(np.mean(np.sum(remainder(fitted) ** 2, axis=-1))))
+    items = float(np.linalg.norm(platform_by_parameters(machine, few) @ change))
     plain = float(np.sqrt(np.mean(np.sum((b - a) ** 2, axis=-1))))
-    assert found < 0.9 * plain  # the frames do count
-    assert told == pytest.approx(found, rel=1e-3)  # of second order, 1e-4 of a radian's
+    assert values < 0.9 * plain  # the frames do count
+    assert items == pytest.approx(values, rel=1e-3)  # of second order, 1e-4 of a radian's
 
 
 # ------------------------------------------------------------------ parts
@@ -459,8 +464,8 @@ def test_pose_derivatives_agree_with_the_forward_kinematics():
         jacobian = pose_by_parameters(machine, scene.joints[0], scene.poses[0]) @ free
         for k in range(0, free.shape[1], 5):
             there = machine.with_values(machine.values + step * free[:, k])
-            found = there.forward_result(scene.joints[0], scene.poses[0]).T_base_platform
-            shift = (found - scene.poses[0])[:, :3, 3] / step
+            fk = there.forward_result(scene.joints[0], scene.poses[0]).T_base_platform
+            shift = (fk - scene.poses[0])[:, :3, 3] / step
             np.testing.assert_allclose(shift, jacobian[:, 3:, k], atol=2e-5)
 
 
@@ -483,10 +488,10 @@ def test_one_pose_does_not_hide_what_others_show():
 
 
 def test_groups_follow_what_stations_share():
-    seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
-    assert (1, 4) in movable_leg_groups(seen)
-    assert (2, 5) in movable_leg_groups(seen)
-    assert [tuple(np.flatnonzero(g)) for g in hanging_together(seen)] == [tuple(range(6))]
+    in_view = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    assert (1, 4) in movable_leg_groups(in_view)
+    assert (2, 5) in movable_leg_groups(in_view)
+    assert [tuple(np.flatnonzero(g)) for g in hanging_together(in_view)] == [tuple(range(6))]
     apart = seen_from([1, 2], [3, 4], [4, 5], [6])
     parts = {tuple(np.flatnonzero(g).tolist()) for g in hanging_together(apart)}
     assert parts == {(0, 1), (2, 3, 4), (5,)}
@@ -504,8 +509,8 @@ def test_a_board_on_the_base_joins_stations():
     measured = Measurements(
         edges, np.zeros((1, 6)), 1e-6, 3, np.zeros(3, int), poses=poses, mounts=mounts
     )
-    seen = seen_through_boards(seen_from([1], [2], [3]), measured)
-    assert [np.flatnonzero(row).tolist() for row in seen] == [[0, 2], [1], [0, 2]]
+    in_view = observed_by_boards(seen_from([1], [2], [3]), measured)
+    assert [np.flatnonzero(row).tolist() for row in in_view] == [[0, 2], [1], [0, 2]]
 
 
 @pytest.mark.parametrize("carrier", [*base_carriers().values(), *platform_carriers().values()])
@@ -545,8 +550,8 @@ def test_what_a_carrier_names_is_said(monkeypatch):
 def test_candidates_are_changes_of_this_machine():
     for name in ("gough-stewart", "3-upu", "3-rpr", "6-spu-passive"):
         machine = load_mechanism(name)
-        seen = np.ones((2, machine.n_legs), bool)
-        seen[1, 0] = False
-        for motion in candidates(Situation(machine, seen, machine.home()[None])):
+        visible = np.ones((2, machine.n_legs), bool)
+        visible[1, 0] = False
+        for motion in candidates(Situation(machine, visible, machine.home()[None])):
             assert motion.columns.shape[0] == len(machine.parameters)
             assert np.isfinite(motion.columns).all()

@@ -21,7 +21,7 @@ from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.report import parameters
-from pkmcal.report.identifiability import held as held_in_words
+from pkmcal.report.identifiability import held_text as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import TIGHT_CORRELATION, bound_together, grouped, tight_pairs
 from pkmcal.solver.search import Stop
@@ -38,8 +38,8 @@ def told_of(name, model=None, shape=""):
     estimate = estimated(machine, case, rng)
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     state = batch_of(machine, assembled, estimate.state)
-    told = identifiability(Information(assembled.problem, state), machine)
-    return told, explain(told, estimate, np.ones((1, machine.n_legs), bool)), estimate
+    values = identifiability(Information(assembled.problem, state), machine)
+    return values, explain(values, estimate, np.ones((1, machine.n_legs), bool)), estimate
 
 
 def kit_poses(rng, machine, shape):
@@ -57,8 +57,8 @@ def of(findings, start):
 
 
 def test_the_half_width_is_told_from_the_base_by_nobody():
-    told, findings, _ = told_of("h4")
-    assert len(told.unidentified) == 2
+    values, findings, _ = told_of("h4")
+    assert len(values.unidentified) == 2
     (width,) = of(findings, "Of y of the base joints and of the side bars' joints (half a bar's")
     assert "only the difference is seen: both can shift alike in one way" in width.text
     assert set(width.parameters) == {
@@ -89,11 +89,11 @@ def test_what_the_advice_holds_leaves_nothing_open():
     machine = replace(machine, parameters=table.with_roles(held, tied))
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     info = Information(assembled.problem, batch_of(machine, assembled, estimate.state))
-    told = identifiability(info, machine)
+    values = identifiability(info, machine)
     before = told_of("h4")[0]
-    assert told.unidentified == ()
-    assert told.rank == before.rank
-    assert told.n_parameters == before.n_parameters - 2
+    assert values.unidentified == ()
+    assert values.rank == before.rank
+    assert values.n_parameters == before.n_parameters - 2
 
 
 def test_parallelism_is_said_to_be_the_boards():
@@ -147,8 +147,8 @@ def test_what_moves_with_hinges_moves_no_platform():
     for _ in range(3):
         change = free @ (table.tolerances_free() * rng.normal(size=free.shape[1])) * step
         after = machine.with_values(machine.values + change).forward(joints, before)
-        moved = pose_difference(after, before)
-        np.testing.assert_allclose(moved, by @ change, atol=2e-4 * np.abs(moved).max())
+        shifted = pose_difference(after, before)
+        np.testing.assert_allclose(shifted, by @ change, atol=2e-4 * np.abs(shifted).max())
 
 
 def test_radii_are_no_business_of_boards():
@@ -171,26 +171,26 @@ def test_weak_and_free_are_told_together():
     "case", [("h4",), ("h4", "rods"), ("delta",), ("linear-delta",), ("delta", None, "straight")]
 )
 def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
-    told, findings, _ = told_of(*case)
+    values, findings, _ = told_of(*case)
     sentences = (*findings.unidentified, *findings.weak)
     text = " ".join(f"{s.text} {s.advice}" for s in sentences)
     for word in ("tube", "hotograph", "base.arm is", "caliper"):
         assert word not in text
-    assert sum(s.dimensions for s in sentences) == len(told.unidentified) + len(told.weak)
+    assert sum(s.dimensions for s in sentences) == len(values.unidentified) + len(values.weak)
     assert len({s.text for s in sentences}) == len(sentences)
 
 
 def test_sizes_are_columns_of_the_machine():
     machine = load_mechanism("linear-delta")
-    found = {
+    names = {
         size.label: size.columns
         for size in sizes(Situation(machine, np.ones((1, 3), bool), machine.home()[None]))
     }
-    assert list(found) == ["base radius", "base height", "rod length", "reading scale"]
-    centres = machine.values + 1e-3 * found["base radius"].sum(axis=1)
-    moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
+    assert list(names) == ["base radius", "base height", "rod length", "reading scale"]
+    centres = machine.values + 1e-3 * names["base radius"].sum(axis=1)
+    shifted = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
     np.testing.assert_allclose(
-        moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
+        shifted - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
     )
 
 
@@ -212,12 +212,12 @@ def test_a_search_that_has_not_settled_is_refused():
 def test_what_the_calibration_model_holds_is_convention():
     _, findings, estimate = told_of("h4")
     assert set(findings.conventional) == set(estimate.machine.parameters.fixed)
-    said = held_in_words(findings, estimate.machine.parameters)
-    assert "are held by convention" in said
-    assert "held by the model" not in said
-    assert said.startswith("Crank axis distance of legs 1 to 4,")
-    assert "hinge z of legs 1 to 4" in said
-    assert "Of the heights of base joints and platform only the sum counts" in said
+    text = held_in_words(findings, estimate.machine.parameters)
+    assert "are held by convention" in text
+    assert "held by the model" not in text
+    assert text.startswith("Crank axis distance of legs 1 to 4,")
+    assert "hinge z of legs 1 to 4" in text
+    assert "Of the heights of base joints and platform only the sum counts" in text
 
 
 def test_ties_are_said_once_with_their_signs():
@@ -240,17 +240,17 @@ def test_pairs_that_a_finding_names_are_not_said_again():
 @pytest.mark.parametrize("name", ["h4", "linear-delta", "gough-stewart"])
 def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
     _, _, estimate = told_of(name)
-    table, said = estimate.machine.parameters, bound_together(estimate)
+    table, text = estimate.machine.parameters, bound_together(estimate)
     part = parameters.correlations_part(estimate)
     (heat,) = part.plots[0].figure["data"]
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
-    assert bool(said) == (abs(closest) > TIGHT_CORRELATION)
+    assert bool(text) == (abs(closest) > TIGHT_CORRELATION)
     for i, j, rho in tight_pairs(estimate)[:1]:
         assert (
             f"{table.in_words(table.names[i])} and {table.in_words(table.names[j])}" in part.text[0]
         )
         assert closest == pytest.approx(rho, abs=0.005)
-        assert table.in_words(table.names[j]) in said[0]
+        assert table.in_words(table.names[j]) in text[0]
     # of a tie, one stands for all: another name of it would have a correlation of one
     again = {table.in_words(x) for group in table.tied for x in group[1:]}
     assert not again & set(heat["x"])
@@ -269,9 +269,9 @@ def test_the_design_models_assumptions_are_no_conventions():
     _, findings, estimate = told_of("h4", "design")
     assert not any(".axis." in name for name in findings.conventional)
     assert findings.also_conventional > 0  # the heights' sum among them
-    said = held_in_words(findings, estimate.machine.parameters)
-    assert "held by the model that the mechanism file describes" in said
-    assert "of which with a camera and a board only the sum is seen" in said
+    text = held_in_words(findings, estimate.machine.parameters)
+    assert "held by the model that the mechanism file describes" in text
+    assert "of which with a camera and a board only the sum is seen" in text
 
 
 def test_a_held_arm_is_no_convention():

@@ -34,10 +34,10 @@ def shifted(T, *tau):
 
 
 def test_home_belongs_to_every_workspace(machine):
-    found = machine.reachable(machine.home())
-    assert found.inside
-    assert found.why() == ()
-    np.testing.assert_array_equal(found.readings, machine.inverse(machine.home()))
+    reach = machine.reachable(machine.home())
+    assert reach.inside
+    assert reach.why() == ()
+    np.testing.assert_array_equal(reach.readings, machine.inverse(machine.home()))
 
 
 def test_poses_of_readings_in_range_are_inside_and_others_are_not(machine):
@@ -51,9 +51,9 @@ def test_poses_of_readings_in_range_are_inside_and_others_are_not(machine):
     poses = machine.forward(near)
     if machine.redundancy:  # readings are not free: those of a pose that there is
         near = machine.inverse(poses)
-    found = machine.reachable(poses)
-    assert found.inside.all()
-    np.testing.assert_allclose(found.readings, near, atol=1e-9)
+    value = machine.reachable(poses)
+    assert value.inside.all()
+    np.testing.assert_allclose(value.readings, near, atol=1e-9)
     if not np.isfinite(low).all():
         return
     for j in range(machine.n_joints):
@@ -93,30 +93,30 @@ def test_the_reasons_in_words():
 def test_each_pose_of_a_batch_has_its_own_reasons():
     machine = hexapod()
     poses = np.stack([[machine.home(), yawed(90, 0.3)], [yawed(120, 0.3), yawed(5)]])
-    found = machine.reachable(poses)
-    np.testing.assert_array_equal(found.inside, [[True, False], [False, True]])
-    assert found.why(0, 0) == ()
-    assert any("singular or nearly so" in text for text in found.why(0, 1))
-    assert any("beyond a singular one" in text for text in found.why(1, 0))
+    reach = machine.reachable(poses)
+    np.testing.assert_array_equal(reach.inside, [[True, False], [False, True]])
+    assert reach.why(0, 0) == ()
+    assert any("singular or nearly so" in text for text in reach.why(0, 1))
+    assert any("beyond a singular one" in text for text in reach.why(1, 0))
 
 
 def test_a_crank_that_cannot_reach_is_named():
     machine = load_mechanism("delta")
-    found = machine.reachable(shifted(machine.home(), 0.4, 0, 0))
-    assert found.lost.any()
-    assert not found.inside
-    assert not found.singular  # nothing is known of it
-    named = [text for text in found.why() if text.endswith("cannot reach")]
-    assert named == [f"the limb of motor {j + 1} cannot reach" for j in np.flatnonzero(found.lost)]
+    reach = machine.reachable(shifted(machine.home(), 0.4, 0, 0))
+    assert reach.lost.any()
+    assert not reach.inside
+    assert not reach.singular  # nothing is known of it
+    named = [text for text in reach.why() if text.endswith("cannot reach")]
+    assert named == [f"the limb of motor {j + 1} cannot reach" for j in np.flatnonzero(reach.lost)]
 
 
 def test_a_joint_on_a_joint_is_no_pose_and_no_warning():
     """The rod has no direction there."""
     machine = cube()
     on_it = shifted(machine.home(), 1000, 0, 0)
-    found = machine.reachable(on_it)
-    assert found.singular
-    assert found.too_short[0]
+    reach = machine.reachable(on_it)
+    assert reach.singular
+    assert reach.too_short[0]
 
 
 def test_an_h4_of_rods_reads_as_one_of_parallelograms_at_any_turn():
@@ -129,11 +129,11 @@ def test_an_h4_of_rods_reads_as_one_of_parallelograms_at_any_turn():
 
 def test_what_no_drive_allows_is_told():
     three = load_mechanism("3-rps")
-    found = three.reachable(shifted(three.home(), 0.003, 0, 0))
-    assert found.forbidden
-    assert found.off == pytest.approx(0.003, rel=0.5)
+    reach = three.reachable(shifted(three.home(), 0.003, 0, 0))
+    assert reach.forbidden
+    assert reach.off == pytest.approx(0.003, rel=0.5)
     assert (
-        "the rods of constant length and the joints' axes do not allow the pose" in found.why()[0]
+        "the rods of constant length and the joints' axes do not allow the pose" in reach.why()[0]
     )
     flat = planar()
     lifted = flat.reachable(shifted(flat.home(), 0, 0, 1e-3))
@@ -145,8 +145,8 @@ def test_same_assembly_tells_the_mirror_image_and_never_home():
     machine = hexapod()
     mirror = machine.home()
     mirror[2, 3] *= -1
-    found = machine.same_assembly(np.stack([machine.home(), mirror, yawed(30), yawed(120)]))
-    np.testing.assert_array_equal(found, [True, False, True, False])
+    values = machine.same_assembly(np.stack([machine.home(), mirror, yawed(30), yawed(120)]))
+    np.testing.assert_array_equal(values, [True, False, True, False])
     np.testing.assert_array_equal(machine.same_assembly(yawed(150), yawed(120)), True)
 
 
@@ -169,24 +169,24 @@ def test_extents_of_a_cube_are_its_walls():
     """Along the diagonal the wall is root 3 times as far; a rod of 1000 m bends by 2e-5."""
     machine = cube()
     directions = np.array([[1, 0, 0], [0, -2, 0], [0, 0, 1], [1, 1, 1]])
-    found = machine.extents(directions)
-    np.testing.assert_allclose(found.distance, [0.1, 0.1, 0.1, 0.1 * np.sqrt(3)], atol=4e-5)
-    assert found.why[0] == ("motor 1 is at the end of its range, 999.9 m",)
-    assert found.why[1] == ("motor 2 is at the end of its range, 1000 m",)
-    assert len(found.why[3]) >= 1
-    assert machine.reachable(found.poses).inside.all()
+    values = machine.extents(directions)
+    np.testing.assert_allclose(values.distance, [0.1, 0.1, 0.1, 0.1 * np.sqrt(3)], atol=4e-5)
+    assert values.why[0] == ("motor 1 is at the end of its range, 999.9 m",)
+    assert values.why[1] == ("motor 2 is at the end of its range, 1000 m",)
+    assert len(values.why[3]) >= 1
+    assert machine.reachable(values.poses).inside.all()
 
 
 def test_extents_end_where_something_stands_against_them(machine):
     """Just inside all is well, just outside something is not; a range is met to a digit."""
     own = np.linalg.svd(machine.forward_jacobian(machine.home()))[0]
     own = own[:, : machine.n_joints - machine.redundancy].T
-    found = machine.extents(np.concatenate([own, -own]))
-    inside = machine.reachable(found.poses)
+    reach = machine.extents(np.concatenate([own, -own]))
+    inside = machine.reachable(reach.poses)
     assert inside.inside.all()
-    assert found.distance.min() > 1e-3  # freedoms that it has
+    assert reach.distance.min() > 1e-3  # freedoms that it has
     low, high = machine.joint_ranges.T
-    for reasons, q in zip(found.why, inside.readings, strict=True):
+    for reasons, q in zip(reach.why, inside.readings, strict=True):
         assert reasons
         if all("range" in text for text in reasons):
             assert min(np.min(q - low), np.min(high - q)) < 1e-7
@@ -196,22 +196,22 @@ def test_a_rod_of_constant_length_bends_the_way():
     """Its end runs on a sphere; the way along the direction is kept all the same."""
     machine = tripod()
     own = np.linalg.svd(machine.forward_jacobian(machine.home()))[0][:, 0]
-    found = machine.extents([own])
-    moved = pose_difference(found.poses[0], machine.home())
-    assert moved @ own == pytest.approx(found.distance[0], rel=0.01)
-    assert found.distance[0] > 0.05
-    assert np.linalg.norm(moved) > 1.01 * found.distance[0]
-    assert "range" in found.why[0][0]
+    value = machine.extents([own])
+    shifted = pose_difference(value.poses[0], machine.home())
+    assert shifted @ own == pytest.approx(value.distance[0], rel=0.01)
+    assert value.distance[0] > 0.05
+    assert np.linalg.norm(shifted) > 1.01 * value.distance[0]
+    assert "range" in value.why[0][0]
 
 
 def test_a_turn_ends_before_the_singular_pose():
     """The hexapod without ranges yaws to where its measure, cos(yaw) of home's, is 0.02."""
     machine = hexapod()
     free = machine_of_legs_without_ranges()
-    found = free.extents([[0, 0, 1, 0, 0, 0]], start=yawed(0))
+    reach = free.extents([[0, 0, 1, 0, 0, 0]], start=yawed(0))
     at = float(machine.reachable(yawed(0)).singularity)
-    assert "singular" in found.why[0][0]
-    assert found.distance[0] == pytest.approx(np.arccos(0.02 / at), abs=2e-3)
+    assert "singular" in reach.why[0][0]
+    assert reach.distance[0] == pytest.approx(np.arccos(0.02 / at), abs=2e-3)
 
 
 def machine_of_legs_without_ranges():
@@ -224,9 +224,9 @@ def machine_of_legs_without_ranges():
 
 
 def test_where_the_search_ends_nothing_stands_against_it():
-    found = cube().extents([[1, 0, 0]], most=0.05)
-    assert found.distance[0] == pytest.approx(0.05)
-    assert found.why == ((),)
+    value = cube().extents([[1, 0, 0]], most=0.05)
+    assert value.distance[0] == pytest.approx(0.05)
+    assert value.why == ((),)
 
 
 def test_extents_refuse_a_start_outside_and_no_direction():
@@ -243,21 +243,21 @@ def test_extents_refuse_a_start_outside_and_no_direction():
 
 
 def test_the_volume_of_a_cube():
-    found = cube().grid(count=20)
-    assert found.size == pytest.approx(0.2**3, rel=0.15)
-    assert found.inside.ndim == 3
-    assert found.inside.shape == tuple(len(axis) for axis in found.axes)
+    value = cube().grid(count=20)
+    assert value.size == pytest.approx(0.2**3, rel=0.15)
+    assert value.inside.ndim == 3
+    assert value.inside.shape == tuple(len(axis) for axis in value.axes)
     # a corner of the grid is a tenth outside
-    assert not found.inside[0, 0, 0]
+    assert not value.inside[0, 0, 0]
 
 
 def test_a_section_of_a_planar_machine_is_where_its_three_rings_meet():
     """Each rod's length is a ring about its base joint, shifted by the turned platform joint."""
     machine = planar()
-    found = machine.grid(count=60)
-    assert len(found.axes) == 2
+    count = machine.grid(count=60)
+    assert len(count.axes) == 2
     T = machine.home()
-    x, y = np.meshgrid(*(axis + T[k, 3] for k, axis in enumerate(found.axes)), indexing="ij")
+    x, y = np.meshgrid(*(axis + T[k, 3] for k, axis in enumerate(count.axes)), indexing="ij")
     arms = machine.platform_centers() @ T[:3, :3].T
     ok = np.ones(x.shape, dtype=bool)
     offsets = machine.values[machine.layout.rod]
@@ -267,12 +267,12 @@ def test_a_section_of_a_planar_machine_is_where_its_three_rings_meet():
         length = np.hypot(x + arm[0] - a[0], y + arm[1] - a[1]) - offset
         ok &= (length >= low) & (length <= high)
     # the section is the part of it about home on home's side of the singular curve
-    assert np.all(ok[found.inside])
+    assert np.all(ok[count.inside])
     usable = machine.reachable(pose(T[:3, :3], np.stack([x, y, np.zeros_like(x)], axis=-1)))
-    np.testing.assert_array_equal(usable.inside & found.inside, found.inside)
-    assert np.count_nonzero(usable.inside) >= np.count_nonzero(found.inside) > 500
-    cell = found.axes[0][1] - found.axes[0][0]
-    assert found.size == pytest.approx(np.count_nonzero(found.inside) * cell**2)
+    np.testing.assert_array_equal(usable.inside & count.inside, count.inside)
+    assert np.count_nonzero(usable.inside) >= np.count_nonzero(count.inside) > 500
+    cell = count.axes[0][1] - count.axes[0][0]
+    assert count.size == pytest.approx(np.count_nonzero(count.inside) * cell**2)
 
 
 def test_finer_grids_agree():
@@ -293,13 +293,13 @@ def test_a_path_inside_is_usable(machine):
     home = machine.home()
     free = np.eye(6)[machine.layout.free][-1]
     ends = machine.extents(np.stack([free, -free]))
-    way = np.array([-0.5 * ends.distance[1], 0, 0.5 * ends.distance[0]])
-    poses = perturb(home, way[:, None] * free)
-    found = machine.check_path(poses)
-    assert found.usable, str(found)
-    assert found.inside.all()
-    assert str(found).startswith("the path stays in the workspace")
-    np.testing.assert_array_equal(found.readings, machine.inverse(poses))
+    direction = np.array([-0.5 * ends.distance[1], 0, 0.5 * ends.distance[0]])
+    poses = perturb(home, direction[:, None] * free)
+    value = machine.check_path(poses)
+    assert value.usable, str(value)
+    assert value.inside.all()
+    assert str(value).startswith("the path stays in the workspace")
+    np.testing.assert_array_equal(value.readings, machine.inverse(poses))
 
 
 @pytest.mark.parametrize("steps", [2, 7])
@@ -307,40 +307,40 @@ def test_crossing_a_singular_pose_is_found_where_it_is(steps):
     """From 60 to 150 degrees of yaw: a third of the way is 90."""
     machine = machine_of_legs_without_ranges()
     yaws = np.linspace(60, 150, steps)
-    found = machine.check_path(np.stack([yawed(x) for x in yaws]))
-    assert not found.usable
-    assert len(found.crossings) == 1
-    assert found.crossings[0] == pytest.approx((steps - 1) / 3, abs=1e-7)
-    assert str(found).startswith("the path crosses a singular pose at ")
+    values = machine.check_path(np.stack([yawed(x) for x in yaws]))
+    assert not values.usable
+    assert len(values.crossings) == 1
+    assert values.crossings[0] == pytest.approx((steps - 1) / 3, abs=1e-7)
+    assert str(values).startswith("the path crosses a singular pose at ")
     # it leaves before, where the pose is too near
     at = float(machine.reachable(yawed(0)).singularity)
     near = np.degrees(np.arccos(0.02 / at))
-    assert found.leaves == pytest.approx((near - 60) / 90 * (steps - 1), abs=2e-3 * steps)
-    assert found.closest[1] < 0.1
+    assert values.leaves == pytest.approx((near - 60) / 90 * (steps - 1), abs=2e-3 * steps)
+    assert values.closest[1] < 0.1
 
 
 def test_there_and_back_crosses_twice():
     machine = machine_of_legs_without_ranges()
-    found = machine.check_path(np.stack([yawed(60), yawed(120), yawed(60)]))
-    np.testing.assert_allclose(found.crossings, [0.5, 1.5], atol=1e-7)
+    values = machine.check_path(np.stack([yawed(60), yawed(120), yawed(60)]))
+    np.testing.assert_allclose(values.crossings, [0.5, 1.5], atol=1e-7)
 
 
 def test_leaving_the_range_is_found_where_it_is():
     """A cube's wall at 0.1 m, on a path of 0.3 m in three parts."""
     machine = cube()
     path = np.stack([shifted(machine.home(), x, 0, 0) for x in (0.0, 0.04, 0.3)])
-    found = machine.check_path(path)
-    assert found.leaves == pytest.approx(1 + 0.06 / 0.26, abs=1e-5)
-    np.testing.assert_array_equal(found.inside, [True, True, False])
-    assert found.crossings == ()
-    assert str(found).endswith("motor 1 is at the end of its range, 999.9 m")
+    value = machine.check_path(path)
+    assert value.leaves == pytest.approx(1 + 0.06 / 0.26, abs=1e-5)
+    np.testing.assert_array_equal(value.inside, [True, True, False])
+    assert value.crossings == ()
+    assert str(value).endswith("motor 1 is at the end of its range, 999.9 m")
 
 
 def test_a_path_that_begins_outside():
     machine = cube()
-    found = machine.check_path(np.stack([shifted(machine.home(), x, 0, 0) for x in (0.2, 0.0)]))
-    assert found.leaves == 0.0
-    assert len(found.why) == 1
+    count = machine.check_path(np.stack([shifted(machine.home(), x, 0, 0) for x in (0.2, 0.0)]))
+    assert count.leaves == 0.0
+    assert len(count.why) == 1
 
 
 def test_a_path_of_one_pose_is_none():

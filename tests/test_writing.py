@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from faults import fault
-from pkmcal.calibration.saved import load
+from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.files import (
     check_own_folder,
@@ -228,8 +228,8 @@ def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(
     states = [path for path in sorted(keep.iterdir()) if path.name != "old"]
     finished = []
     for state, read in zip(states, readable, strict=True):
-        killed, looked = contents_of(state / "killed"), contents_of(state / "read")
-        assert looked == killed  # whoever reads changes nothing
+        killed, remeasured = contents_of(state / "killed"), contents_of(state / "read")
+        assert remeasured == killed  # whoever reads changes nothing
         visible = {k: v for k, v in killed.items() if not k.startswith(".stage.")}
         # and finds the one or the other, or is told
         assert (visible in (before, after)) == read
@@ -321,8 +321,8 @@ def test_the_next_run_clears_what_a_killed_one_left_and_no_other(tmp_path, there
     killed.communicate()
     assert len(stages()) == 2
     with staged_folder(tmp_path / ("one" if there else "three")) as stage:
-        (left,) = stages()
-        assert ".two." in str(left) or "/two/" in left.as_posix()
+        (remainder,) = stages()
+        assert ".two." in str(remainder) or "/two/" in remainder.as_posix()
         (stage / "a").write_text("1")
     alive.communicate("")
     assert alive.returncode == 0

@@ -10,8 +10,8 @@ import numpy as np
 import pkmcal
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
-from pkmcal.observe.photographs import Photographs
+from pkmcal.calibration.localization import platform_poses, read_photographs, recognise
+from pkmcal.observe.image_batches import Photographs
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
@@ -53,9 +53,9 @@ class Case:
         """Stations by hand and as recognised, T_camera_base (S, 4, 4) each."""
         poses = platform_poses(self.session)
         rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
-        found = recognise(self.session, self.photographs, poses, rngs[1:])
+        results = recognise(self.session, self.photographs, poses, rngs[1:])
         by_hand = [s.T_camera_base for s in self.session.stations if s.T_camera_base is not None]
-        return [np.stack(by_hand), np.stack([f.T_camera_base for f in found.found])]
+        return [np.stack(by_hand), np.stack([f.T_camera_base for f in results.localizations])]
 
 
 def simulated(folder: Path, seed: int) -> Path:

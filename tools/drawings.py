@@ -18,7 +18,7 @@ from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
-from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed
+from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.simulation import Truth
 
@@ -41,8 +41,8 @@ def frames(truth: Truth) -> str:
     rgb = (CALIBRATED, GOOD, DRAWING)
 
     def on_paper(points: Array) -> Array:
-        seen = apply(eye, np.asarray(points, dtype=float))
-        return np.array([455.0, 160.0]) + 950.0 * seen[..., :2] / seen[..., 2:]
+        in_view = apply(eye, np.asarray(points, dtype=float))
+        return np.array([455.0, 160.0]) + 950.0 * in_view[..., :2] / in_view[..., 2:]
 
     def axes(T: Array, name: str, size: float, away: tuple[float, float], anchor: str) -> list[str]:
         ends = on_paper(apply(T, size * np.vstack([np.zeros(3), np.eye(3)])))
@@ -86,9 +86,9 @@ def _outline(points: Array) -> str:
 
 def _camera(T_base_camera: Array, on_paper: Callable[[Array], Array]) -> list[str]:
     corners = np.array([[-4, -3, 8], [4, -3, 8], [4, 3, 8], [-4, 3, 8]]) * 0.011
-    seen = on_paper(apply(T_base_camera, np.vstack([np.zeros(3), corners])))
-    sides = [line([seen[0], c], MUTED, 1) for c in seen[1:]]
-    return [*sides, line(seen[[1, 2, 3, 4, 1]], MUTED, 1)]
+    visible = on_paper(apply(T_base_camera, np.vstack([np.zeros(3), corners])))
+    sides = [line([visible[0], c], MUTED, 1) for c in visible[1:]]
+    return [*sides, line(visible[[1, 2, 3, 4, 1]], MUTED, 1)]
 
 
 # ------------------------------------------------------------------ edge planes
@@ -166,9 +166,9 @@ def edge_lines(
 ) -> Array:
     """Predicted edges in photograph k, (E, n, 2) px; NaN where nothing is seen."""
     tubes = tubes_of(machine)
-    seen = legs_in_camera(machine, T_camera_base, pose[None], photographs.joints[k][None])
-    points = edge_points(machine, photographs.camera, seen, tubes, 60)
-    clear = unobstructed(machine, photographs.camera, seen, tubes, points, 0.5)
+    in_view = legs_in_camera(machine, T_camera_base, pose[None], photographs.joints[k][None])
+    points = edge_points(machine, photographs.camera, in_view, tubes, 60)
+    clear = unobstructed(machine, photographs.camera, in_view, tubes, points, 0.5)
     return np.where(clear[0][..., None], points.pixel[0], np.nan)
 
 
@@ -179,12 +179,12 @@ def _panel(
     x, y, w, h = crop
     left, top, width, height = frame
     # brighter, so that dark sides of legs can be told from the wall
-    shown = np.clip(image[y : y + h, x : x + w] * 1.5, 0, 255).astype(np.uint8)
-    packed = cv2.imencode(".png", shown)[1]
+    visible = np.clip(image[y : y + h, x : x + w] * 1.5, 0, 255).astype(np.uint8)
+    packed = cv2.imencode(".png", visible)[1]
     data = base64.b64encode(packed.tobytes()).decode("ascii")
     zoom = width / w
-    seen = [edge[np.isfinite(edge).all(axis=1)] for edge in lines]
-    placed = [(left, top) + (edge - (x, y) + 0.5) * zoom for edge in seen if len(edge) > 1]
+    finite = [edge[np.isfinite(edge).all(axis=1)] for edge in lines]
+    placed = [(left, top) + (edge - (x, y) + 0.5) * zoom for edge in finite if len(edge) > 1]
     drawn = "".join(line(points.tolist(), colour, 1.6) for points in placed)
     rectangle = f'<rect x="{left}" y="{top}" width="{width}" height="{height}"/>'
     return (
@@ -216,25 +216,25 @@ class Places:
 
 def measured_places(case: Case) -> Places:
     """All profiles of the session, taken about the edges that truth predicts."""
-    found: list[tuple[Array, ...]] = []
+    results: list[tuple[Array, ...]] = []
     truth = case.truth
     for p in case.photographs:
         poses = truth.T_camera_base[p.station], truth.T_base_platform[p.configuration]
-        seen = legs._seen(PhotographWindow.of([Placed(p, *poses)]), truth.machine)
-        blur = {p.station: profiles.estimate_blur(seen.across)}
-        dull, _ = profiles.without_highlights(seen.across, blur)
+        prediction = legs._predicted_edges(PhotographWindow.of([Placed(p, *poses)]), truth.machine)
+        blur = {p.station: profiles.estimate_blur(prediction.across)}
+        dull, _ = profiles.without_highlights(prediction.across, blur)
         curves = profiles.residual_curves(dull, blur)
         chances = profiles.shift_log_likelihoods(dull, curves)
-        about = legs._leg_lines(chances, seen.places.along, seen.full, seen.tubes)
+        about = legs._leg_lines(chances, prediction.places.along, prediction.full, prediction.tubes)
         at = profiles.locate(dull, curves, about)
-        tube = seen.tubes.tube[np.nonzero(seen.full)[1]]
-        steep = strongest_gradient(seen.across.grey)
+        tube = prediction.tubes.tube[np.nonzero(prediction.full)[1]]
+        steep = strongest_gradient(prediction.across.grey)
         blurs = np.full(len(tube), blur[p.station])
         columns = (
-            seen.across.grey, seen.across.half_width, blurs, tube, at.position, steep,
+            prediction.across.grey, prediction.across.half_width, blurs, tube, at.position, steep,
         )  # fmt: skip
-        found.append(tuple(c[at.found] for c in columns))
-    return Places(*(np.concatenate(c) for c in zip(*found, strict=True)))
+        results.append(tuple(c[at.valid] for c in columns))
+    return Places(*(np.concatenate(c) for c in zip(*results, strict=True)))
 
 
 def strongest_gradient(grey: Array) -> Array:

@@ -86,14 +86,16 @@ def h4_score(mechanism: Path, truth: Path) -> dict[str, float]:
     import pkmcal as package
 
     true = json.loads(truth.read_text(encoding="utf-8"))
-    found = np.asarray(package.load_mechanism(mechanism).forward(np.array(true["readings_exact"])))
-    known = np.array(true["poses_model31_base"])
-    p, q = known[:, :3], found[:, :3, 3]
+    forward_kinematics = np.asarray(
+        package.load_mechanism(mechanism).forward(np.array(true["readings_exact"]))
+    )
+    reference_values = np.array(true["poses_model31_base"])
+    p, q = reference_values[:, :3], forward_kinematics[:, :3, 3]
     u, _, vt = np.linalg.svd((p - p.mean(0)).T @ (q - q.mean(0)))
     rot = vt.T @ np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
     off = q - ((p - p.mean(0)) @ rot.T + q.mean(0))
-    axis = found[:, :3, 0] @ rot
-    turn = np.angle(np.exp(1j * (np.arctan2(axis[:, 1], axis[:, 0]) - known[:, 3])))
+    axis = forward_kinematics[:, :3, 0] @ rot
+    turn = np.angle(np.exp(1j * (np.arctan2(axis[:, 1], axis[:, 0]) - reference_values[:, 3])))
     turn = np.angle(np.exp(1j * (turn - turn[0])))
     return {
         "tool_mm": 1e3 * float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
@@ -103,23 +105,23 @@ def h4_score(mechanism: Path, truth: Path) -> dict[str, float]:
 
 def measure(data: Path, render: Path, work: Path, only: set[str]) -> dict[str, Any]:
     """All figures, by name."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
 
     def take(name: str, function: Any) -> None:
         if only and name not in only:
             return
         begin = time.perf_counter()
-        found[name] = function()
+        results[name] = function()
         print(f"{name}: {time.perf_counter() - begin:.1f} s", file=sys.stderr, flush=True)
 
     def demo() -> Any:
-        said = command("demo", "-o", work / "demo", "--no-open")
-        return {"said": said, "saved": saved(work / "demo" / "calibration")}
+        text = command("demo", "-o", work / "demo", "--no-open")
+        return {"said": text, "saved": saved(work / "demo" / "calibration")}
 
     def calibrated(name: str, *words: str) -> Any:
         out = work / "-".join([name, *words]).replace("--", "")
-        said = command("calibrate", data / name, "-o", out, *words)
-        result = {"said": said, "saved": saved(out)}
+        text = command("calibrate", data / name, "-o", out, *words)
+        result = {"said": text, "saved": saved(out)}
         truth = data / name / "truth.json"
         if name == "h4-board":
             return result | {"score": h4_score(out / "mechanism.yaml", truth)}
@@ -169,7 +171,7 @@ def measure(data: Path, render: Path, work: Path, only: set[str]) -> dict[str, A
         take(f"exports {name}", lambda n=name: exported(n, n))
     take("reproduce a", lambda: command("reproduce", "a", "-o", work / "reproduce-a"))
     take("reproduce c", lambda: command("reproduce", "c", "-o", work / "reproduce-c"))
-    return found
+    return results
 
 
 def _timeless(text: str) -> bytes:
@@ -248,10 +250,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         work = options.work or Path(folder)
         work.mkdir(parents=True, exist_ok=True)
-        found = measure(options.data.resolve(), options.render.resolve(), work, set(options.only))
+        actual_names = measure(
+            options.data.resolve(), options.render.resolve(), work, set(options.only)
+        )
     if options.only and options.out.is_file():
-        found = json.loads(options.out.read_text(encoding="utf-8")) | found
-    options.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        actual_names = json.loads(options.out.read_text(encoding="utf-8")) | actual_names
+    options.out.write_text(json.dumps(actual_names, indent=1), encoding="utf-8")
     return 0
 
 

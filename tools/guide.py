@@ -86,10 +86,10 @@ def confirmed(work: Path) -> str:
 
 def laid_over(folder: Path) -> str:
     """The drawing over the first station's first photograph, by hand and as found."""
-    found = check_session(folder)
-    if found.look is None:
+    check = check_session(folder)
+    if check.look is None:
         sys.exit(f"{folder}: nothing to look at")
-    few = replace(found.look, stations=found.look.stations[:1])
+    few = replace(check.look, stations=check.look.stations[:1])
     # the section shows up to three photographs of a station, each twice; one is enough
     figures = str(pictures.with_pictures(few).html).split("<figure")[1:3]
     style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
@@ -135,8 +135,8 @@ def _wrong_sessions() -> ModuleType:
     return wrong_sessions
 
 
-def _only(found: Outcome, name: str) -> str:
-    kept = tuple(part for part in found.parts if part.name == name)
-    html = page.page_html(replace(found, parts=kept, findings=(), figures=()))
+def _only(outcome: Outcome, name: str) -> str:
+    retained = tuple(part for part in outcome.parts if part.name == name)
+    html = page.page_html(replace(outcome, parts=retained, findings=(), figures=()))
     hidden = "header.top, .verdict, .note { display: none !important; }"
     return html.replace("</style>", hidden + "</style>", 1)

@@ -33,11 +33,11 @@ def main(machines: int) -> None:
         for seed in range(machines):
             with tempfile.TemporaryDirectory() as folder:
                 kit = make(Path(folder) / "session", seed)
-                found = kit.calibrated()
-            e = tool(kit, found)
-            bed = flatness(kit, kit.drawing), flatness(kit, found.machine)
+                value = kit.calibrated()
+            e = tool(kit, value)
+            bed = flatness(kit, kit.drawing), flatness(kit, value.machine)
             rows.append((e.before, e.after, e.after / e.expected, e.sideways, *bed))
-            usable += found.verdict.usable
+            usable += value.verdict.usable
         x = np.array(rows)
         r = np.sqrt(np.mean(x**2, axis=0))
         mm = [r[0], r[1], x[:, 1].max(), r[3]]

@@ -46,6 +46,7 @@ from pkmcal.simulation import (
     true_machine,
 )
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
+from pkmcal.view.content import Viewed
 from pkmcal.view.server import (
     LOOPBACK_ADDRESS,
     application,
@@ -53,7 +54,6 @@ from pkmcal.view.server import (
     new_token,
     serve_until_interrupted,
 )
-from pkmcal.view.viewed import Viewed
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings
@@ -122,9 +122,9 @@ def result(case: Case) -> Shot:
 
 def outward(case: Case) -> Array:
     """Pixels by which each edge lies outward."""
-    session, found = case.session, case.result
-    edges, cameras = found.observation.edges, session.camera_of_station
-    return shown.outward_shift(edges, found.estimate, session.joints, cameras)
+    session, value = case.session, case.result
+    edges, cameras = value.observation.edges, session.camera_of_station
+    return shown.outward_shift(edges, value.estimate, session.joints, cameras)
 
 
 def report(case: Case) -> Shot:
@@ -173,7 +173,7 @@ def positions(case: Case) -> Shot:
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
     edges, estimate = case.result.observation.edges, case.result.estimate
-    found = {
+    results = {
         "histogram": shown.histogram(estimate.edge_residuals),
         "by_leg": shown.by_leg(case.session, edges, estimate, Links()),
     }
@@ -183,7 +183,7 @@ def residuals(case: Case) -> Shot:
         "<div><h3>{{ r.by_leg.title }}</h3>{{ draw.rows(r.by_leg) }}</div></div>"
     )
     style = ".two { display: grid; grid-template-columns: 1fr 1fr; gap: 20px; padding: 0 16px; }"
-    return whole_page(template.render(r=found), 900, 290, style)
+    return whole_page(template.render(r=results), 900, 290, style)
 
 
 def repeats(case: Case) -> Shot:
@@ -253,9 +253,9 @@ def normalised(body: Centres) -> Array:
 def accuracy(case: Case) -> None:
     """Errors against the truth, as README quotes them, for 6 and 15 configurations a station."""
     for folder, count in ((case.folder, 6), (_larger(case.work / "larger", 15), 15)):
-        found = pkmcal.calibrate(folder)
-        tell(f"{count} configurations a station, {sum(found.timings.values()):.1f} s")
-        compared = compare_with_truth(found, folder)
+        value = pkmcal.calibrate(folder)
+        tell(f"{count} configurations a station, {sum(value.timings.values()):.1f} s")
+        compared = compare_with_truth(value, folder)
         for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
             tell(
                 f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
@@ -310,10 +310,10 @@ def photograph(shot: Shot, path: Path) -> None:
 
 def served(session: Session) -> str:
     """The address at which a session is to be viewed, until this program ends."""
-    found, token = listening_socket(0), new_token()
-    port = found.getsockname()[1]
+    socket_, token = listening_socket(0), new_token()
+    port = socket_.getsockname()[1]
     app = application(Viewed(session, None), token, port)
-    Thread(target=serve_until_interrupted, args=(app, found), daemon=True).start()
+    Thread(target=serve_until_interrupted, args=(app, socket_), daemon=True).start()
     return f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
 
 
@@ -321,9 +321,9 @@ def plan(_case: Case) -> Shot:
     """Where a plan puts three cameras round a hexapod: the page's drawing in space."""
     machine = pkmcal.load_mechanism(DEMO_MECHANISM)
     subject = of_machine(machine, [demo_camera()], machine.joint_names)
-    found = outcome_of(make_plan(subject, free_places=3))
-    kept = tuple(part for part in found.parts if part.name == "where")
-    html = page.page_html(replace(found, parts=kept, findings=()))
+    outcome = outcome_of(make_plan(subject, free_places=3))
+    retained = tuple(part for part in outcome.parts if part.name == "where")
+    html = page.page_html(replace(outcome, parts=retained, findings=()))
     return Shot(html, 1000, 1390)
 
 
@@ -364,8 +364,8 @@ def tutorial_validation(case: Case) -> Shot:
 
 def trouble_scale(case: Case) -> Shot:
     """The top of a refused report: one reading has another scale."""
-    found = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
-    return Shot(page.page_html(outcome_of_calibration(found)), 1180, 345)
+    value = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
+    return Shot(page.page_html(outcome_of_calibration(value)), 1180, 345)
 
 
 def trouble_columns(case: Case) -> Shot:

@@ -43,8 +43,8 @@ def short_repr(self: Any) -> str:
 
     For use as ``__repr__`` in a dataclass's body.
     """
-    told = (f"{one.name}={_short(getattr(self, one.name))}" for one in fields(self) if one.repr)
-    return f"{type(self).__name__}({', '.join(told)})"
+    parts = (f"{one.name}={_short(getattr(self, one.name))}" for one in fields(self) if one.repr)
+    return f"{type(self).__name__}({', '.join(parts)})"
 
 
 def _short(value: Any) -> str:

@@ -18,7 +18,7 @@ _LONG_NAME = re.compile(rf"[^\s/\\]{{{LONGEST_NAME + 1},}}")
 _INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 """Of Unicode: what moves a terminal's cursor, turns the direction of writing, has no width, breaks
 lines, or is half of a character, as a file's name that is not UTF-8 holds it."""
-LONGEST_FOUND = 500
+LONGEST_VALUE_QUOTED = 500
 """Characters of what was found: enough to recognise it by."""
 
 
@@ -56,7 +56,7 @@ class PkmcalError(Exception):
         self.code = code or self.class_code
         self.what = _brief(what)
         self.where = None if where is None else _brief(where)
-        self.found = None if found is None else _brief(str(found), LONGEST_FOUND)
+        self.found = None if found is None else _brief(str(found), LONGEST_VALUE_QUOTED)
         self.expected = None if expected is None else _brief(str(expected))
         self.next_step = None if next_step is None else _brief(next_step)
         super().__init__(self.what)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 MINUS_SIGN = "\N{MINUS SIGN}"
-SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
+DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
 """Factor and name of the unit that the report shows, by the unit inside."""
 
 LARGEST_DECIMALS = 6
@@ -46,7 +46,7 @@ def brief(value: float) -> str:
 
 def amount(value: float, unit: str) -> str:
     """A positive magnitude in m or rad, as ``0.07 mm`` or ``0.3°``."""
-    scale, name = SHOWN_UNITS[unit]
+    scale, name = DISPLAY_UNITS[unit]
     return with_unit(brief(value * scale), name)
 
 
@@ -71,12 +71,12 @@ def named(legs: Iterable[int], all_legs: int = 0) -> str:
     """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0; ``all legs``
     where their number is given.
     """
-    found = sorted({int(leg) + 1 for leg in legs})
-    if len(found) == all_legs and all_legs > 1:
+    count = sorted({int(leg) + 1 for leg in legs})
+    if len(count) == all_legs and all_legs > 1:
         return "all legs"
-    if len(found) > 2 and found[-1] - found[0] == len(found) - 1:
-        return f"legs {found[0]} to {found[-1]}"
-    return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
+    if len(count) > 2 and count[-1] - count[0] == len(count) - 1:
+        return f"legs {count[0]} to {count[-1]}"
+    return ("leg " if len(count) == 1 else "legs ") + joined([str(n) for n in count])
 
 
 def in_full(k: int) -> str:

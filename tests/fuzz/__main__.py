@@ -28,8 +28,8 @@ def main() -> int:
     parser.add_argument("count", nargs="?", type=int, default=300, help="of cases")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--only", type=int, nargs="+", help="these cases; their folders are kept")
-    told = "only those of them that try something which none before them does"
-    parser.add_argument("--telling", action="store_true", help=told)
+    values = "only those of them that try something which none before them does"
+    parser.add_argument("--telling", action="store_true", help=values)
     parser.add_argument("--bases", type=Path, help="made by an earlier run, to go on with")
     given = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # one core, so that a study has one worker: this process

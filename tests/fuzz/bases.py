@@ -109,12 +109,12 @@ def measured(folder: Path, seed: int, count: int) -> None:
     )
     joints = truth.inverse(T)
     T_tracker_base = look_at(np.array([2.0, 0.5, 0.4]), np.array([0, 0, 0.3]), np.eye(3)[2])
-    seen = (
+    in_view = (
         T_tracker_base @ T @ pose(rotation(np.array([0.1, 0.2, 0.3])), np.array([0.02, 0.01, 0.05]))
     )
-    turns = np.stack([cv2.Rodrigues(R)[0].ravel() for R in seen[:, :3, :3]])
+    turns = np.stack([cv2.Rodrigues(R)[0].ravel() for R in in_view[:, :3, :3]])
     turns += 1e-4 * rng.normal(size=turns.shape)
-    points = seen[:, :3, 3] + 2e-5 * rng.normal(size=(count, 3))
+    points = in_view[:, :3, 3] + 2e-5 * rng.normal(size=(count, 3))
     names = [f"{seed}{k:02d}" for k in range(count)]
     folder.mkdir()
     (folder / "joints.csv").write_text(csv_text([f"leg{k}" for k in range(1, 7)], names, joints))
@@ -155,8 +155,8 @@ def boards(folder: Path) -> None:
         middle = np.array([[metres, 0, -metres * drawn.shape[1] / 2],
                            [0, metres, -metres * drawn.shape[0] / 2], [0, 0, 1]])  # fmt: skip
         H = K @ T[:3][:, [0, 1, 3]] @ middle
-        seen = cv2.warpPerspective(drawn, H, size, flags=cv2.INTER_AREA, borderValue=130)
-        noisy = cv2.GaussianBlur(seen, (0, 0), 0.7) + rng.normal(0, 1.0, seen.shape)
+        in_view = cv2.warpPerspective(drawn, H, size, flags=cv2.INTER_AREA, borderValue=130)
+        noisy = cv2.GaussianBlur(in_view, (0, 0), 0.7) + rng.normal(0, 1.0, in_view.shape)
         picture = np.clip(noisy, 0, 255).astype(np.uint8)
         assert cv2.imwrite(str(folder / "images" / f"{name}.png"), picture)
     drawing = load_mechanism("gough-stewart")

@@ -124,12 +124,12 @@ class Case:
         """What one case may try before others: a way of spoiling a kind of file, and a file of a
         command.
         """
-        found = set()
+        actual_names = set()
         for file, how, _ in self.spoilt:
             path = Path(file)
-            found.add((path.suffix, how.split(" '")[0]))  # whatever it was renamed to
-            found.add((self.words[0], path.suffix if path.suffix in PICTURES else path.name))
-        return found
+            actual_names.add((path.suffix, how.split(" '")[0]))  # whatever it was renamed to
+            actual_names.add((self.words[0], path.suffix if path.suffix in PICTURES else path.name))
+        return actual_names
 
 
 def telling(numbers: Iterable[int], bases: Path, scratch: Path) -> list[int]:
@@ -194,23 +194,23 @@ def spoil(
     if rng.random() < 0.07:
         return _as_entry(path, place, rng), ()
     data = path.read_bytes()
-    told: tuple[str, ...] = ()
+    values: tuple[str, ...] = ()
     if path.suffix in PICTURES and fresh:
         others = {p.name: p.read_bytes() for p in (bases / "pictures").iterdir()}
         how, new = spoil_picture(data, others, rng)
     elif path.suffix == ".csv" and fresh and rng.random() < 0.7:
-        how, text, told = spoil_table(data.decode(), rng)
+        how, text, values = spoil_table(data.decode(), rng)
         new = text.encode("utf-8", "surrogatepass")
     elif path.suffix in TREE and fresh and not data.startswith(b"%YAML") and rng.random() < 0.75:
         tree = trees.read_tree(path)
-        how, told = trees.spoil_tree(tree, rng, path.suffix)
+        how, values = trees.spoil_tree(tree, rng, path.suffix)
         new = trees.written(tree, path.suffix).encode("utf-8", "surrogatepass")
     else:
         how, new = _spoil_npz(data, rng) if path.suffix == ".npz" else spoil_bytes(data, rng)
     # The bases are linked, not copied.
     path.unlink()
     path.write_bytes(new)
-    return how, told
+    return how, values
 
 
 def _spoil_npz(data: bytes, rng: Random) -> tuple[str, bytes]:

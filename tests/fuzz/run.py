@@ -144,20 +144,20 @@ def _read_camera(path: Path) -> None:
 def _look_at(folder: Path) -> None:
     """What the page of `pkmcal view` asks for of every station, without serving it."""
     from pkmcal.session.load import load_session
-    from pkmcal.view.found import found
+    from pkmcal.view.content import Viewed
+    from pkmcal.view.edge_search import edge_search
     from pkmcal.view.overlay import overlay_after_gesture
-    from pkmcal.view.requests import LookRequest
+    from pkmcal.view.requests import ViewRequest
     from pkmcal.view.server import view_page_html
-    from pkmcal.view.viewed import Viewed
 
     viewed = Viewed(load_session(folder), None)
     view_page_html(viewed)
     for k, station in enumerate(viewed.session.stations):
         if station.photographs:
             viewed.jpeg(k, 0)
-            look = LookRequest(station=k, photograph=0)
-            overlay_after_gesture(viewed, look)
-            found(viewed, look)
+            edges = ViewRequest(station=k, photograph=0)
+            overlay_after_gesture(viewed, edges)
+            edge_search(viewed, edges)
 
 
 def listing(place: Path) -> dict[str, tuple[int, ...]]:
@@ -181,9 +181,9 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
         faults.append(f"exit code {code}")
     if kilobytes > 1 << 20:
         faults.append(f"{kilobytes >> 10} MB")
-    found = INTERNALS.search(out + err)
-    if found:
-        faults.append(f"internals: {found[0]}")
+    match = INTERNALS.search(out + err)
+    if match:
+        faults.append(f"internals: {match[0]}")
     hidden = {c for c in out + err if unicodedata.category(c) in INVISIBLE and c != "\n"}
     if hidden:
         faults.append(f"characters that cannot be seen: {sorted(hidden)!a}")
@@ -198,9 +198,9 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
         has_file = any(name in text for name in _files_of(case)) or bool(ELSEWHERE.search(text))
         places = [words for _, _, words in case.spoilt]
         if len(places) == 1 and places[0] and "mine.txt" not in text:
-            said = text.lower()
+            phrases = text.lower()
             has_field = bool(PLACE.search(text)) or any(
-                word.strip() and word.strip().lower()[:30] in said for word in places[0]
+                word.strip() and word.strip().lower()[:30] in phrases for word in places[0]
             )
         if not has_file:
             faults.append("no file named")
@@ -232,15 +232,15 @@ def _errors(case, code, out, err, faults) -> list[str]:
 
 def _in_json(code, out, faults) -> list[str]:
     try:
-        told = json.loads(out, parse_constant=_refuse)
+        values = json.loads(out, parse_constant=_refuse)
     except ValueError as error:
         faults.append(f"no JSON: {error}")
         return []
-    if told.get("exit_code", code) != code:
-        faults.append(f"exit code {code}, but {told['exit_code']} in the JSON")
-    if "message" in told:
-        return [told["message"]]
-    return [found["text"] for found in told.get("findings", ()) if found.get("level") == "wrong"]
+    if values.get("exit_code", code) != code:
+        faults.append(f"exit code {code}, but {values['exit_code']} in the JSON")
+    if "message" in values:
+        return [values["message"]]
+    return [value["text"] for value in values.get("findings", ()) if value.get("level") == "wrong"]
 
 
 def _refuse(constant):
@@ -266,14 +266,14 @@ def _written(case: Case, code: int, before, after) -> list[str]:
     if (
         case.words[0] in ("calibrate", "diff") and code != 2
     ):  # what stood there is kept beside it, dated
-        kept = re.compile(rf"{re.escape(case.out)}-\d{{4}}-\d\d-\d\dT\d{{4}}(/[^/]+)?")
-        outside = [name for name in outside if not kept.fullmatch(name) or name in before]
+        retained = re.compile(rf"{re.escape(case.out)}-\d{{4}}-\d\d-\d\dT\d{{4}}(/[^/]+)?")
+        outside = [name for name in outside if not retained.fullmatch(name) or name in before]
     faults = []
     if outside:
         faults.append(f"written outside the output: {outside[:5]}")
-    left = [name for name in after if name.endswith(".part") or ".pkmcal-replacing" in name]
-    if left:
-        faults.append(f"left over: {left[:3]}")
+    remainder = [name for name in after if name.endswith(".part") or ".pkmcal-replacing" in name]
+    if remainder:
+        faults.append(f"left over: {remainder[:3]}")
     # A study keeps what it has finished, and its lock, whatever comes after.
     inside = {n for n in changed if n.startswith(f"{case.out}/") and "batches" not in n}
     if code == 2 and inside and case.words[0] != "check":

@@ -184,16 +184,16 @@ class Place:
 
 def spoil_tree(tree, rng: Random, suffix):
     """Change one place of a tree; returns (its kind, words of which a message should hold one)."""
-    found = list(spots(tree))
-    if not found:
+    value = list(spots(tree))
+    if not value:
         return "nothing to spoil", ()
     # Tables of numbers fill a result file; every key is to have its turn.
     by_key = {}
-    for spot in found:
+    for spot in value:
         by_key.setdefault(tuple(k for k in spot[2] if not isinstance(k, int)), []).append(spot)
     holder, at, keys = rng.choice(by_key[rng.choice(sorted(by_key))])
     words = [str(key) for key in keys if not isinstance(key, int)]
-    place = Place(tree, holder, at, words, found, suffix)
+    place = Place(tree, holder, at, words, value, suffix)
     kind = rng.choice([how for how in KINDS if _suits(how, place)])
     KINDS[kind](place, rng)
     return kind, tuple(place.words)
@@ -231,13 +231,13 @@ def _type(place, rng):
 
 def _level(place, rng):
     mapping = place.mapping
-    moved = place.holder.pop(place.at)
+    shifted = place.holder.pop(place.at)
     mappings = [spot[0] for spot in place.found if isinstance(spot[0], Pairs)]
     other = rng.choice(mappings or [place.tree])
     if mapping and isinstance(other, Pairs):
-        other.append(moved)
+        other.append(shifted)
     else:
-        place.tree.append(["moved", moved])
+        place.tree.append(["moved", shifted])
 
 
 def _wrap(place, rng):

@@ -9,7 +9,7 @@ from typing import Literal
 
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.calibrate import calibrate_session as run
-from pkmcal.calibration.saved import SavedCalibration, load
+from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.report.calibration import save
 from pkmcal.report.rrd import write_rrd
 from pkmcal.session.load import Session
@@ -84,7 +84,7 @@ def calibrate(
         Nothing can be said from these data.
 
     """
-    found = run(
+    value = run(
         session,
         method=method,
         seed=seed,
@@ -93,8 +93,8 @@ def calibrate(
         progress=progress,
     )
     # a result that is held should not hold its photographs, too
-    kept = replace(found, photographs={})
-    return CalibrationResult(**{one.name: getattr(kept, one.name) for one in fields(kept)})
+    retained = replace(value, photographs={})
+    return CalibrationResult(**{one.name: getattr(retained, one.name) for one in fields(retained)})
 
 
 def load_result(source: Path | str) -> SavedCalibration:

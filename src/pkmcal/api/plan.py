@@ -8,7 +8,7 @@ from typing import Literal
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
@@ -105,7 +105,7 @@ def plan(
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
     planned = {
         "count": count, "index": index, "together": together, "free_places": places,
-        "best_of": best_of, "seed": seed, "told": progress,
+        "best_of": best_of, "seed": seed, "progress": progress,
     }  # fmt: skip
     with threadpool_limits(1, "blas"):
         if folder is not None or isinstance(subject, Session):

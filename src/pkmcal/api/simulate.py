@@ -59,14 +59,14 @@ def simulate(
         The folder is not empty, or a machine, a camera or a setting cannot be.
 
     """
-    known = [one.name for one in fields(Settings)]
+    names = [one.name for one in fields(Settings)]
     for name in settings:
-        if name not in known:
-            guess = closest(name, known)
+        if name not in names:
+            guess = closest(name, names)
             raise InputError(
                 "this is no setting of a simulation",
                 found=name,
-                expected=guess or listed(known, len(known)),
+                expected=guess or listed(names, len(names)),
             )
     check_number("simulate", "seed", seed)
     _check_settings(settings)

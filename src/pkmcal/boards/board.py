@@ -23,8 +23,8 @@ from pkmcal.files import (
     Schema,
     Share,
     closest,
+    quoted,
     read_yaml,
-    shown,
     validated_document,
 )
 
@@ -47,12 +47,12 @@ class _Dictionary(Schema):
 
     @field_validator("dictionary")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _check_dictionary(cls, name: str) -> str:
         if name in dictionaries():
             return name
         guess = closest(name, dictionaries())
         raise ValueError(
-            f"OpenCV has no dictionary of markers {shown(name)}"
+            f"OpenCV has no dictionary of markers {quoted(name)}"
             + (f"; {guess} comes near" if guess else "")
         )
 
@@ -189,7 +189,7 @@ class Detection:
     mirrored: bool = False
 
     @property
-    def found(self) -> bool:
+    def success(self) -> bool:
         """True where the board's corners are there."""
         return not self.reason
 

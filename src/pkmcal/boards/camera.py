@@ -105,7 +105,7 @@ class CameraCalibration:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def kept(self) -> Booleans:
+    def inliers(self) -> Booleans:
         """(V, N) corners in use: seen, and with at least half their weight."""
         return np.isfinite(self.residuals).all(axis=-1) & (self.weight >= 0.5)
 
@@ -154,7 +154,7 @@ class CameraCalibration:
                 }
                 for v, name in enumerate(self.views)
             ],
-            "not_used": {d.name: d.reason for d in self.detections if not d.found},
+            "not_used": {d.name: d.reason for d in self.detections if not d.success},
             "board": self.board.document,
             "warnings": list(self.warnings),
             "findings": [one.document() for one in self.findings],
@@ -165,7 +165,7 @@ def calibrate_photographs(
     paths: Sequence[Path | str], board: Board, model: str = "auto"
 ) -> CameraCalibration:
     """Find the board in photographs of one size and calibrate the camera that took them."""
-    _check_known(model)
+    _check_model_name(model)
     return calibrate_camera(detect_boards(paths, board), board, model)
 
 
@@ -177,8 +177,8 @@ def calibrate_camera(
     Raises `InputError` where the views are too few or `model` does not fit, and `ResultError`
     where the views do not determine the camera.
     """
-    _check_known(model)
-    used = [detection for detection in detections if detection.found]
+    _check_model_name(model)
+    used = [detection for detection in detections if detection.success]
     check_enough(used, len(detections))
     image_size = used[0].image_size
     views = views_of(used, board)
@@ -187,7 +187,7 @@ def calibrate_camera(
     if not mine:
         raise no_fit(model, pool)
     chosen = best_of(mine)
-    doubt = check_model(model, chosen, best_of(pool))
+    model_warnings = check_model(model, chosen, best_of(pool))
     fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
@@ -196,7 +196,7 @@ def calibrate_camera(
     check_determined(fit, covariance, views)
     tested = held_out(fit, views, board.lines)
     check_explained(tested.rms, fit.camera)
-    kept = (fit.weight >= 0.5) & views.seen
+    inliers = (fit.weight >= 0.5) & views.visible
     lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
@@ -210,23 +210,23 @@ def calibrate_camera(
         residuals=fit.residuals,
         weight=fit.weight,
         noise=fit.tau,
-        rms=float(np.sqrt(lengths[kept].mean())),
+        rms=float(np.sqrt(lengths[inliers].mean())),
         held_out=tested,
         compared=pool,
         board=board,
         detections=tuple(detections),
         findings=(),
     )
-    return replace(calibration, findings=(*doubt, *calibration_findings(calibration)))
+    return replace(calibration, findings=(*model_warnings, *calibration_findings(calibration)))
 
 
-def _check_known(model: str) -> None:
-    known = ("auto", *DISTORTION_CANDIDATES)
-    if model not in known:
+def _check_model_name(model: str) -> None:
+    reference_values = ("auto", *DISTORTION_CANDIDATES)
+    if model not in reference_values:
         raise InputError(
             "no such camera model",
             found=model,
-            expected=closest(model, known) or listed(known),
+            expected=closest(model, reference_values) or listed(reference_values),
         )
 
 
@@ -305,8 +305,8 @@ def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
     `ResultError` where too many fit no camera.
     """
     check_numbering(fit.residuals, views.pixels, board, "the board file")
-    seen = views.seen
-    lost = 1 - float((seen & (fit.weight >= 0.5)).sum()) / max(int(seen.sum()), 1)
+    in_view = views.visible
+    lost = 1 - float((in_view & (fit.weight >= 0.5)).sum()) / max(int(in_view.sum()), 1)
     if lost <= MOST_CORNERS_LOST:
         return
     raise ResultError(
@@ -353,13 +353,13 @@ def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
 def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
     """Warnings about a camera's calibration that may be used."""
     c = calibration
-    missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.found]
+    missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.success]
     if missed:
         yield doubtful("lens.unused", number=len(missed), of=len(c.detections), names=missed)
     if len(c.views) < GOOD_VIEWS:
         yield doubtful("lens.few_views", number=len(c.views))
     mirrored = [d.name for d in c.detections if d.mirrored]
-    if mirrored and len(mirrored) < sum(d.found for d in c.detections):
+    if mirrored and len(mirrored) < sum(d.success for d in c.detections):
         yield doubtful("lens.some_mirrored", listed(mirrored), names=mirrored)
     elif mirrored:
         yield doubtful("lens.all_mirrored", number=len(mirrored), first=mirrored[0])
@@ -371,10 +371,10 @@ def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
     covered = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
     if covered < LEAST_COVERED_SHARE:
         yield doubtful("lens.little_covered", percent=100 * covered)
-    seen = np.isfinite(c.residuals).all(axis=-1)
-    rejected = int((seen & ~c.kept).sum())
+    finite = np.isfinite(c.residuals).all(axis=-1)
+    rejected = int((finite & ~c.inliers).sum())
     if rejected:
-        yield doubtful("lens.rejected_corners", number=rejected, of=int(seen.sum()))
+        yield doubtful("lens.rejected_corners", number=rejected, of=int(finite.sum()))
     middle = float(np.median(c.held_out.by_view))
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
         if rms > ODD_VIEW_RMS_FACTOR * middle:

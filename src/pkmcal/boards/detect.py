@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
-    LEAST_CORNERS_FOUND,
+    LEAST_DETECTED_CORNERS,
     Markers,
     charuco_detector,
     detect_board,
@@ -25,7 +25,7 @@ from pkmcal.boards.layout import LEAST_MARKER_SIDE, another_grid, marker_layout
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
-from pkmcal.session.photographs import photograph_header
+from pkmcal.session.image_files import photograph_header
 from pkmcal.wording import listed
 
 BOARD_PHOTOGRAPHS_EXAMINED = 3
@@ -55,17 +55,17 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     files = [Path(path) for path in paths]
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
-        if not any(detection.found for detection in found):
+        detections = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
+        if not any(detection.success for detection in detections):
             # Before all that can be tried is tried on photographs of something else.
-            check_boards(files, found, board)
-        missed = [k for k, detection in enumerate(found) if not detection.found]
+            check_boards(files, detections, board)
+        missed = [k for k, detection in enumerate(detections) if not detection.success]
         again = pool.map(lambda k: _detect(files[k], size, board, quick=False), missed)
         for k, detection in zip(missed, again, strict=True):
-            found[k] = detection
-    check_any(found, board)  # another board would have been told above
-    check_boards(files, found, board)
-    return tuple(found)
+            detections[k] = detection
+    check_any(detections, board)  # another board would have been told above
+    check_boards(files, detections, board)
+    return tuple(detections)
 
 
 def _detect(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
@@ -94,16 +94,16 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
     )
 
 
-def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
+def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: Board) -> None:
     """Raise `InputError` where some or all photographs show another board than `board`."""
-    missed = [f for f, d in zip(files, found, strict=True) if not d.found]
-    seen = [(f, d) for f, d in zip(files, found, strict=True) if d.found]
-    shown = [path for path, _ in seen]
-    size = found[0].image_size
+    missed = [f for f, d in zip(files, detections, strict=True) if not d.success]
+    visible = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
+    display = [path for path, _ in visible]
+    size = detections[0].image_size
     other: str | None = None
     if board.type == "aruco_grid":
-        _check_grid([path for path, _ in seen[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
-    for path, detection in seen[:BOARD_PHOTOGRAPHS_EXAMINED]:
+        _check_grid([path for path, _ in visible[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
+    for path, detection in visible[:BOARD_PHOTOGRAPHS_EXAMINED]:
         # One photograph alone may show something beside the board that looks like more of it.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
@@ -116,28 +116,28 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
         if other is None:
             break
     if other is not None:
-        raise _another(shown[0], other, board)
+        raise _another(display[0], other, board)
     for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
-        other = other_board(decode(path, size, path.name), board, part=not shown)
-        if other is not None and not shown:
+        other = other_board(decode(path, size, path.name), board, part=not display)
+        if other is not None and not display:
             raise _another(path, other, board)
         if other is not None:
             raise InputError(
                 "photographs of two boards are mixed",
                 where=path.name,
                 found=other,
-                expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
+                expected=f"{board.described}, as in {listed([f.name for f in display], 3)}",
                 next_step="Calibrate with the photographs of one board",
             )
 
 
-def check_any(found: Sequence[Detection], board: Board) -> None:
+def check_any(detections: Sequence[Detection], board: Board) -> None:
     """Raise `InputError` where no photograph shows the board."""
-    if not any(detection.found for detection in found):
+    if not any(detection.success for detection in detections):
         raise InputError(
             "the board is in none of the photographs",
-            where=listed([detection.name for detection in found], 3),
-            found=found[0].reason,
+            where=listed([detection.name for detection in detections], 3),
+            found=detections[0].reason,
             expected=board.described,
             next_step="Check the board file, the light and the focus; a chessboard's white border"
             " must be seen as well",
@@ -312,9 +312,9 @@ def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | Non
         if most <= (columns * rows) // 2 <= 2 * most + 4
         for legacy in [False, True][: 2 - rows % 2]
     ]
-    scored = [(_found(image, data, ids, corners), data) for data in layouts]
-    mine = _found(image, board.document, ids, corners)
-    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS_FOUND, mine[0] + 1)]
+    scored = [(_charuco_corners(image, data, ids, corners), data) for data in layouts]
+    mine = _charuco_corners(image, board.document, ids, corners)
+    scored = [item for item in scored if item[0][0] >= max(LEAST_DETECTED_CORNERS, mine[0] + 1)]
     if not scored:
         return None
     data = max(scored, key=lambda item: item[0])[1]
@@ -326,15 +326,15 @@ def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | Non
     return other.described + pattern
 
 
-def _found(
+def _charuco_corners(
     image: Integers, data: dict[str, Any], ids: Integers, corners: Array
 ) -> tuple[int, float]:
     """Corners of a ChArUco board between given markers, and their share of the board's."""
     marker_corners = [corner[None].astype(np.float32) for corner in corners]
     marker_ids = ids.astype(np.int32)[:, None]
     detector: Any = charuco_detector(data)
-    found: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
-    count = 0 if found is None else len(found)
+    value: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    count = 0 if value is None else len(value)
     columns, rows = data["squares"]
     return count, count / ((columns - 1) * (rows - 1))
 

@@ -41,7 +41,7 @@ UNMODELLED_EDGE_BEND = 0.02
 """px by which an edge may leave its tangent within the window before its bend is put in."""
 BLANK_BORDER_SHARE = 0.9
 """Share of the blank border between edge and marker that the window may fill."""
-LEAST_CORNERS_FOUND = 6
+LEAST_DETECTED_CORNERS = 6
 """Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
 WHOLE_CHESSBOARD_SHARE = 0.75
 """Share of a chessboard's corners that must look like corners: what is found there is the whole
@@ -65,7 +65,7 @@ def detect_board(image: Integers, board: Board, name: str = "", quick: bool = Fa
         raw, mirrored, why = (_charuco if board.type == "charuco" else _marker_grid)(image, board)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
-    if len(raw[0]) < LEAST_CORNERS_FOUND:
+    if len(raw[0]) < LEAST_DETECTED_CORNERS:
         return Detection(name, size, *nothing, reason=why)
     fitted = _fitted(image, board, raw)
     ids, good = raw[0], fitted.good
@@ -73,7 +73,7 @@ def detect_board(image: Integers, board: Board, name: str = "", quick: bool = Fa
     least = (
         WHOLE_CHESSBOARD_SHARE * len(board.points)
         if board.type == "chessboard"
-        else LEAST_CORNERS_FOUND
+        else LEAST_DETECTED_CORNERS
     )
     if good.sum() < least or _on_a_line(board.points[ids[good], :2]):
         why = f"only {good.sum()} of {len(board.points)} corners are sharp and uncovered"
@@ -96,14 +96,14 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
         # By one threshold alone five times as fast: enough where it shows the whole board.
         for detector, enough in (
             (charuco_detector(board.document, quick=True), len(board.points)),
-            (charuco_detector(board.document), LEAST_CORNERS_FOUND),
+            (charuco_detector(board.document), LEAST_DETECTED_CORNERS),
         ):
             corners, ids, _, marker_ids = detector.detectBoard(picture)
             markers = max(markers, _length(marker_ids))
-            found = _raw(corners, ids, image.shape[1], mirrored)
-            if len(found[0]) >= enough:
-                return found, mirrored, ""
-            best = max(best, found, key=lambda raw: len(raw[0]))
+            count = _raw(corners, ids, image.shape[1], mirrored)
+            if len(count[0]) >= enough:
+                return count, mirrored, ""
+            best = max(best, count, key=lambda raw: len(raw[0]))
     why = f"{markers} of the board's markers and {len(best[0])} corners are recognised"
     return best, False, why if markers else "none of the board's markers is recognised"
 
@@ -139,9 +139,9 @@ def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
     return np.asarray(ids).reshape(-1).astype(int), pixels
 
 
-def _length(found: Any) -> int:
+def _length(value: Any) -> int:
     """Entries of what OpenCV found; None where it found nothing."""
-    return 0 if found is None else len(found)
+    return 0 if value is None else len(value)
 
 
 def dictionary(name: str, first: int = 0, count: int | None = None) -> Any:
@@ -191,8 +191,8 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
             ids, corners = detect_markers(picture, words, quick)
             once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
             if once.sum() >= enough:
-                found = (4 * ids[once, None] + np.arange(4)).reshape(-1)
-                return _raw(corners[once], found, image.shape[1], mirrored), mirrored, ""
+                values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
+                return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
 
 
@@ -228,9 +228,9 @@ def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator
             lambda p=picture: cv2.findChessboardCorners(p, counts, flags=adaptive),
         ]
         # Enlarged, the second way takes seconds on a cluttered picture.
-        for way in ways[:1] if quick or scale > 1 else ways:
-            found, corners = way()
-            if found and _length(corners) == counts[0] * counts[1]:
+        for attempt in ways[:1] if quick or scale > 1 else ways:
+            value, corners = attempt()
+            if value and _length(corners) == counts[0] * counts[1]:
                 pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
                 yield (pixels + 0.5) / scale - 0.5
 
@@ -337,12 +337,12 @@ def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
     for k, axis in enumerate((1, 0)):
         step = np.diff(grid, axis=axis)
         mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
-        side = _mean_of_known(_padded(step, axis, 1, 0), _padded(step, axis, 0, 1))
+        side = _nanmean(_padded(step, axis, 1, 0), _padded(step, axis, 0, 1))
         side = side.reshape(-1, 2)[ids]
         sides[:, k] = np.where(np.isfinite(side), side, mean)
         # At the board's border the bend of the nearest corner inside serves as well.
         second = _padded(np.diff(step, axis=axis), axis, 1, 1)
-        around = _mean_of_known(np.roll(second, 1, axis), np.roll(second, -1, axis))
+        around = _nanmean(np.roll(second, 1, axis), np.roll(second, -1, axis))
         second = np.where(np.isfinite(second), second, around)
         bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
     # A single row of corners has no second side: take it square.
@@ -363,12 +363,12 @@ def _padded(values: Array, axis: int, before: int, after: int) -> Array:
     return out
 
 
-def _mean_of_known(*parts: Array) -> Array:
+def _nanmean(*parts: Array) -> Array:
     """Means of what is known (not NaN) in parts of one shape."""
     both = np.stack(parts)
-    known = np.isfinite(both)
-    total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(known.any(axis=0), total, np.nan)
+    finite = np.isfinite(both)
+    total = np.where(finite, both, 0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1)
+    return np.where(finite.any(axis=0), total, np.nan)
 
 
 def _marker_axes(ids: Integers, pixels: Array) -> Array:
@@ -522,7 +522,7 @@ class _Fitted(NamedTuple):
     """
 
     unknowns: Array
-    left: Array
+    residual: Array
     normal: Array
 
 
@@ -536,7 +536,7 @@ class _Fit(NamedTuple):
     grey: Array
     weight: Array
     shape: _Shape
-    left: Array
+    residual: Array
     by: Array
     cost: Array
     damping: Array
@@ -555,9 +555,11 @@ class _Fit(NamedTuple):
         # the derivatives by place, directions and blur are in proportion to the amplitude
         by[:, :5] *= amplitude[:, None, None]
         p = np.concatenate([p[:, :5], level[:, None], amplitude[:, None]], axis=1)
-        left = grey - level[:, None] - amplitude[:, None] * form
-        cost = np.sum(weight * left**2, axis=1)
-        return cls(np.arange(len(p)), p, grey, weight, shape, left, by, cost, np.full(len(p), 1e-3))
+        residual = grey - level[:, None] - amplitude[:, None] * form
+        cost = np.sum(weight * residual**2, axis=1)
+        return cls(
+            np.arange(len(p)), p, grey, weight, shape, residual, by, cost, np.full(len(p), 1e-3)
+        )
 
     @property
     def normal(self) -> Array:
@@ -566,17 +568,17 @@ class _Fit(NamedTuple):
 
     def stepped(self) -> tuple[_Fit, Array]:
         """After a damped step, where it is better, and that step (k, 7)."""
-        normal, right = self.normal, self.by @ (self.weight * self.left)[..., None]
+        normal, right = self.normal, self.by @ (self.weight * self.residual)[..., None]
         diagonal = np.einsum("nii->ni", normal)
         normal = normal + (self.damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
         step = np.clip(np.linalg.solve(normal, right)[..., 0], -LONGEST_STEP, LONGEST_STEP)
         value, by = _model(self.p + step, self.shape)
-        left = self.grey - value
-        cost = np.sum(self.weight * left**2, axis=1)
+        residual = self.grey - value
+        cost = np.sum(self.weight * residual**2, axis=1)
         better = cost < self.cost
         after = self._replace(
             p=_taken(better, self.p + step, self.p),
-            left=_taken(better, left, self.left),
+            residual=_taken(better, residual, self.residual),
             by=_taken(better, by, self.by),
             cost=np.where(better, cost, self.cost),
             damping=self.damping * np.where(better, 0.1, 10.0),
@@ -602,7 +604,9 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fitted:
         fit, step = fit.stepped()
         on = (np.abs(step[:, :2]).max(axis=1) >= CORNER_FIT_SETTLED) & (more > 0)
         settled = fit.select(~on)
-        for all_of_them, these in zip(out, (settled.p, settled.left, settled.normal), strict=True):
+        for all_of_them, these in zip(
+            out, (settled.p, settled.residual, settled.normal), strict=True
+        ):
             all_of_them[settled.number] = these
         if not on.any():
             break
@@ -656,18 +660,18 @@ def _judged(start: Array, fitted: _Fitted, grey: Array, weight: Array, scale: Ar
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * grey, axis=1) / total
     variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
-    left = np.sum(weight * fitted.left**2, axis=1) / total
-    blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
+    remainder = np.sum(weight * fitted.residual**2, axis=1) / total
+    blur, shifted = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
     good = (
-        (left < (1 - LEAST_SHARE) * variance)
+        (remainder < (1 - LEAST_SHARE) * variance)
         & (blur > CORNER_BLUR_RANGE[0] / 2)
         & (blur < np.maximum(CORNER_BLUR_RANGE[1], 0.2 * scale))
-        & (moved < np.maximum(1.5, FARTHEST_CORNER_MOVE * scale))
+        & (shifted < np.maximum(1.5, FARTHEST_CORNER_MOVE * scale))
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )
     # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
-    noise = np.maximum(left, 1 / 12)
+    noise = np.maximum(remainder, 1 / 12)
     covariance = np.linalg.inv(fitted.normal + 1e-9 * np.eye(7)) * noise[:, None, None]
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
     pixels = start + np.where(good[:, None], p[:, :2], 0.0)

@@ -26,7 +26,7 @@ from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import normal_root
 from pkmcal.solver.search import Stop, Values, final_weights, minimise
 
-LEAST_KNOWN = 1e-14
+LEAST_EIGENVALUE_SHARE = 1e-14
 """Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
@@ -53,7 +53,7 @@ class Views(NamedTuple):
     sigma: Array
 
     @property
-    def seen(self) -> Booleans:
+    def visible(self) -> Booleans:
         """(V, N) True where a corner is seen."""
         return np.asarray(np.isfinite(self.pixels).all(axis=-1))
 
@@ -134,7 +134,7 @@ class CameraProblem:
             np.zeros((0, shared.shape[-1])),
         )
 
-    def moved(self, state: CameraState, shared: Array, own: Array) -> CameraState:
+    def retract(self, state: CameraState, shared: Array, own: Array) -> CameraState:
         """The state after a step; xi stays at 0 or above."""
         intrinsics = state.intrinsics
         if len(self.free):
@@ -193,20 +193,20 @@ def fit_camera(
     rounds: int = CAMERA_FIT_ROUNDS,
 ) -> CameraFit:
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
-    seen = views.seen
-    weight = seen.astype(float)
+    in_view = views.visible
+    weight = in_view.astype(float)
     state = CameraState(camera.parameters[None, free], T_camera_board[None])
     tau, cut, converged, off = 1.0, 4.0, True, views.pixels
     for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
-        found = minimise(problem, state, max_steps=CAMERA_FIT_STEPS)
-        state, converged = found.state, found.stop[0] is Stop.CONVERGED
+        solution = minimise(problem, state, max_steps=CAMERA_FIT_STEPS)
+        state, converged = solution.state, solution.stop[0] is Stop.CONVERGED
         off = _off(with_free(camera, free, state), state, views)
-        dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
+        dof = max(2 * weight.sum() - 6 * len(in_view) - len(free), 1.0)
         new_tau = noise_beyond(off, views.sigma, weight, dof)
-        robust = _robust_scale(off, views.sigma, seen)
+        robust = _robust_scale(off, views.sigma, in_view)
         distance = np.sum(np.nan_to_num(off) ** 2, axis=-1) / (views.sigma**2 + (robust * cut) ** 2)
-        new_weight = np.where(seen, final_weights(np.sqrt(distance)), 0.0)
+        new_weight = np.where(in_view, final_weights(np.sqrt(distance)), 0.0)
         change = np.abs(new_weight - weight).max(initial=0.0)
         done = (
             cut == 1.0
@@ -221,17 +221,17 @@ def fit_camera(
     )
 
 
-def refit(fit: CameraFit, views: Views, kept: Integers) -> CameraFit:
+def refit(fit: CameraFit, views: Views, retained: Integers) -> CameraFit:
     """The camera from some of the views, from the fit to all, with its weights and noise."""
-    part = views.take(kept)
-    problem = _problem(fit.camera, fit.free, part, fit.weight[kept], fit.tau)
-    state = CameraState(fit.camera.parameters[None, fit.free], fit.T_camera_board[kept][None])
-    found = minimise(problem, state, max_steps=15)
-    camera = with_free(fit.camera, fit.free, found.state)
-    off = _off(camera, found.state, part)
+    part = views.take(retained)
+    problem = _problem(fit.camera, fit.free, part, fit.weight[retained], fit.tau)
+    state = CameraState(fit.camera.parameters[None, fit.free], fit.T_camera_board[retained][None])
+    solution = minimise(problem, state, max_steps=15)
+    camera = with_free(fit.camera, fit.free, solution.state)
+    off = _off(camera, solution.state, part)
     return replace(
-        fit, camera=camera, T_camera_board=found.state.T_camera_board[0], residuals=off,
-        weight=fit.weight[kept],
+        fit, camera=camera, T_camera_board=solution.state.T_camera_board[0], residuals=off,
+        weight=fit.weight[retained],
     )  # fmt: skip
 
 
@@ -243,8 +243,8 @@ def fit_board_poses(
         camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
     )
     # to the end: where another tilt was followed half-way, nobody knows whether it is another one
-    found = minimise(problem, CameraState(np.zeros((len(scale), 0)), T_camera_board[:, None]))
-    return found.state.T_camera_board[:, 0], found.cost
+    solution = minimise(problem, CameraState(np.zeros((len(scale), 0)), T_camera_board[:, None]))
+    return solution.state.T_camera_board[:, 0], solution.cost
 
 
 def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
@@ -266,7 +266,7 @@ def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
 
 def inverted(normal: Array) -> Array:
     """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
-    half = normal_root(normal, LEAST_KNOWN, loose=True)
+    half = normal_root(normal, LEAST_EIGENVALUE_SHARE, loose=True)
     return half @ half.mT
 
 
@@ -282,9 +282,9 @@ def check_numbering(residuals: Array, pixels: Array, board: Board, where: str) -
     gap[:, each, each] = np.inf
     nearest = np.where(np.isfinite(gap), gap, np.inf).min(axis=-1, initial=np.inf)
     off = np.linalg.norm(residuals, axis=-1)
-    seen = np.isfinite(off) & np.isfinite(nearest)
-    elsewhere = np.sum(seen & (np.nan_to_num(off) > nearest / 2), axis=0)
-    wrong = (elsewhere >= LEAST_VIEWS_ELSEWHERE) & (2 * elsewhere > seen.sum(axis=0))
+    finite = np.isfinite(off) & np.isfinite(nearest)
+    elsewhere = np.sum(finite & (np.nan_to_num(off) > nearest / 2), axis=0)
+    wrong = (elsewhere >= LEAST_VIEWS_ELSEWHERE) & (2 * elsewhere > finite.sum(axis=0))
     if wrong.sum() <= CORNERS_OF_A_MARKER or 2 * wrong.sum() > len(wrong):
         return  # where most lie elsewhere there is no board to be numbered
     raise InputError(
@@ -315,23 +315,23 @@ def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:
 def _problem(
     camera: Camera, free: Integers, views: Views, weight: Array, tau: float
 ) -> CameraProblem:
-    scale = np.where(views.seen, np.sqrt(weight / (views.sigma**2 + tau**2)), 0.0)
+    scale = np.where(views.visible, np.sqrt(weight / (views.sigma**2 + tau**2)), 0.0)
     return CameraProblem(camera, free, views.points, views.pixels[None], scale[None])
 
 
 def _off(camera: Camera, state: CameraState, views: Views) -> Array:
     """Predicted minus seen, (V, N, 2) px; far away where the camera cannot see the corner."""
     off = camera.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
-    lost = views.seen[..., None] & ~np.isfinite(off)
+    lost = views.visible[..., None] & ~np.isfinite(off)
     return np.where(lost, 1e3, off)
 
 
-def _robust_scale(off: Array, sigma: Array, seen: Booleans) -> float:
+def _robust_scale(off: Array, sigma: Array, visible: Booleans) -> float:
     """Tau from the median of the residuals' lengths, px: half of a 2-D normal's lie within
     sqrt(2 ln 2) standard deviations.
     """
-    middle = float(np.median(np.sum(off[seen] ** 2, axis=-1))) / (2 * np.log(2))
-    return float(np.sqrt(max(middle - float(np.median(sigma[seen] ** 2)), LEAST_NOISE**2)))
+    middle = float(np.median(np.sum(off[visible] ** 2, axis=-1))) / (2 * np.log(2))
+    return float(np.sqrt(max(middle - float(np.median(sigma[visible] ** 2)), LEAST_NOISE**2)))
 
 
 class BoardPoses(NamedTuple):
@@ -374,7 +374,7 @@ def board_poses(camera: Camera, views: Views) -> BoardPoses:
 def settled_poses(camera: Camera, views: Views, start: Array | None = None) -> Array:
     """Poses (V, 4, 4) by least squares, the better of each view's two tilts."""
     start = linear_poses(camera.ray(views.pixels), views.points) if start is None else start
-    scale = views.seen.astype(float)
+    scale = views.visible.astype(float)
     first, cost = fit_board_poses(camera, views, start, scale)
     second, other = fit_board_poses(camera, views, tilted_back(first, views.points), scale)
     return np.where((other < cost)[:, None, None], second, first)
@@ -401,12 +401,12 @@ def linear_poses(rays: Array, points: Array) -> Array:
     made orthonormal afterwards. NaN rays are left out; poses that fewer than four rays leave open
     are any.
     """
-    known = np.asarray(np.isfinite(rays).all(axis=-1))
-    s = np.where(known[..., None], rays, 0.0)
+    finite = np.asarray(np.isfinite(rays).all(axis=-1))
+    s = np.where(finite[..., None], rays, 0.0)
     middle, spread = points[:, :2].mean(axis=0), points[:, :2].std() + 1e-12
     plane = np.concatenate([(points[:, :2] - middle) / spread, np.ones((len(points), 1))], axis=-1)
     # sum over corners of kron(X X^T, I - s s^T), the normal matrix of the cross products
-    across = known[..., None, None] * np.eye(3) - s[..., :, None] * s[..., None, :]
+    across = finite[..., None, None] * np.eye(3) - s[..., :, None] * s[..., None, :]
     normal = np.einsum("na,nb,...nij->...aibj", plane, plane, across, optimize=True)
     normal = normal.reshape(*rays.shape[:-2], 9, 9)
     vector = np.linalg.eigh(normal)[1][..., 0].reshape(*rays.shape[:-2], 3, 3)

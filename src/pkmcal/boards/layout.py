@@ -72,11 +72,11 @@ class _Neighbours(NamedTuple):
 
 def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
     """The layout that photographs show, None where they do not show one."""
-    found = [part for markers in photographs if (part := _neighbours(markers)) is not None]
-    if not found:
+    results = [part for markers in photographs if (part := _neighbours(markers)) is not None]
+    if not results:
         return None
-    ids = np.concatenate([part.ids for part in found])
-    step = np.concatenate([part.step for part in found])
+    ids = np.concatenate([part.ids for part in results])
+    step = np.concatenate([part.step for part in results])
     difference = ids[:, 1] - ids[:, 0]
     along = _usual(difference[step[:, 0] == 1])
     down = _usual(difference[step[:, 1] == 1])
@@ -86,7 +86,7 @@ def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
     return MarkerLayout(
         along,
         down,
-        float(np.median(np.concatenate([part.pitch for part in found]))) - 1,
+        float(np.median(np.concatenate([part.pitch for part in results]))) - 1,
         Counter((i, j) for i, j in rows),
         frozenset(int(number) for number in ids.flat),
     )

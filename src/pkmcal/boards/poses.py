@@ -39,7 +39,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
+from pkmcal.measurements import Effect, ModelViolation, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import count, listed
 
@@ -71,7 +71,7 @@ which it is not one of them."""
 class BoardViews:
     """One station's K photographs of a board, of which F show it.
 
-    configuration : (K,) rows of the session's readings. detections : K. shown : (F,) the
+    configuration : (K,) rows of the session's readings. detections : K. numbers : (F,) the
     photographs that show it. views, poses : of these. rms : (F,) px. usable : (F,) True where the
     pose is sure.
     """
@@ -81,7 +81,7 @@ class BoardViews:
     board: Board
     configuration: Integers
     detections: tuple[Detection, ...]
-    shown: Integers
+    numbers: Integers
     views: Views
     poses: BoardPoses
     rms: Array
@@ -90,13 +90,13 @@ class BoardViews:
     @property
     def names(self) -> list[str]:
         """Names of the photographs that show the board."""
-        return [self.detections[k].name for k in self.shown]
+        return [self.detections[k].name for k in self.numbers]
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
         """Photographs without a pose, with the reason."""
         missed = [(k, f"the board: {d.reason}") for k, d in enumerate(self.detections) if d.reason]
-        unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.shown[~self.usable]]
+        unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.numbers[~self.usable]]
         return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
 
     def rejection(self, photograph: int, reason: str) -> Rejection:
@@ -118,19 +118,19 @@ def detect_in(
 
 
 def detect_again(
-    images: Sequence[Integers], board: Board, found: Sequence[Detection], most: int
+    images: Sequence[Integers], board: Board, detections: Sequence[Detection], most: int
 ) -> tuple[Detection, ...]:
     """Where the board was not found, every way is tried, on `most` photographs spread over these.
 
     Only a chessboard has more than one way, and it takes seconds.
     """
-    missed = [k for k, detection in enumerate(found) if not detection.found]
+    missed = [k for k, detection in enumerate(detections) if not detection.success]
     if board.type != "chessboard" or not missed or most < 1:
-        return tuple(found)
+        return tuple(detections)
     chosen = [missed[k] for k in evenly(len(missed), most)]
-    out = list(found)
+    out = list(detections)
     with ThreadPoolExecutor(THREADS) as pool:
-        again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
+        again = pool.map(lambda k: detect_board(images[k], board, detections[k].name), chosen)
         for k, detection in zip(chosen, again, strict=True):
             out[k] = detection
     return tuple(out)
@@ -149,18 +149,18 @@ def board_views(
     or this camera's.
     """
     _check_sides(board, detections)
-    shown = np.flatnonzero([detection.found for detection in detections])
-    views = views_of([detection for detection in detections if detection.found], board)
+    visible = np.flatnonzero([detection.success for detection in detections])
+    views = views_of([detection for detection in detections if detection.success], board)
     poses = board_poses(camera, views)
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
     usable = (used >= LEAST_CORNERS_WEIGHED) & _one_tilt(camera, views, poses)
-    seen = BoardViews(
-        station, camera, board, configuration, tuple(detections), shown, views, poses, rms, usable
+    in_view = BoardViews(
+        station, camera, board, configuration, tuple(detections), visible, views, poses, rms, usable
     )
-    _check_explained(seen)
-    return seen
+    _check_explained(in_view)
+    return in_view
 
 
 def pose_set(
@@ -199,7 +199,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
             expected="an odd and an even number of corners, or a board with markers (charuco)",
         )
     mirrored = [detection.name for detection in detections if detection.mirrored]
-    others = sum(detection.found and not detection.mirrored for detection in detections)
+    others = sum(detection.success and not detection.mirrored for detection in detections)
     if mirrored and others:
         one = len(mirrored) == 1
         raise InputError(
@@ -219,17 +219,17 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
         )
 
 
-def _check_explained(seen: BoardViews) -> None:
+def _check_explained(views: BoardViews) -> None:
     """Raise `InputError` where the corners do not lie as board and camera files say."""
-    check_numbering(seen.poses.residuals, seen.views.pixels, seen.board, "board.yaml")
-    limit = BOARD_RESIDUAL_LIMIT * seen.camera.image_size[0]
-    if not len(seen.rms) or np.median(seen.rms) <= limit:
+    check_numbering(views.poses.residuals, views.views.pixels, views.board, "board.yaml")
+    limit = BOARD_RESIDUAL_LIMIT * views.camera.image_size[0]
+    if not len(views.rms) or np.median(views.rms) <= limit:
         return
-    worst = int(np.argmax(seen.rms))
+    worst = int(np.argmax(views.rms))
     raise InputError(
         "the board's corners do not lie as the board file and the camera file say",
-        where=seen.names[worst],
-        found=f"{np.median(seen.rms):.2g} px rms off their places ({seen.board.described})",
+        where=views.names[worst],
+        found=f"{np.median(views.rms):.2g} px rms off their places ({views.board.described})",
         expected=f"{limit:.2g} px at most, usually a hundredth of that",
         next_step="Look for a wrong board file, a bent board, or another camera's file",
     )
@@ -253,26 +253,28 @@ class Standing:
     noise: float
     rejected: tuple[Rejection, ...]
 
-    def poses(self, seen: BoardViews, mount: int) -> PoseSet:
+    def poses(self, views: BoardViews, mount: int) -> PoseSet:
         """One measurement; the configuration of its row says nothing, for nothing moves."""
-        row = seen.configuration[seen.shown[self.agreed]][:1]
-        found = pose_set(seen.station, row, mount, self.T_camera_board[None], self.covariance[None])
-        by = seen.poses.by_intrinsics[self.agreed].mean(axis=0)[None]
-        return replace(found, by_intrinsics=by)
+        row = views.configuration[views.numbers[self.agreed]][:1]
+        actual_names = pose_set(
+            views.station, row, mount, self.T_camera_board[None], self.covariance[None]
+        )
+        by = views.poses.by_intrinsics[self.agreed].mean(axis=0)[None]
+        return replace(actual_names, by_intrinsics=by)
 
 
-def standing_board(seen: BoardViews) -> Standing | None:
+def standing_board(views: BoardViews) -> Standing | None:
     """The board's one pose in a station's photographs; None where none shows it surely.
 
     Raises `InputError` where the board or the camera was moved between photographs.
     """
-    if not seen.usable.any():
+    if not views.usable.any():
         return None
-    there, noise = _places(seen)
-    agreed = _agreed(there, noise, seen.usable)
-    odd = seen.usable & ~agreed
-    _check_still(seen, there, agreed)
-    T_camera_board, covariance, rest = _mean_pose(seen, agreed)
+    there, noise = _places(views)
+    agreed = _agreed(there, noise, views.usable)
+    odd = views.usable & ~agreed
+    _check_still(views, there, agreed)
+    T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
     scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
     distance = _distance(there, there[agreed].mean(axis=0))
@@ -283,8 +285,8 @@ def standing_board(seen: BoardViews) -> Standing | None:
         scatter,
         rest,
         tuple(
-            seen.rejection(
-                int(seen.shown[k]),
+            views.rejection(
+                int(views.numbers[k]),
                 f"the board stands {distance[k]:.1f} px from where the other photographs show it",
             )
             for k in np.flatnonzero(odd)
@@ -292,16 +294,16 @@ def standing_board(seen: BoardViews) -> Standing | None:
     )
 
 
-def _places(seen: BoardViews) -> tuple[Array, Array]:
+def _places(views: BoardViews) -> tuple[Array, Array]:
     """Where each photograph's pose puts the board's corners, (F, N, 2) px, and the standard
     deviation of that, rms over the board, (F,) px.
     """
-    T = seen.poses.T_camera_board[:, None]
-    there = apply(T, seen.board.points)
-    by_point = seen.camera.project_jacobians(there)[0]
+    T = views.poses.T_camera_board[:, None]
+    there = apply(T, views.board.points)
+    by_point = views.camera.project_jacobians(there)[0]
     by_pose = np.concatenate([-by_point @ skew(there - T[..., :3, 3]), by_point], axis=-1)
-    variance = np.einsum("fnip,fpq,fniq->fni", by_pose, seen.poses.covariance, by_pose)
-    return seen.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
+    variance = np.einsum("fnip,fpq,fniq->fni", by_pose, views.poses.covariance, by_pose)
+    return views.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
 
 
 def _agreed(there: Array, noise: Array, usable: Booleans) -> Booleans:
@@ -318,9 +320,9 @@ def _distance(there: Array, other: Array) -> Array:
     return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
 
 
-def _check_still(seen: BoardViews, there: Array, agreed: Booleans) -> None:
+def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
     """Raise `InputError` where photographs disagree that follow one another, or too many do."""
-    used = np.flatnonzero(seen.usable)
+    used = np.flatnonzero(views.usable)
     runs = [
         (bool(same), [int(k) for k in run]) for same, run in groupby(used, key=lambda k: agreed[k])
     ]
@@ -330,22 +332,24 @@ def _check_still(seen: BoardViews, there: Array, agreed: Booleans) -> None:
         before, after = (runs[long][1], runs[long + 1][1]) if long == 0 else (
             runs[long - 1][1], runs[long][1]
         )  # fmt: skip
-        raise _moved(seen, there, before, after)
-    odd = int((seen.usable & ~agreed).sum())
+        raise _movement_error(views, there, before, after)
+    odd = int((views.usable & ~agreed).sum())
     if odd > MOST_ODD * len(used) and odd > 1:
         raise InputError(
             "the board, or the camera, did not stand still",
-            where=seen.names[0].rpartition("/")[0] or seen.names[0],
+            where=views.names[0].rpartition("/")[0] or views.names[0],
             found=f"{odd} of {len(used)} photographs show it in other places than the rest",
             expected=_EXPECTED,
         )
 
 
-def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) -> InputError:
+def _movement_error(
+    views: BoardViews, there: Array, before: list[int], after: list[int]
+) -> InputError:
     """The error that names the photographs between which the board moved."""
-    names, poses = seen.names, seen.poses.T_camera_board
+    names, poses = views.names, views.poses.T_camera_board
     pixels = float(_distance(there[before[-1]], there[after[0]]))
-    middle = seen.board.points.mean(axis=0)
+    middle = views.board.points.mean(axis=0)
     metres = float(np.linalg.norm(np.diff(apply(poses[[before[-1], after[0]]], middle), axis=0)))
     turn = float(np.linalg.norm(pose_difference(poses[after[0]], poses[before[-1]])[:3]))
     return InputError(
@@ -359,14 +363,14 @@ def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) 
     )
 
 
-def _mean_pose(seen: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]:
+def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]:
     """The pose by the means of the corners over photographs, its covariance (6, 6), and the
     noise px that the means leave unexplained.
 
     What the photographs do not share (pixel noise) averages out, and its size is told by their
     scatter; what they share (the camera model, the board's print) remains, and does not.
     """
-    views, poses = seen.views, seen.poses
+    views, poses = board_views.views, board_views.poses
     used = agreed[:, None] & (poses.weight > 0.5)
     count = used.sum(axis=0)
     pixels = np.where(used[..., None], views.pixels, 0.0).sum(axis=0)
@@ -376,22 +380,22 @@ def _mean_pose(seen: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]
     single = np.sqrt(np.where(used, views.sigma**2, 0.0).sum(axis=0) / np.maximum(count, 1))
     noise = np.sqrt(np.sum(off**2) / freedom) if freedom > 0 else single
     sigma = noise / np.sqrt(np.maximum(count, 1))
-    mean = board_poses(seen.camera, Views(views.points, pixels[None], sigma[None]))
-    covariance = mean.covariance[0] + _wandering(seen, agreed, mean.T_camera_board[0], noise)
+    mean = board_poses(board_views.camera, Views(views.points, pixels[None], sigma[None]))
+    covariance = mean.covariance[0] + _wandering(board_views, agreed, mean.T_camera_board[0], noise)
     return mean.T_camera_board[0], covariance, mean.noise
 
 
-def _wandering(seen: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array) -> Array:
+def _wandering(views: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array) -> Array:
     """Covariance (6, 6) of the mean by what moves the whole board from photograph to photograph
     (a floor that shakes), beyond what the corners' noise does; zero where there is no more.
     """
     count = int(agreed.sum())
     if count < 2:
         return np.zeros((6, 6))
-    sigma2 = np.mean(seen.views.sigma[seen.views.seen] ** 2) + seen.poses.noise**2
+    sigma2 = np.mean(views.views.sigma[views.views.visible] ** 2) + views.poses.noise**2
     # each pose's covariance, had its corners only the noise that differs between photographs
-    each = seen.poses.covariance[agreed] * (np.mean(np.square(noise)) / sigma2)
-    off = pose_difference(seen.poses.T_camera_board[agreed], T_camera_board)
+    each = views.poses.covariance[agreed] * (np.mean(np.square(noise)) / sigma2)
+    off = pose_difference(views.poses.T_camera_board[agreed], T_camera_board)
     chi2 = np.einsum("fi,fij,fj->", off, np.linalg.inv(each), off)
     spread = chi2 / (6 * (count - 1))
     return max(spread - 1.0, 0.0) * each.mean(axis=0) / count
@@ -422,19 +426,19 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     several = groups.count[groups.member] > 2
     usual = float(np.median(off[several])) if several.any() else 1.0
     used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~several
-    kept = groups_of(configuration[used])
+    retained = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
-    mean, stated = kept.mean(delta), kept.mean(covariance_used)
+    mean, stated = retained.mean(delta), retained.mean(covariance_used)
     alone = (1 - common) * stated
-    rest = delta - mean[kept.member]
-    freedom = float(np.sum(kept.count - 1))
+    rest = delta - mean[retained.member]
+    freedom = float(np.sum(retained.count - 1))
     spread = 1.0
     if freedom:
-        size = np.sum(_deviation(rest, alone[kept.member]) ** 2)
+        size = np.sum(_deviation(rest, alone[retained.member]) ** 2)
         spread = max(float(size) / freedom, 1.0)
-    total = common * stated + spread * alone / kept.count[:, None, None]
-    first = np.flatnonzero(used)[kept.first]
-    reference = T[groups.first[groups.member]][used][kept.first]
+    total = common * stated + spread * alone / retained.count[:, None, None]
+    first = np.flatnonzero(used)[retained.first]
+    reference = T[groups.first[groups.member]][used][retained.first]
     return MeanPoses(first, perturb(reference, mean), total, used, off)
 
 
@@ -444,26 +448,31 @@ def _deviation(delta: Array, covariance: Array) -> Array:
     return np.sqrt(np.mean(white**2, axis=-1))
 
 
-def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
+def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
     """A board on the platform: one measurement a configuration, and the repeats that are odd."""
-    kept = np.flatnonzero(seen.usable)
-    rows = seen.configuration[seen.shown[kept]]
-    if not len(kept):
+    retained_rows = np.flatnonzero(views.usable)
+    rows = views.configuration[views.numbers[retained_rows]]
+    if not len(retained_rows):
         return PoseSet.empty(), ()
-    sigma2 = float(np.median(seen.views.sigma[seen.views.seen]) ** 2)
-    noise2 = seen.poses.noise**2
+    sigma2 = float(np.median(views.views.sigma[views.views.visible]) ** 2)
+    noise2 = views.poses.noise**2
     common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
-    found = mean_poses(rows, seen.poses.T_camera_board[kept], seen.poses.covariance[kept], common)
-    odd = tuple(
-        seen.rejection(int(seen.shown[kept[k]]), ODD_BOARD_REASON.format(found.off[k]))
-        for k in np.flatnonzero(~found.used)
+    value = mean_poses(
+        rows,
+        views.poses.T_camera_board[retained_rows],
+        views.poses.covariance[retained_rows],
+        common,
     )
-    poses = pose_set(seen.station, rows[found.first], mount, found.pose, found.covariance)
-    by = groups_of(rows[found.used]).mean(seen.poses.by_intrinsics[kept[found.used]])
+    odd = tuple(
+        views.rejection(int(views.numbers[retained_rows[k]]), ODD_BOARD_REASON.format(value.off[k]))
+        for k in np.flatnonzero(~value.used)
+    )
+    poses = pose_set(views.station, rows[value.first], mount, value.pose, value.covariance)
+    by = groups_of(rows[value.used]).mean(views.poses.by_intrinsics[retained_rows[value.used]])
     return replace(poses, by_intrinsics=by), odd
 
 
-def size_departure(poses: PoseSet, mount: int, file: str) -> Departure:
+def board_size_violation(poses: PoseSet, mount: int, file: str) -> ModelViolation:
     """A board whose squares are not as large as its file says, by more than its tolerance.
 
     mount : the board's number. Where the size is an unknown with a tolerance, freeing it takes the
@@ -476,4 +485,4 @@ def size_departure(poses: PoseSet, mount: int, file: str) -> Departure:
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {"value": value[0], "sigma": sigma[0], "file": file, "factor": 1 + value[0]}
 
-    return Departure("board.size", file, facts, Effect(poses=by))
+    return ModelViolation("board.size", file, facts, Effect(poses=by))

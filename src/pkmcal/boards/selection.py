@@ -77,7 +77,7 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
             continue  # it did not take these photographs, and has no pose to begin from
         poses = linear_poses(rays, views.points)
         off = camera.project(apply(poses[:, None], views.points)) - views.pixels
-        distance = np.linalg.norm(off, axis=-1)[views.seen]
+        distance = np.linalg.norm(off, axis=-1)[views.visible]
         # Lost corners count as far.
         score = float(np.median(np.where(np.isfinite(distance), distance, np.inf)))
         if np.isfinite(score):
@@ -130,7 +130,7 @@ class HeldOut:
 def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
     """Refit without each part of the views, and predict that part."""
     count = len(fit.T_camera_board)
-    kept = (fit.weight >= 0.5) & views.seen
+    inliers = (fit.weight >= 0.5) & views.visible
     residuals = np.full(views.pixels.shape, np.nan)
     bends: list[Array] = []
     part_of = np.arange(count) % min(HELD_OUT_PARTS, count)
@@ -138,12 +138,12 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
         out = np.flatnonzero(part_of == part)
         camera = refit(fit, views, np.flatnonzero(part_of != part)).camera
         mine = views.take(out)
-        scale = np.where(kept[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
+        scale = np.where(inliers[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
         poses, _ = fit_board_poses(camera, mine, fit.T_camera_board[out], scale)
         predicted = camera.project(apply(poses[:, None], views.points))
-        residuals[out] = np.where(kept[out][..., None], predicted - mine.pixels, np.nan)
+        residuals[out] = np.where(inliers[out][..., None], predicted - mine.pixels, np.nan)
         for v in out:
-            pixels = np.where(kept[v][:, None], views.pixels[v], np.nan)
+            pixels = np.where(inliers[v][:, None], views.pixels[v], np.nan)
             bends.append(line_offsets(camera, pixels, lines))
     squares = np.sum(residuals**2, axis=-1)
     bend = np.concatenate(bends)
@@ -179,10 +179,10 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
     return np.concatenate(out) if out else np.zeros(0)
 
 
-def left_out_residuals(fit: CameraFit, views: Views) -> Array:
+def leave_one_out_residuals(fit: CameraFit, views: Views) -> Array:
     """Residuals (V, N, 2) px of each view under the camera of the others, to first order."""
-    moved, rows, _ = _without_each(fit, views)
-    change = (rows @ moved[..., None])[..., 0].reshape(*views.seen.shape, 2)
+    shifted, rows, _ = _without_each(fit, views)
+    change = (rows @ shifted[..., None])[..., 0].reshape(*views.visible.shape, 2)
     scale = fit.problem(views).scale[0][..., None]
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
 
@@ -193,9 +193,9 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     The jackknife over views, whose covariance is (V - 1) / V of the sum of squares of what each
     view's absence changes, against that of the noise; 1 where chance explains the difference.
     """
-    moved, _, normal = _without_each(fit, views)
-    off = moved - moved.mean(axis=0)
-    count = len(moved)
+    shifted, _, normal = _without_each(fit, views)
+    off = shifted - shifted.mean(axis=0)
+    count = len(shifted)
     jackknife = (count - 1) / count * off.T @ off
     ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
     return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
@@ -213,8 +213,8 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     normals = rows.mT @ rows
     whole = normals.sum(axis=0)
     right = rows.mT @ linear.value[0][..., None]
-    moved = np.stack([inverted(whole - part) for part in normals]) @ right
-    return moved[..., 0], rows, whole
+    shifted = np.stack([inverted(whole - part) for part in normals]) @ right
+    return shifted[..., 0], rows, whole
 
 
 @dataclass(frozen=True)
@@ -262,22 +262,22 @@ def camera_candidates(
     # the one that fits best gives up, and no model wins by giving up more.
     usual = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
     most = NO_WEIGHT_DISTANCE**2 * (usual**2 + views.sigma**2)
-    off = [left_out_residuals(fit, views) for _, _, fit in fits]
-    bounded = [np.minimum(_squares(left, views.seen), most) for left in off]
+    off = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
+    bounded = [np.minimum(_squares(remainder, views.visible), most) for remainder in off]
     best = int(np.argmin([np.sum(squares) for squares in bounded]))
-    used = (fits[best][2].weight > 0.5) & views.seen
+    used = (fits[best][2].weight > 0.5) & views.visible
     pool = [
         Candidate(
             model=model,
             terms=terms,
             parameters=len(fit.free),
             rms=_rms(fit.residuals, used),
-            left_out=_rms(left, used),
-            robust=float(np.sqrt(np.sum(squares) / max(int(views.seen.sum()), 1))),
-            by_view=np.sum(squares, axis=1) / np.maximum(views.seen.sum(axis=1), 1),
+            left_out=_rms(remainder, used),
+            robust=float(np.sqrt(np.sum(squares) / max(int(views.visible.sum()), 1))),
+            by_view=np.sum(squares, axis=1) / np.maximum(views.visible.sum(axis=1), 1),
             fit=fit,
         )
-        for (model, terms, fit), left, squares in zip(fits, off, bounded, strict=True)
+        for (model, terms, fit), remainder, squares in zip(fits, off, bounded, strict=True)
     ]
     return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
@@ -307,14 +307,14 @@ def fitted_to_all(chosen: Candidate, views: Views) -> CameraFit:
 
 def thinned(views: Views) -> Views:
     """The views with fewer corners each, where there are many: evenly over the board."""
-    total = int(views.seen.sum())
+    total = int(views.visible.sum())
     if total <= MOST_CORNERS:
         return views
     # One set of corners for all views, so that arrays stay small; no pattern of rows in it.
     order = np.random.default_rng(0).permutation(len(views.points))
     used = order[: max(len(order) * MOST_CORNERS // total, LEAST_OF_VIEW)]
-    for seen in views.seen:
-        mine = order[seen[order]]
+    for in_view in views.visible:
+        mine = order[in_view[order]]
         used = np.union1d(used, mine[:LEAST_OF_VIEW])
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 

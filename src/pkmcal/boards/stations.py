@@ -13,8 +13,8 @@ from pkmcal.boards.detect import check_boards
 from pkmcal.boards.poses import board_views, detect_again, detect_in, standing_board
 from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.errors import InputError
+from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session
-from pkmcal.session.photographs import label_of
 
 SLOW_SEARCH_PHOTOGRAPHS = 4
 """Photographs in which a chessboard that stands still is looked for by slow ways."""
@@ -31,23 +31,23 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
     board = board_of(session)
     if board is None:
         return Boards()
-    found: dict[int, StationBoard] = {}
+    results: dict[int, StationBoard] = {}
     by_hand: dict[str, list[tuple[Path, Detection]]] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         if not station.handheld:
-            found[number] = station_board(session, board, number, images[number])
+            results[number] = station_board(session, board, number, images[number])
             continue
         # walking round a machine one does not see its board from everywhere
-        one, seen = _board_by_hand(session, board, number, images[number])
+        one, views = _board_by_hand(session, board, number, images[number])
         by_hand.setdefault(station.entry, []).append((station.photographs[0].path, one))
-        if seen is not None:
-            found[number] = seen
+        if views is not None:
+            results[number] = views
     for entry, photographs in by_hand.items():
         _check_another(board, entry, *zip(*photographs, strict=True))
-        _check_shown(entry, board, [detection for _, detection in photographs])
-    return Boards(found, session.board_body, board.tolerance)
+        _check_visible(entry, board, [detection for _, detection in photographs])
+    return Boards(results, session.board_body, board.tolerance)
 
 
 def board_of(session: Session) -> Board | None:
@@ -65,28 +65,28 @@ def station_board(
     labels = [label_of(session.folder, photo.path) for photo in station.photographs]
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
-    nowhere = not any(detection.found for detection in detections)
+    nowhere = not any(detection.success for detection in detections)
     _check_another(board, station.name, [p.path for p in station.photographs], detections)
     # A board that moves says something new in every photograph; a still one is seen enough.
     most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
     detections = detect_again(images, board, detections, most)
-    _check_shown(station.name, board, detections)
+    _check_visible(station.name, board, detections)
     rows = np.array([photo.configuration for photo in station.photographs])
-    seen = board_views(number, station.camera, rows, board, detections)
-    stood = None if moves else standing_board(seen)
+    views = board_views(number, station.camera, rows, board, detections)
+    stood = None if moves else standing_board(views)
     if not moves and stood is None:
         raise InputError(
             "no photograph shows the board well enough for its pose",
             where=f"session.yaml, stations.{station.name}",
-            found=seen.rejected[0].reason,
+            found=views.rejected[0].reason,
             expected="one at least in which the board is large, sharp and little hidden",
         )
-    return StationBoard(seen, stood)
+    return StationBoard(views, stood)
 
 
-def _check_shown(name: str, board: Board, detections: Sequence[Detection]) -> None:
+def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> None:
     """Raise `InputError` where no photograph of a station shows the board."""
-    if not any(detection.found for detection in detections):
+    if not any(detection.success for detection in detections):
         raise InputError(
             f"the board is in none of the photographs of station {name}",
             where=detections[0].name,
@@ -104,22 +104,22 @@ def _board_by_hand(
     station = session.stations[number]
     labels = [label_of(session.folder, photo.path) for photo in station.photographs]
     detections = detect_again(images, board, detect_in(images, board, labels), len(images))
-    if not detections[0].found:
+    if not detections[0].success:
         return detections[0], None
     rows = np.array([photo.configuration for photo in station.photographs])
-    seen = board_views(number, station.camera, rows, board, detections)
+    views = board_views(number, station.camera, rows, board, detections)
     if session.board_body == "platform":
-        return detections[0], StationBoard(seen, None)
-    stood = standing_board(seen)
-    return detections[0], None if stood is None else StationBoard(seen, stood)
+        return detections[0], StationBoard(views, None)
+    stood = standing_board(views)
+    return detections[0], None if stood is None else StationBoard(views, stood)
 
 
 def _check_another(
     board: Board, name: str, paths: Sequence[Path], detections: Sequence[Detection]
 ) -> None:
     """Raise `InputError` where photographs show another board, or more of it than is described."""
-    shown = np.flatnonzero([detection.found for detection in detections])
-    rows = shown if shown.size else np.arange(len(detections))
+    visible = np.flatnonzero([detection.success for detection in detections])
+    rows = visible if visible.size else np.arange(len(detections))
     few = rows[evenly(len(rows), OTHER_BOARD_TRIALS)]
     try:
         check_boards([paths[k] for k in few], [detections[k] for k in few], board)

@@ -27,26 +27,30 @@ ONLY_BOARD_MOUNT = 0
 class StationBoard:
     """The board in one station's photographs; stood : where, of a board on the base."""
 
-    seen: BoardViews
+    views: BoardViews
     stood: Standing | None
 
     @property
     def poses(self) -> PoseSet:
         """The measurements that it gives."""
         return (
-            self._moving[0] if self.stood is None else self.stood.poses(self.seen, ONLY_BOARD_MOUNT)
+            self._moving[0]
+            if self.stood is None
+            else self.stood.poses(self.views, ONLY_BOARD_MOUNT)
         )
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
         """Photographs whose board is not used."""
-        return self.seen.rejected + (self._moving[1] if self.stood is None else self.stood.rejected)
+        return self.views.rejected + (
+            self._moving[1] if self.stood is None else self.stood.rejected
+        )
 
     @cached_property
     def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
         from pkmcal.boards.poses import one_a_configuration
 
-        return one_a_configuration(self.seen, ONLY_BOARD_MOUNT)
+        return one_a_configuration(self.views, ONLY_BOARD_MOUNT)
 
 
 @dataclass(frozen=True)
@@ -77,11 +81,12 @@ class Boards:
 
     def of(self, stations: Integers) -> Boards:
         """The board in some of the stations, numbered anew in their order."""
-        kept = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
+        retained = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
         return replace(
             self,
             stations={
-                new: replace(one, seen=replace(one.seen, station=new)) for new, one in kept.items()
+                new: replace(one, views=replace(one.views, station=new))
+                for new, one in retained.items()
             },
         )
 
@@ -92,8 +97,10 @@ class Boards:
         T_camera_base = T_camera_board T_board_other T_other_base, [A] 3.3.
         """
         stood = {k: s.stood.T_camera_board for k, s in self.stations.items() if s.stood}
-        known = ((k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood)
-        T_board_base = next((inverse(stood[k]) @ T for k, T in known), None)
+        reference_values = (
+            (k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood
+        )
+        T_board_base = next((inverse(stood[k]) @ T for k, T in reference_values), None)
         if T_board_base is None:
             return list(T_camera_base)
         return [

@@ -13,28 +13,27 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.byhand import misplaced, place, without_misplaced
-from pkmcal.calibration.chance import by_chance, chance_doubt
-from pkmcal.calibration.departures import Departed, model_violations
-from pkmcal.calibration.diameters import check_radii
-from pkmcal.calibration.doubts import (
-    as_stated,
+from pkmcal.calibration.camera_refinement import CameraRefinement, refinement_of
+from pkmcal.calibration.camera_responses import overruled
+from pkmcal.calibration.case import Case, PriorScene
+from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
+from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
+from pkmcal.calibration.faults import (
     check_poses,
-    lens_told,
+    lens_notes,
     model_at_fault,
-    noise_doubt,
-    noise_told,
+    noise_fault,
+    noise_notes,
+    refit_fixed_noise,
     richer_models,
-    scale_doubt,
-    scales_told,
-    sizes_told,
+    scale_fault,
+    scale_notes,
+    size_notes,
 )
-from pkmcal.calibration.gather import CameraRefinement, refinement_of
-from pkmcal.calibration.known import KnownScene, SeenSession
-from pkmcal.calibration.model_errors import ModelError, discrepancy_findings, explains_heights
-from pkmcal.calibration.numbering import numbering_told
-from pkmcal.calibration.outvoted import outvoted
-from pkmcal.calibration.recognise import (
+from pkmcal.calibration.handheld import inconsistent_poses, localize_case, without_misplaced
+from pkmcal.calibration.image_rotation import UpsideDown, turned_round, upside_down
+from pkmcal.calibration.leg_numbering import numbering_note
+from pkmcal.calibration.localization import (
     CalibrationProgress,
     boards_of,
     check_observable,
@@ -42,14 +41,20 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
-from pkmcal.calibration.rejected import rejection_findings, unused_configurations
-from pkmcal.calibration.responses import overruled
-from pkmcal.calibration.shown import Overview, ShownCalibration
-from pkmcal.calibration.turns import Turns, identify_poses, looked_again, take_turns
-from pkmcal.calibration.upside_down import UpsideDown, turned_round, upside_down
+from pkmcal.calibration.model_violations import DetectedViolation, model_violations
+from pkmcal.calibration.outlier_explanations import outlier_explanations
+from pkmcal.calibration.refinement import (
+    RefinementResult,
+    identify_poses,
+    imputation_variance,
+    refine_alternating,
+)
+from pkmcal.calibration.rejections import rejection_findings, unused_configurations
+from pkmcal.calibration.summary import CalibrationSummary, Overview
+from pkmcal.calibration.tube_radii import check_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
-from pkmcal.files import closest, resolved, shown
-from pkmcal.identify.bundle import as_ended, bundle
+from pkmcal.files import closest, quoted, resolved
+from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import NO_RANDOM_EFFECTS, RandomEffects
@@ -57,9 +62,9 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
     explain,
+    observed_by_boards,
+    observed_legs,
     only_heights,
-    seen_legs,
-    seen_through_boards,
 )
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
@@ -73,7 +78,7 @@ from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:
-    from pkmcal.calibration.aside import LeftOut
+    from pkmcal.calibration.holdout import Holdout
     from pkmcal.identify.bed import Bed
 
 CalibrationMethod = Literal["bundle"] | PaperMethod
@@ -81,13 +86,13 @@ CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration(ShownCalibration):
+class Calibration(CalibrationSummary):
     """Everything that a calibration found.
 
     boards : the calibration board, where stations observe one. findings : what the data tell of
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
     the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
-    tells what it predicts of them. departures : what the data show that the model does not have.
+    tells what it predicts of them. violations : what the data show that the model does not have.
     model_errors : smooth errors of the model that have no name; the covariance contains them.
     upside_down : cameras whose photographs are, by which they were measured.
     photographs : of stations whose legs were observed, by their number; those that fitted into
@@ -105,8 +110,8 @@ class Calibration(ShownCalibration):
     seed: int
     timings: dict[str, float] = field(default_factory=dict)
     boards: Boards = field(default_factory=Boards)
-    holdout: LeftOut | None = None
-    departures: tuple[Departed, ...] = ()
+    holdout: Holdout | None = None
+    violations: tuple[DetectedViolation, ...] = ()
     model_errors: tuple[ModelError, ...] = ()
     upside_down: tuple[UpsideDown, ...] = ()
     photographs: Mapping[int, Sequence[Integers]] = field(
@@ -132,7 +137,7 @@ class Calibration(ShownCalibration):
             data_share=e.data_share,
             poses=e.state.T_base_platform[e.configurations],
             stations=session.station_names,
-            legs_seen=e.edge_weights.size > 0,
+            legs_observed=e.edge_weights.size > 0,
             residuals=np.concatenate([edges.ravel(), poses[e.pose_weights >= 0.5].ravel()]),
             chi2=e.statistics.chi2_as_stated,
             warnings=session.warnings,
@@ -168,10 +173,10 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, clock)
-        seen = _observe(session, seed, clock)
+        case = _observe(session, seed, clock)
 
         def calibrated(refine: bool) -> Calibration:
-            settled = settle(session, seen, refine, seed, clock)
+            settled = settle(session, case, refine, seed, clock)
             return _finished(settled, method, seed, holdout, clock)
 
         if not refine_camera or refinement_of(session, False).refines_all:
@@ -191,7 +196,7 @@ def better_refined(
     error of ``refined`` where neither ends.
     """
     try:
-        found = refined()
+        value = refined()
     except PkmcalError as error:
         try:
             other = held()
@@ -203,9 +208,9 @@ def better_refined(
         other = held()
     except PkmcalError as error:
         why = str(error).rstrip(".")
-        return _with_warning(found, note("camera.files_intrinsics_failed", why=why))
-    worse = worse_refined(found, other)
-    return _with_warning(other, worse) if worse else found
+        return _with_warning(value, note("camera.files_intrinsics_failed", why=why))
+    worse = worse_refined(value, other)
+    return _with_warning(other, worse) if worse else value
 
 
 def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
@@ -215,14 +220,14 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
     if refined.verdict.usable != held.verdict.usable:
         return None if refined.verdict.usable else doubtful("camera.refinement_refused")
     taken = refined.session.images_taken
-    kept, more = (
-        taken - sum(len(one.station.photographs) for one in found.session.rejected)
-        for found in (refined, held)
+    retained, more = (
+        taken - sum(len(one.station.photographs) for one in candidate.session.rejected)
+        for candidate in (refined, held)
     )
-    if kept != more:
-        if kept > more:
+    if retained != more:
+        if retained > more:
             return None
-        return doubtful("camera.refinement_rejects", kept=kept, of=taken, by_files=more)
+        return doubtful("camera.refinement_rejects", kept=retained, of=taken, by_files=more)
     by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
     # the mean square of n numbers that are noise has the standard deviation sqrt(2 / n)
     chance = 1 + 4 * np.sqrt(2 / max(by_refined.dof, 1.0))
@@ -235,9 +240,9 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
     return None
 
 
-def _with_warning(found: Calibration, warning: Finding) -> Calibration:
-    verdict = replace(found.verdict, findings=(warning, *found.verdict.findings))
-    return replace(found, verdict=verdict)
+def _with_warning(calibration: Calibration, warning: Finding) -> Calibration:
+    verdict = replace(calibration.verdict, findings=(warning, *calibration.verdict.findings))
+    return replace(calibration, verdict=verdict)
 
 
 def calibrate_measurements(
@@ -256,10 +261,12 @@ def calibrate_measurements(
     clock = Clock(progress)
     start = start_state(session.machine, measurements, T_camera_base)
     estimate = bundle(session.machine, measurements, start)
-    turns = Turns(observation, measurements, estimate, refinement_of(session, False), start=start)
-    known = KnownScene.as_drawn(session.machine, T_camera_base, session.joints)
-    seen = SeenSession(session, [], Boards(), known)
-    return _judge(seen, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
+    turns = RefinementResult(
+        observation, measurements, estimate, refinement_of(session, False), start=start
+    )
+    scene = PriorScene.as_drawn(session.machine, T_camera_base, session.joints)
+    case = Case(session, [], Boards(), scene)
+    return _judge(case, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -269,7 +276,7 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
         raise InputError(
             "there is no method of this name",
             where="method",
-            found=shown(method),
+            found=quoted(method),
             expected=guess or listed(CALIBRATION_METHODS),
         )
     check_number("calibrate", "seed", seed)
@@ -284,65 +291,63 @@ class Settled(NamedTuple):
     photographs are upside down, or may be. findings : notes on hypotheses that could not be tested.
     """
 
-    seen: SeenSession
-    turns: Turns
+    case: Case
+    turns: RefinementResult
     stated: Estimate
     richer: tuple[RicherModel, ...]
     turned: tuple[UpsideDown, ...]
     findings: tuple[Finding, ...] = ()
 
 
-def settle(
-    session: Session, seen: SeenSession, refine_camera: bool, seed: int, clock: Clock
-) -> Settled:
+def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: Clock) -> Settled:
     """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
     `check` ends with it.
 
-    seen : of the session. Raises `InputError` or `ResultError` where it cannot.
+    case : of the session. Raises `InputError` or `ResultError` where it cannot.
     """
-    turns = _identify(seen, refine_camera, seed, clock)
-    turned = upside_down(seen.session, turns)
+    turns = _identify(case, refine_camera, seed, clock)
+    turned = upside_down(case.session, turns)
     if sure := {one.file: one.camera for one in turned if one.sure}:
         session = turned_round(session, sure)
-        seen = _observe(session, seed, clock)
-        turns = _identify(seen, refine_camera, seed, clock)
+        case = _observe(session, seed, clock)
+        turns = _identify(case, refine_camera, seed, clock)
     # without one that was in a wrong place, another may show itself to be
-    while wrong := by_chance(seen.session, turns) or misplaced(
-        seen.session, turns.measurements, turns.estimate, seen.known.T_camera_base
+    while wrong := by_chance(case.session, turns) or inconsistent_poses(
+        case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
     ):
-        seen = without_misplaced(seen, wrong, turns.measurements.edges, turns.estimate)
-        turns = _identify(seen, refine_camera, seed, clock)
-    clock.told("Looking for mistakes that explain the data", 0.86)
-    machine = seen.session.machine
-    stated = as_stated(machine, turns.measurements, turns.estimate)
-    richer = richer_models(seen.session, turns.measurements, stated)
+        case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
+        turns = _identify(case, refine_camera, seed, clock)
+    clock.progress("Looking for mistakes that explain the data", 0.86)
+    machine = case.session.machine
+    stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
+    richer = richer_models(case.session, turns.measurements, stated)
     untested = (
-        *seen.known.findings,
+        *case.scene.findings,
         *(
             note("poses.model_failed", model.name, why=model.failure.rstrip("."))
             for model in richer
             if model.failure
         ),
-        *check_poses(seen.session, turns.measurements, stated, richer),
-        *check_radii(seen, turns.estimate, bool(chance_doubt(turns)), refine_camera, seed),
+        *check_poses(case.session, turns.measurements, stated, richer),
+        *check_radii(case, turns.estimate, bool(chance_match_reason(turns)), refine_camera, seed),
     )
-    return Settled(seen, turns, stated, richer, turned, untested)
+    return Settled(case, turns, stated, richer, turned, untested)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
     """The calibration of a settled session."""
-    seen, turns, stated, richer, turned, untested = settled
-    machine = seen.session.machine
-    turns = looked_again(seen, turns, np.random.default_rng(0), clock.told)
+    case, turns, stated, richer, turned, untested = settled
+    machine = case.session.machine
+    turns = imputation_variance(case, turns, np.random.default_rng(0), clock.progress)
     clock.lap("identify")
     if turns is not settled.turns:
-        stated = as_stated(machine, turns.measurements, turns.estimate)
+        stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
-    found = _estimated(machine, turns, richer, method, seed, holdout, clock)
-    return _judge(seen, found, turned, untested, method, seed, clock)
+    value = _estimated(machine, turns, richer, method, seed, holdout, clock)
+    return _judge(case, value, turned, untested, method, seed, clock)
 
 
 class _Identified(NamedTuple):
@@ -350,10 +355,10 @@ class _Identified(NamedTuple):
     was left out.
     """
 
-    turns: Turns
+    turns: RefinementResult
     estimate: Estimate
     richer: tuple[RicherModel, ...]
-    out: LeftOut | None
+    out: Holdout | None
 
 
 def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> Session:
@@ -368,35 +373,35 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> S
     return session
 
 
-def _observe(session: Session, seed: int, clock: Clock) -> SeenSession:
+def _observe(session: Session, seed: int, clock: Clock) -> Case:
     """Where the stations stand, by what their photographs and tables show; without photographs by
     hand that could not be placed.
     """
-    clock.told("Reading photographs", 0.0)
+    clock.progress("Reading photographs", 0.0)
     photographs = read_photographs(session)
     clock.lap("decode")
     if any("board" in station.observe for station in session.stations):
-        clock.told("Looking for the board", 0.1)
+        clock.progress("Looking for the board", 0.1)
     boards = boards_of(session, photographs)
-    seen = place(session, photographs, boards, np.random.default_rng(seed), clock.told)
+    case = localize_case(session, photographs, boards, np.random.default_rng(seed), clock.progress)
     clock.lap("observe")
-    return seen
+    return case
 
 
-def _identify(seen: SeenSession, refine_camera: bool, seed: int, clock: Clock) -> Turns:
+def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> RefinementResult:
     """The machine, in turns with looks at the edges; where there is none, diameters for radii may
     be why.
     """
-    session, cameras = seen.session, refinement_of(seen.session, refine_camera)
+    session, cameras = case.session, refinement_of(case.session, refine_camera)
     try:
-        if seen.photographs:
-            turns = take_turns(seen, cameras, clock.told, clock.lap)
+        if case.photographs:
+            turns = refine_alternating(case, cameras, clock.progress, clock.lap)
         else:
             turns = identify_poses(
-                session, seen.boards, seen.known.T_camera_base, cameras, clock.told
+                session, case.boards, case.scene.T_camera_base, cameras, clock.progress
             )
     except ResultError:
-        check_radii(seen, None, False, refine_camera, seed)
+        check_radii(case, None, False, refine_camera, seed)
         raise
     clock.lap("identify")
     return turns
@@ -404,7 +409,7 @@ def _identify(seen: SeenSession, refine_camera: bool, seed: int, clock: Clock) -
 
 def _estimated(
     drawing: Machine,
-    turns: Turns,
+    turns: RefinementResult,
     richer: tuple[RicherModel, ...],
     method: CalibrationMethod,
     seed: int,
@@ -417,23 +422,23 @@ def _estimated(
     """
     out = None
     if holdout:
-        from pkmcal.calibration.aside import LeftOut, chosen, set_aside
+        from pkmcal.calibration.holdout import Holdout, chosen, estimate_without
 
         region = chosen(drawing, turns.estimate, turns.measurements, holdout)
-        out = LeftOut(region, turns.measurements)
-        turns = set_aside(drawing, turns, region)
+        out = Holdout(region, turns.measurements)
+        turns = estimate_without(drawing, turns, region)
     estimate = turns.estimate
     if method != "bundle":
         from pkmcal.papers.methods import by_paper
 
-        clock.told("Repeating the paper's method", 0.9)
+        clock.progress("Repeating the paper's method", 0.9)
         estimate = by_paper(method, drawing, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
 
 def _judge(
-    seen: SeenSession,
-    found: _Identified,
+    case: Case,
+    value: _Identified,
     turned: tuple[UpsideDown, ...],
     untested: tuple[Finding, ...],
     method: CalibrationMethod,
@@ -441,88 +446,88 @@ def _judge(
     clock: Clock,
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
-    session = seen.session
-    clock.told("Judging", 0.95)
-    if found.turns.cameras.active:  # the edges are where these cameras see them
-        cameras = found.turns.cameras
+    session = case.session
+    clock.progress("Judging", 0.95)
+    if value.turns.cameras.active:  # the edges are where these cameras see them
+        cameras = value.turns.cameras
         refined = [
             replace(station, camera=cameras.at_station(k))
             for k, station in enumerate(session.stations)
         ]
         session = replace(session, stations=tuple(refined))
-    if sure := overruled(found.turns.responses):
-        told = [
-            replace(station, response=sure[station.entry], response_told=True)
+    if sure := overruled(value.turns.responses):
+        notes = [
+            replace(station, response=sure[station.entry], response_given=True)
             if station.entry in sure
             else station
             for station in session.stations
         ]
-        session = replace(session, stations=tuple(told))
-    ended = as_ended(found.turns.measurements, found.estimate)
-    departed: tuple[Departed, ...] = ()
+        session = replace(session, stations=tuple(notes))
+    ended = linearize_at_solution(value.turns.measurements, value.estimate)
+    detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
     uneven = NO_RANDOM_EFFECTS
-    without = found.estimate
+    without = value.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
-        turns = found.turns
-        departed, errors, estimate, uneven = model_violations(
-            session, turns.observation, turns.measurements, found.estimate, ended
+        turns = value.turns
+        detections, errors, estimate, uneven = model_violations(
+            session, turns.observation, turns.measurements, value.estimate, ended
         )
-        found = found._replace(estimate=estimate)
-    findings = _findings(found.turns.measurements, without, ended[1], uneven)
+        value = value._replace(estimate=estimate)
+    findings = _findings(value.turns.measurements, without, ended[1], uneven)
     uneven_bed = explains_heights(errors)
-    named, images = bool(departed or any(one.sure for one in errors)), found.turns.responses
+    named, images = bool(detections or any(one.sure for one in errors)), value.turns.responses
     others = (
-        *scale_doubt(session, found.estimate),
-        *(() if uneven_bed else noise_doubt(session, found.estimate)),
-        *found.turns.doubts,
-        *chance_doubt(found.turns),
-        *unused_configurations(session, found.estimate, found.out.region.rows if found.out else ()),
+        *scale_fault(session, value.estimate),
+        *(() if uneven_bed else noise_fault(session, value.estimate)),
+        *value.turns.reasons,
+        *chance_match_reason(value.turns),
+        *unused_configurations(session, value.estimate, value.out.region.rows if value.out else ()),
         *rejection_findings(
             session,
-            found.turns.measurements,
-            found.estimate,
+            value.turns.measurements,
+            value.estimate,
             findings,
             at_minimum=method == "bundle",
         ),
-        *(one.finding for one in departed),
+        *(one.finding for one in detections),
         *discrepancy_findings(errors),
-        *outvoted(session, found.turns.measurements, found.estimate),
-        *noise_told(session, found.estimate, named, explained=uneven_bed),
-        *lens_told(found.turns.cameras),
-        *sizes_told(session, found.turns.measurements, found.estimate),
-        *scales_told(session, found.estimate, tuple(x.of for x in departed)),
-        *numbering_told(session),
+        *outlier_explanations(session, value.turns.measurements, value.estimate),
+        *noise_notes(session, value.estimate, named, explained=uneven_bed),
+        *lens_notes(value.turns.cameras),
+        *size_notes(session, value.turns.measurements, value.estimate),
+        *scale_notes(session, value.estimate, tuple(x.of for x in detections)),
+        *numbering_note(session),
         *(one.finding for one in (*turned, *images)),
         *untested,
     )
     verdict = judge(
-        found.turns.observation,
-        found.estimate,
+        value.turns.observation,
+        value.estimate,
         findings,
         method,
-        richer=found.richer,
+        richer=value.richer,
         explained=uneven_bed,
         others=others,
     )
     clock.lap("identify")
     return Calibration(
         session=session,
-        observation=found.turns.observation,
-        measurements=found.turns.measurements,
-        estimate=found.estimate,
+        observation=value.turns.observation,
+        measurements=value.turns.measurements,
+        estimate=value.estimate,
         verdict=verdict,
         findings=findings,
-        cameras=found.turns.cameras,
+        cameras=value.turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
-        boards=seen.boards,
-        holdout=found.out,
-        departures=departed,
+        boards=case.boards,
+        holdout=value.out,
+        violations=detections,
         model_errors=errors,
         upside_down=tuple(one for one in turned if one.sure),
-        photographs={one.station: one.images for one in seen.photographs},
+        photographs={one.station: one.images for one in case.photographs},
     )
 
 
@@ -533,29 +538,29 @@ def _findings(
 
     info : of the estimate at its end. uneven : the model discrepancy, which bends a bed.
     """
-    seen = seen_legs(
+    observed = observed_legs(
         measurements.edges,
         estimate.edge_weights,
         measurements.n_stations,
         estimate.machine.n_legs,
     )
     if not len(measurements.edges):  # of no leg can be said that it was not seen
-        seen = np.ones_like(seen)
-    told = identifiability(info, estimate.machine)
-    counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
+        observed = np.ones_like(observed)
+    values = identifiability(info, estimate.machine)
+    counted = conditions(estimate.machine, observed) if len(measurements.edges) else ()
     bed: Bed | None = None
     if only_heights(estimate):
         from pkmcal.identify.bed import bed_of
 
         bed = bed_of(measurements, estimate, uneven)
-    return explain(told, estimate, seen_through_boards(seen, measurements), counted, bed)
+    return explain(values, estimate, observed_by_boards(observed, measurements), counted, bed)
 
 
 class Clock:
     """Seconds by step, each of which may be lapped several times; told : what is being done."""
 
     def __init__(self, progress: CalibrationProgress | None) -> None:
-        self.told: CalibrationProgress = progress or (lambda _text, _share: None)
+        self.progress: CalibrationProgress = progress or (lambda _text, _share: None)
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
 

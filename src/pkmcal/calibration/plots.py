@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.identify.found import FoundParameters
+from pkmcal.identify.parameter_estimates import ParameterEstimates
 from pkmcal.identify.tool import ToolError
 from pkmcal.wording import install_step
 
@@ -53,20 +53,20 @@ def draw_residuals(values: Array, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def parameters(found: FoundParameters, tolerance: Array, ax: Axes | None = None) -> Axes:
+def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None = None) -> Axes:
     """Each parameter's change from the drawing in its tolerances (P,), two deviations either way;
     those that a frame or the file holds are left out.
     """
-    rows = [k for k, row in enumerate(found) if row.decided_by in ("data", "drawing")]
+    rows = [k for k, row in enumerate(estimates) if row.decided_by in ("data", "drawing")]
     ax = _axes(ax, (6.0, 1.2 + PARAMETER_ROW_HEIGHT * len(rows)))
     for place, k in enumerate(rows):
-        row, size = found[k], float(tolerance[k])
+        row, size = estimates[k], float(tolerance[k])
         colour = CALIBRATED_COLOUR if row.decided_by == "data" else DRAWING_COLOUR
         reach = 2 * row.sigma / size
         ax.errorbar(row.change / size, place, xerr=reach, fmt="o", ms=3, color=colour, lw=1)
     ax.axvline(0, color=QUIET_COLOUR, linewidth=0.8)
     ax.axvspan(-1, 1, color=QUIET_COLOUR, alpha=0.12, linewidth=0)
-    ax.set_yticks(range(len(rows)), [found[k].name for k in rows], fontsize=7)
+    ax.set_yticks(range(len(rows)), [estimates[k].name for k in rows], fontsize=7)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlabel("calibrated less drawing ± 2σ, in tolerances of the drawing")
     ax.set_title("Parameters: blue by the data, brown by the drawing", fontsize=10)
@@ -76,8 +76,8 @@ def parameters(found: FoundParameters, tolerance: Array, ax: Axes | None = None)
 def tool(error: ToolError, ax: Axes | None = None) -> Axes:
     """The drawing's error and the calibrated machine's standard deviation at each pose, mm."""
     ax = _axes(ax, (6.0, 3.4))
-    known = np.flatnonzero(np.isfinite(error.position))
-    order = known[np.argsort(error.position[known])]
+    finite = np.flatnonzero(np.isfinite(error.position))
+    order = finite[np.argsort(error.position[finite])]
     place = np.arange(len(order))
     for values, colour, name in (
         (error.off_position, DRAWING_COLOUR, "the drawing's error"),

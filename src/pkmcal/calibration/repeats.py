@@ -16,14 +16,14 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
-from pkmcal.calibration.recognise import read_photographs
+from pkmcal.calibration.localization import read_photographs
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
-from pkmcal.observe.photographs import Photographs
+from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
     Groups,
@@ -38,7 +38,7 @@ from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
-CAUSE_TOLD_SHARE = 0.3
+CAUSE_NAMED_SHARE = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""
 LEGS_BETTER_SHARE = 0.1
 """Share by which each leg's own motion must explain more than one of the whole to be the cause."""
@@ -116,9 +116,9 @@ class StationScatter:
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
-        if self.legs > max(CAUSE_TOLD_SHARE, whole + LEGS_BETTER_SHARE):
+        if self.legs > max(CAUSE_NAMED_SHARE, whole + LEGS_BETTER_SHARE):
             return "legs"
-        return best if whole > CAUSE_TOLD_SHARE else "noise"
+        return best if whole > CAUSE_NAMED_SHARE else "noise"
 
 
 @dataclass(frozen=True)
@@ -156,11 +156,17 @@ def study_repeats(
     calibration = calibrate_session(session, seed=seed, progress=progress)
     session = calibration.session  # without photographs by hand that were not placed
     observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
-    looks = [_Look.of(calibration, photographs) for photographs in observed]
-    looks = [look for look in looks if np.any(look.same.count > 1)]
+    parts = [_StationEdges.of(calibration, photographs) for photographs in observed]
+    parts = [station_edges for station_edges in parts if np.any(station_edges.same.count > 1)]
     names = [station.name for station in session.stations]
-    legs = tuple(row for look in looks for row in _leg_rows(look, names[look.station]))
-    stations = tuple(_station_row(look, names[look.station]) for look in looks)
+    legs = tuple(
+        row
+        for station_edges in parts
+        for row in _leg_rows(station_edges, names[station_edges.station])
+    )
+    stations = tuple(
+        _station_row(station_edges, names[station_edges.station]) for station_edges in parts
+    )
     middle, bound = _over_legs(legs, 0.5), _over_legs(legs, 1.0)
     return RepeatStudy(legs, stations, middle, bound, _findings(stations))
 
@@ -196,7 +202,7 @@ def _sees_legs(station: Station) -> bool:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _StationEdges:
     """One station's edges, each photograph's by itself, without those that fell far off.
 
     photo : (N,) number of the photograph. same : the repeats of each edge. turn : (N, 2) of each
@@ -213,7 +219,7 @@ class _Look:
     dropped: int
 
     @classmethod
-    def of(cls, calibration: Calibration, photographs: Photographs) -> _Look:
+    def of(cls, calibration: Calibration, photographs: Photographs) -> _StationEdges:
         """Measure a station's photographs where the calibration says that the legs are."""
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration
@@ -245,22 +251,24 @@ class _Look:
         )
 
 
-def _leg_rows(look: _Look, station: str) -> list[LegScatter]:
+def _leg_rows(station_edges: _StationEdges, station: str) -> list[LegScatter]:
     """Table 1 of one station: a row for each leg that has repeats."""
-    edges = look.edges
+    edges = station_edges.edges
     pixel = pixel_units(edges)[:, 0]
-    tilt = look.turn[:, 1] * half_angles(edges, look.cylinders)
-    pixels = _pooled(np.stack([look.turn[:, 0], tilt], axis=1) / pixel[:, None], look.same)
-    promised = _pooled(look.turn / _stated(look), look.same)
-    rows, axes = _axis_scatter(look)
-    leg = edges.leg[look.same.first]
+    tilt = station_edges.turn[:, 1] * half_angles(edges, station_edges.cylinders)
+    pixels = _pooled(
+        np.stack([station_edges.turn[:, 0], tilt], axis=1) / pixel[:, None], station_edges.same
+    )
+    promised = _pooled(station_edges.turn / _stated(station_edges), station_edges.same)
+    rows, axes = _axis_scatter(station_edges)
+    leg = edges.leg[station_edges.same.first]
     out: list[LegScatter] = []
-    for j in np.unique(leg[look.same.count > 1]):
+    for j in np.unique(leg[station_edges.same.count > 1]):
         mine = leg == j
         psi, theta, x, z = (float(v) for v in _deviation(axes, rows == j))
         shift, tilts = (float(v) for v in _deviation(pixels, mine))
         ratio = rms(_deviation(promised, mine))
-        count = len(np.unique(look.photo[edges.leg == j]))
+        count = len(np.unique(station_edges.photo[edges.leg == j]))
         freedom = count - len(np.unique(edges.configuration[edges.leg == j]))
         row = (station, int(j) + 1, psi, theta, x, z, shift, tilts, ratio, count, freedom)
         out.append(LegScatter(*row))
@@ -286,72 +294,83 @@ def _deviation(pooled: _Pooled, mine: Booleans) -> Array:
     return np.sqrt(pooled.squares[mine].sum(axis=0) / (freedom if freedom else np.nan))
 
 
-def _stated(look: _Look) -> Array:
+def _stated(station_edges: _StationEdges) -> Array:
     """Standard deviations (N, 2) that each edge's own photograph promises, mean over repeats."""
-    mean = look.same.mean(look.edges.covariance[:, [0, 1], [0, 1]])
-    return np.sqrt(mean)[look.same.member]
+    mean = station_edges.same.mean(station_edges.edges.covariance[:, [0, 1], [0, 1]])
+    return np.sqrt(mean)[station_edges.same.member]
 
 
-def _whiten(look: _Look) -> Array:
+def _whiten(station_edges: _StationEdges) -> Array:
     """Inverse roots (N, 2, 2) of the edges' stated covariances, the same for all repeats of one."""
-    stated = look.same.mean(look.edges.covariance)[look.same.member]
+    stated = station_edges.same.mean(station_edges.edges.covariance)[station_edges.same.member]
     return np.linalg.inv(np.linalg.cholesky(stated))
 
 
-def _axis_scatter(look: _Look) -> tuple[Integers, _Pooled]:
+def _axis_scatter(station_edges: _StationEdges) -> tuple[Integers, _Pooled]:
     """The axes' psi, theta, x, z in every photograph: the leg of each configuration, and sums.
 
     An axis is fitted to all edges of the leg, of all of its tubes, weighted as the calibration
     weights them; one that shows a single side has none.
     """
-    edges, legs = look.edges, look.cylinders
-    seen = groups_of(look.photo, edges.leg)
-    fit = fit_motions(look.turn, by_ends(edges, look.basis, legs), _whiten(look), seen)
-    change = axis_coordinates(fit.motion, legs.a[seen.first], legs.b[seen.first])
-    sides = seen.total(edges.side[:, None] == np.array([0, 1]))
+    edges, legs = station_edges.edges, station_edges.cylinders
+    in_view = groups_of(station_edges.photo, edges.leg)
+    fit = fit_motions(
+        station_edges.turn,
+        by_ends(edges, station_edges.basis, legs),
+        _whiten(station_edges),
+        in_view,
+    )
+    change = axis_coordinates(fit.motion, legs.a[in_view.first], legs.b[in_view.first])
+    sides = in_view.total(edges.side[:, None] == np.array([0, 1]))
     whole = np.flatnonzero((sides > 0).all(axis=1))
-    first = seen.first[whole]
+    first = in_view.first[whole]
     repeats = groups_of(edges.configuration[first], edges.leg[first])
     return edges.leg[first][repeats.first], _pooled(change[whole], repeats)
 
 
-def _station_row(look: _Look, station: str) -> StationScatter:
+def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
     """Scatter over all legs of a station, and what motion explains it."""
-    edges, same, legs = look.edges, look.same, look.cylinders
+    edges, same, legs = station_edges.edges, station_edges.same, station_edges.cylinders
     every = np.ones(len(same.first), dtype=bool)
-    shift = _deviation(_pooled(look.turn[:, :1] / pixel_units(edges)[:, :1], same), every)
-    promised = _deviation(_pooled(look.turn / _stated(look), same), every)
-    ends = by_ends(edges, look.basis, legs)
-    photo = groups_of(look.photo)
+    shift = _deviation(_pooled(station_edges.turn[:, :1] / pixel_units(edges)[:, :1], same), every)
+    promised = _deviation(_pooled(station_edges.turn / _stated(station_edges), same), every)
+    ends = by_ends(edges, station_edges.basis, legs)
+    photo = groups_of(station_edges.photo)
     return StationScatter(
         station=station,
         photographs=len(photo.first),
         configurations=len(np.unique(edges.configuration[same.first[same.count > 1]])),
         shift=float(shift[0]),
         promised=rms(promised),
-        camera=_explained(look, by_camera(ends, legs), photo),
-        platform=_explained(look, by_platform(ends, legs), photo),
-        legs=_explained(look, ends, groups_of(look.photo, edges.leg)),
-        dropped=look.dropped,
+        camera=_explained(station_edges, by_camera(ends, legs), photo),
+        platform=_explained(station_edges, by_platform(ends, legs), photo),
+        legs=_explained(station_edges, ends, groups_of(station_edges.photo, edges.leg)),
+        dropped=station_edges.dropped,
     )
 
 
-def _explained(look: _Look, rows: Array, groups: Groups) -> float:
+def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> float:
     """Share of the squared scatter that motions of groups explain: 0 as by chance, 1 all.
 
     rows : (N, 2, p) turn of the edges by a group's motion. What chance explains is found by
     exchanging the repeats of every edge by itself, which leaves its scatter and parts it from
     the other edges'. Two edges of a leg look like a motion of it however they scatter.
     """
-    whiten, rng = _whiten(look), np.random.default_rng(0)
+    whiten, rng = _whiten(station_edges), np.random.default_rng(0)
 
     def share(turn: Array) -> float:
         fit = fit_motions(turn, rows, whiten, groups)
         return float(fit.explained.sum() / max(fit.total.sum(), 1e-300))
 
-    shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(REPEAT_SHUFFLES)]
+    shuffled = [
+        share(station_edges.turn[station_edges.same.exchanged(rng)]) for _ in range(REPEAT_SHUFFLES)
+    ]
     chance = float(np.mean(shuffled))
-    return (share(look.turn) - chance) / (1 - chance) if chance < MOST_EXPLAINED_BY_CHANCE else 0.0
+    return (
+        (share(station_edges.turn) - chance) / (1 - chance)
+        if chance < MOST_EXPLAINED_BY_CHANCE
+        else 0.0
+    )
 
 
 @dataclass(frozen=True)
@@ -415,9 +434,9 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
-    seen = values > _RANK * values[:, -1:]
+    visible = values > _RANK * values[:, -1:]
     along = (axes.mT @ right[..., None])[..., 0]
-    along = np.where(seen, along / np.where(seen, values, 1.0), 0.0)
+    along = np.where(visible, along / np.where(visible, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]
     return MotionFit(motion, dot(motion, right), groups.total(dot(white, white)))
 
@@ -447,8 +466,8 @@ def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
 
     def quantile(name: str) -> float:
         column = np.array([getattr(row, name) for row in rows])
-        known = column[np.isfinite(column)]
-        return float(np.quantile(known, share)) if known.size else float("nan")
+        finite = column[np.isfinite(column)]
+        return float(np.quantile(finite, share)) if finite.size else float("nan")
 
     return LegScatter(
         station="",
@@ -496,10 +515,10 @@ def _mm(value: float) -> str:
 
 def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
     """What each station's repeats show, and what more of them would bring."""
-    found = [_finding(station) for station in stations] or [doubtful("repeats.none")]
+    results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
     if stations and all(station.promised < MOSTLY_COMMON for station in stations):
-        found.append(note("repeats.mostly_common"))
-    return tuple(found)
+        results.append(note("repeats.mostly_common"))
+    return tuple(results)
 
 
 def _finding(station: StationScatter) -> Finding:

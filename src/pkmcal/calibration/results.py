@@ -2,7 +2,7 @@
 
 calibration.json holds everything that a calibration found, in SI units, in the frames that
 ``gauge`` names; without dates, so that the same session gives the same file but for its timings.
-:mod:`pkmcal.calibration.saved` reads it back.
+:mod:`pkmcal.calibration.saved_calibration` reads it back.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import mechanism_text
+from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, digests, session_digest
-from pkmcal.session.photographs import label_of
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
 
     Only a new or empty folder, or an earlier result, is written to: a session's own
     mechanism.yaml must not be lost to its calibrated one. Returns the files of that result, which
-    is kept beside its place (:mod:`pkmcal.calibration.kept`) unless ``force`` replaces it.
+    is kept beside its place (:mod:`pkmcal.calibration.archive`) unless ``force`` replaces it.
     """
     folder = Path(folder)
     check_writable(folder)
@@ -163,7 +163,7 @@ def calibration_document(
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.findings.bed
-    seen = digests(session) if photographs is None else photographs
+    in_view = digests(session) if photographs is None else photographs
     document = {
         FORMAT_KEY: CALIBRATION_FORMAT,
         "conventions": CALIBRATION_CONVENTIONS,
@@ -180,7 +180,7 @@ def calibration_document(
         "station_covariance": _station_covariance(calibration),
         "targets": _targets(calibration),
         "cameras": _cameras(calibration),
-        "configurations": _configurations(calibration, seen),
+        "configurations": _configurations(calibration, in_view),
         "statistics": asdict(estimate.statistics),
         "edge_noise": _edge_noise(estimate),
         "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
@@ -192,10 +192,10 @@ def calibration_document(
         "mechanism": estimate.machine.to_document(),
         "session": {
             "folder": resolved(session.folder).name,
-            "digest": session_digest(session, seen),
+            "digest": session_digest(session, in_view),
             **session.document,
         },
-        "departures": [one.document() for one in calibration.departures],
+        "departures": [one.document() for one in calibration.violations],
         "model_errors": [one.document() for one in calibration.model_errors],
         "warnings": session.warnings,
         "versions": versions(),
@@ -208,8 +208,8 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
     """One entry for each tube of a leg, from 1: what its edges scatter by."""
     if not estimate.edge_weights.size:
         return []
-    found = estimate.edge_noise
-    rows = zip(found.scale, found.shading, found.tails, strict=True)
+    value = estimate.edge_noise
+    rows = zip(value.scale, value.shading, value.dof, strict=True)
     return [
         {"tube": k, "scale": scale, "shading": shading, "tails": tails}
         for k, (scale, shading, tails) in enumerate(rows, start=1)
@@ -219,13 +219,13 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
 @cache
 def versions() -> Mapping[str, str]:
     """Versions of pkmcal, Python and the packages that numbers depend on."""
-    found = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
+    results = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
     for name in PACKAGES_WITH_VERSION:
         try:
-            found[name] = version(name)
+            results[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return results
 
 
 def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
@@ -238,12 +238,12 @@ def identifiability_of(findings: Findings) -> dict[str, Any]:
 
     moves_platform : m, root mean square over the platform's joints and poses.
     """
-    told = findings.told
+    ranks = findings.identifiability
     return {
-        "rank": told.rank,
-        "n_parameters": told.n_parameters,
-        "n_frames": told.n_frames,
-        "singular_values": told.singular_values,
+        "rank": ranks.rank,
+        "n_parameters": ranks.n_parameters,
+        "n_frames": ranks.n_frames,
+        "singular_values": ranks.singular_values,
         "moves_platform_by_drawing": findings.by_drawing,
         "unidentified": [asdict(sentence) for sentence in findings.unidentified],
         "weak": [asdict(sentence) for sentence in findings.weak],
@@ -263,7 +263,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     for s, (name, file, number, response) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
-        known = _sigma_where_identified(estimate, covariance)
+        reference_values = _sigma_where_identified(estimate, covariance)
         out.append(
             {
                 "name": name,
@@ -271,8 +271,8 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
                 "response": response,
                 "binning": None if response is None else calibration.observation.binning[s],
                 "T_base_camera": inverse(T_camera_base),
-                "sigma_rotation": known[:3],
-                "sigma_translation": known[3:],
+                "sigma_rotation": reference_values[:3],
+                "sigma_translation": reference_values[3:],
                 "photographs": number,
                 **_focal_scale(calibration, s),
             }
@@ -289,13 +289,13 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     nowhere = {station.name for station in session.stations if station.handheld}
     nowhere |= {table.name for table in session.trackers if table.kind == Heights.code}
     names = session.station_names
-    kept = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
+    retained_rows = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
-    rows = rows_of_stations(n, kept)
+    rows = rows_of_stations(n, retained_rows)
     joint = of_inverse_poses(
-        estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[kept]
+        estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[retained_rows]
     )
-    return {"stations": [names[k] for k in kept], "rows": joint[n:]}
+    return {"stations": [names[k] for k in retained_rows], "rows": joint[n:]}
 
 
 def rows_of_stations(n: int, stations: Integers) -> Integers:
@@ -321,7 +321,7 @@ def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
     if number >= len(cameras.breathes) or not cameras.breathes[number]:
         return {}
     return {
-        "focal_scale": 1 + BREATHING_SIGMA * cameras.moved(estimate).breath[number],
+        "focal_scale": 1 + BREATHING_SIGMA * cameras.updated(estimate).breath[number],
         "sigma_focal_scale": BREATHING_SIGMA * estimate.breathing_sigma[number],
     }
 
@@ -337,15 +337,15 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
             value, deviation = next(sizes)
             size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"
-        known = _sigma_where_identified(estimate, estimate.mount_covariance[m])
+        reference_values = _sigma_where_identified(estimate, estimate.mount_covariance[m])
         out.append(
             {
                 "name": mount.name,
                 **size,
                 "fixed_to": body,
                 f"T_{body}_target": estimate.state.T_mount[m],
-                "sigma_rotation": known[:3],
-                "sigma_translation": known[3:],
+                "sigma_rotation": reference_values[:3],
+                "sigma_translation": reference_values[3:],
             }
         )
     return out
@@ -354,8 +354,8 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
 def _sigma_where_identified(estimate: Estimate, covariance: Array) -> list[float | None]:
     """Standard deviations of a pose's six numbers, None where the data do not determine them."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    known = identified(estimate.machine, covariance)
-    return [x if sure else None for x, sure in zip(sigma, known, strict=True)]
+    reference = identified(estimate.machine, covariance)
+    return [x if sure else None for x, sure in zip(sigma, reference, strict=True)]
 
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
@@ -410,16 +410,16 @@ def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
 
 
 def _configurations(
-    calibration: Calibration, seen: Mapping[str, Sequence[str]]
+    calibration: Calibration, in_view: Mapping[str, Sequence[str]]
 ) -> list[dict[str, Any]]:
-    """Poses of all configurations; those not used have theirs from the readings alone. seen : the
-    photographs' digests.
+    """Poses of all configurations; those not used have theirs from the readings alone. in_view :
+    the photographs' digests.
     """
     session, estimate = calibration.session, calibration.estimate
     return [
         {
             "name": name,
-            "photographs": seen.get(name, []),
+            "photographs": in_view.get(name, []),
             "used": bool(estimate.configurations[k]),
             "joints": session.joints[k],
             "joint_residuals": np.round(estimate.joint_residuals[k], 4),

@@ -105,12 +105,12 @@ class ToolMap:
 def _summary(position: Array, orientation: Array) -> dict[str, Any]:
     """Medians and largest, None where nothing is known."""
     parts = {"position": position, "orientation": orientation}
-    known = {name: values[np.isfinite(values)] for name, values in parts.items()}
+    finite = {name: values[np.isfinite(values)] for name, values in parts.items()}
     return {
         name: {"median": float(np.median(values)), "worst": float(values.max())}
         if values.size
         else None
-        for name, values in known.items()
+        for name, values in finite.items()
     }
 
 
@@ -120,11 +120,11 @@ def map_of(
     covariance: Array,
     region: Region | None = None,
     *,
-    legs_seen: bool = True,
+    legs_observed: bool = True,
 ) -> ToolMap:
     """The map of a region, the whole reach unless given.
 
-    covariance : (P, P) of the calibrated parameters, in any frames. legs_seen : see
+    covariance : (P, P) of the calibrated parameters, in any frames. legs_observed : see
     :func:`~pkmcal.identify.tool.tool_error`; without legs the frames are those that fit the evenly
     spread poses best. Raises InputError where the machine can take no pose of the region.
     """
@@ -140,7 +140,7 @@ def map_of(
         calibrated,
         free_of_gauge(calibrated, covariance),
         poses,
-        legs_seen=legs_seen,
+        legs_observed=legs_observed,
         fitted=np.arange(len(even)),
     )
     before = replace(after, parameters=free_of_gauge(calibrated, root @ root.T))
@@ -152,9 +152,13 @@ def of_calibration(calibration: Calibration) -> ToolMap:
     none.
     """
     estimate, session = calibration.estimate, calibration.session
-    seen = estimate.edge_weights.size > 0
+    in_view = estimate.edge_weights.size > 0
     return map_of(
-        session.machine, estimate.machine, estimate.covariance, session.workspace, legs_seen=seen
+        session.machine,
+        estimate.machine,
+        estimate.covariance,
+        session.workspace,
+        legs_observed=in_view,
     )
 
 

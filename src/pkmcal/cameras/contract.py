@@ -70,7 +70,7 @@ ring turned by a hair, pixels that are square to a thousandth, a sensor that is 
 its lens, and the distortion of most lenses."""
 
 
-class LensDeparture(NamedTuple):
+class LensViolation(NamedTuple):
     """How a camera may be another than its file says, by k numbers.
 
     columns : (n, k) change of its parameters by them. usual : their standard deviation where nobody
@@ -108,8 +108,8 @@ class Camera(ABC):
 
     def __repr__(self) -> str:
         width, height = self.image_size
-        told = zip(self.parameter_names, self.parameters.tolist(), strict=True)
-        numbers = ", ".join(f"{name} {value:.6g}" for name, value in told if value)
+        values = zip(self.parameter_names, self.parameters.tolist(), strict=True)
+        numbers = ", ".join(f"{name} {value:.6g}" for name, value in values if value)
         return f"<{type(self).__name__} {width} × {height}: {numbers}>"
 
     @abstractmethod
@@ -128,8 +128,10 @@ class Camera(ABC):
         the points.
         """
         by_point = self.project_jacobians(points)[0]
-        moved = (of_components(*(dot(by_point[..., k, :], d) for k in (0, 1))) for d in directions)
-        return self.project(points), *moved
+        shifted = (
+            of_components(*(dot(by_point[..., k, :], d) for k in (0, 1))) for d in directions
+        )
+        return self.project(points), *shifted
 
     @abstractmethod
     def ray(self, pixels: Array) -> Array:
@@ -177,20 +179,22 @@ class Camera(ABC):
         """(n,) change of the parameters when fx / fy grows by its own size and their geometric mean
         stays.
         """
-        way = [{"focal.x": 0.5, "focal.y": -0.5}.get(name, 0.0) for name in self.parameter_names]
-        return np.array(way) * self.parameters
+        direction = [
+            {"focal.x": 0.5, "focal.y": -0.5}.get(name, 0.0) for name in self.parameter_names
+        ]
+        return np.array(direction) * self.parameters
 
-    def departures(self) -> tuple[LensDeparture, ...]:
+    def violations(self) -> tuple[LensViolation, ...]:
         """What is wrong first, where anything is: focus, pixels that are not as square as stated,
         the picture cut otherwise, a lens whose distortion was left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
         return (
-            LensDeparture("focal", self.focal_part[:, None], USUAL_FOCAL),
-            LensDeparture("aspect", self.aspect_part[:, None], USUAL_ASPECT),
-            LensDeparture("centre", eye[:, 2:4], USUAL_CENTRE * self.image_size[0]),
-            LensDeparture(
+            LensViolation("focal", self.focal_part[:, None], USUAL_FOCAL),
+            LensViolation("aspect", self.aspect_part[:, None], USUAL_ASPECT),
+            LensViolation("centre", eye[:, 2:4], USUAL_CENTRE * self.image_size[0]),
+            LensViolation(
                 "distortion",
                 eye[:, lens : lens + 1],
                 USUAL_DISTORTION,
@@ -200,7 +204,7 @@ class Camera(ABC):
 
     def usual_covariance(self) -> Array:
         """(n, n) of the parameters where no calibration tells it: of what departs first."""
-        parts = [part.usual * part.columns for part in self.departures()]
+        parts = [part.usual * part.columns for part in self.violations()]
         columns = np.concatenate(parts, axis=1)
         return columns @ columns.T
 

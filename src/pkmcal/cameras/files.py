@@ -18,8 +18,8 @@ from pkmcal.files import (
     Document,
     closest,
     parse_yaml,
+    quoted,
     read_text,
-    shown,
     validated_document,
     yaml_text,
 )
@@ -99,7 +99,7 @@ def camera_from_document(document: Document) -> Camera:
         raise InputError(
             "the camera sees nothing in the middle of its image",
             where=document.label,
-            found=f"image_size {shown(list(camera.image_size))}, and lens numbers by which no ray"
+            found=f"image_size {quoted(list(camera.image_size))}, and lens numbers by which no ray"
             " of light ends there",
             expected="focal, center and distortion of images of this size",
         )
@@ -190,7 +190,7 @@ def _from_opencv(text: str, label: str) -> Camera:
 
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        found: dict[str, Any] = {
+        results: dict[str, Any] = {
             key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
         }
         flag = storage.getNode("fisheye_model")
@@ -203,24 +203,24 @@ def _from_opencv(text: str, label: str) -> Camera:
             next_step="Write it again with cv2.FileStorage",
         ) from None
     for key in ("matrix", "width", "height"):
-        if found[key] is None:
+        if results[key] is None:
             raise InputError(
                 f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
             )
     for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
-        values = found[key]
+        values = results[key]
         if values is not None and (len(values) != count or not np.all(np.isfinite(values))):
             raise InputError(
                 f"the camera's {key} is not what it should be",
                 where=f"{label}, {_OPENCV_NAMES[key][0]}",
-                found=shown(values.tolist()),
+                found=quoted(values.tolist()),
                 expected=count_of(count, "finite number"),
             )
-    size = (round(float(found["width"][0])), round(float(found["height"][0])))
-    k = found["distortion"] if found["distortion"] is not None else np.zeros(0)
-    xi = found["xi"]
+    size = (round(float(results["width"][0])), round(float(results["height"][0])))
+    k = results["distortion"] if results["distortion"] is not None else np.zeros(0)
+    xi = results["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
-    return _made(model, size, found["matrix"], k, None if xi is None else float(xi[0]), label)
+    return _made(model, size, results["matrix"], k, None if xi is None else float(xi[0]), label)
 
 
 def _word(storage: Any) -> str:
@@ -262,8 +262,8 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 def _from_ros(document: Document) -> Camera:
     word = document.data.get("distortion_model", "plumb_bob")
     if not isinstance(word, str) or word not in _ROS:
-        found = word if isinstance(word, str) else shown(word)
-        raise _not_ours(document.where("distortion_model"), found, _ROS)
+        value = word if isinstance(word, str) else quoted(word)
+        raise _not_ours(document.where("distortion_model"), value, _ROS)
     size = _size(document, ("image_width",), ("image_height",))
     matrix = _numbers(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
@@ -318,8 +318,8 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     data = document.data[key]
     pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:
-        known = ["-".join(names) for names in _KALIBR]
-        raise _not_ours(document.where(key, "camera_model"), "-".join(pair), known)
+        reference_values = ["-".join(names) for names in _KALIBR]
+        raise _not_ours(document.where(key, "camera_model"), "-".join(pair), reference_values)
     model = _KALIBR[pair]
     count = 5 if model == "unified" else 4
     values = _numbers(document, (key, "intrinsics"), (count,))
@@ -371,9 +371,9 @@ def _made(
             f"{m[0, 0]:g} at a width of {size[0]}",
         ),
     )
-    for wrong, what, found in faults:
+    for wrong, what, item in faults:
         if wrong:
-            raise InputError(f"the camera has {what}", where=where, found=found)
+            raise InputError(f"the camera has {what}", where=where, found=item)
     fields: dict[str, Any] = {
         "model": model,
         "image_size": list(size),
@@ -421,7 +421,7 @@ def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -
     raise InputError(
         "this is not the list of numbers that it should be",
         where=document.where(*keys),
-        found=shown(values),
+        found=quoted(values),
         expected=f"{wanted} numbers",
     )
 
@@ -436,18 +436,18 @@ def _size(
             raise InputError(
                 "this is no size in pixels",
                 where=document.where(*keys),
-                found=shown(value),
+                found=quoted(value),
                 expected="a whole number above 0",
             )
         out.append(value)
     return out[0], out[1]
 
 
-def _not_ours(where: str, found: str, known: Any) -> InputError:
+def _not_ours(where: str, text: str, reference_values: Any) -> InputError:
     return InputError(
         "this model of camera or lens is not known here",
         where=where,
-        found=found,
-        expected=listed(list(known)),
+        found=text,
+        expected=listed(list(reference_values)),
         next_step="Calibrate again from photographs of a board: pkmcal camera",
     )

@@ -91,13 +91,13 @@ def in_pixels(parameters: Array, good: Booleans, distorted: Array) -> Array:
         )
 
 
-def moved_in_pixels(parameters: Array, moved: Sequence[Array], by_xy: Array | None) -> Array:
+def moved_in_pixels(parameters: Array, shifted: Sequence[Array], by_xy: Array | None) -> Array:
     """How pixels move (..., 2) as the undistorted x and y (...) do; by_xy : the derivative of
     :func:`distort` there, None where the lens has none.
     """
-    x, y = moved
+    x, y = shifted
     if by_xy is not None:
-        x, y = (by_xy[..., k, 0] * moved[0] + by_xy[..., k, 1] * moved[1] for k in (0, 1))
+        x, y = (by_xy[..., k, 0] * shifted[0] + by_xy[..., k, 1] * shifted[1] for k in (0, 1))
     focal = parameters[:2].tolist()
     return of_components(focal[0] * x, focal[1] * y)
 
@@ -124,8 +124,8 @@ def _undistort_radially(target: Array, k: Array) -> Array:
     while last < fold and last * _radial(last**2, k) < farthest:
         last *= 2
     radius = np.linspace(0.0, min(last, fold), _TABLE)
-    found = np.interp(distance, radius * _radial(radius**2, k), radius)
-    scale = np.where(distance > 0, found / np.where(distance > 0, distance, 1.0), 1.0)
+    values = np.interp(distance, radius * _radial(radius**2, k), radius)
+    scale = np.where(distance > 0, values / np.where(distance > 0, distance, 1.0), 1.0)
     return target * scale[..., None]
 
 
@@ -176,12 +176,12 @@ class Pinhole(Camera):
         """All from one pass through the lens, if there is one."""
         good, z, xy, distorted, by_xy = self._imaged(points)
         z = np.where(good, z, np.nan)
-        moved: list[Array] = []
+        shifted: list[Array] = []
         for d in directions:
             # x/z and y/z move by (dx - x/z dz) / z
             own = [(d[..., k] - xy[..., k] * d[..., 2]) / z for k in (0, 1)]
-            moved.append(moved_in_pixels(self.parameters, own, by_xy))
-        return in_pixels(self.parameters, good, distorted), *moved
+            shifted.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *shifted
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.check.forecast import Forecast, LegForecast
-from pkmcal.check.look import Look, StationLook
+from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_REACH_INSIDE, SATURATED_GREY_LEVEL
@@ -43,12 +43,17 @@ ONE_LEGEND = (
 )
 
 
-def advice(look: Look, forecast: Forecast | None) -> tuple[Finding, ...]:
+def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
     """Advice, the most useful first."""
-    out = [*_second_place(forecast), *_from_one_side(look), *_hidden(look), *_slim(look)]
+    out = [
+        *_second_place(forecast),
+        *_from_one_side(inspection),
+        *_hidden(inspection),
+        *_slim(inspection),
+    ]
     if forecast is not None:
-        for station, edges in zip(look.stations, forecast.edges, strict=True):
-            out += _lost(look, station, edges)
+        for station, edges in zip(inspection.stations, forecast.edges, strict=True):
+            out += _lost(inspection, station, edges)
     return tuple(out)
 
 
@@ -66,22 +71,22 @@ def _second_place(forecast: Forecast | None) -> list[Finding]:
     ]
 
 
-def _from_one_side(look: Look) -> list[Finding]:
+def _from_one_side(inspection: Inspection) -> list[Finding]:
     """Whether the stations look along nearly the same line.
 
     What one camera sees badly, along its line of sight, another sees by the sine of the angle
     between the two.
     """
-    cameras = [station.photographs.camera for station in look.stations]
+    cameras = [station.photographs.camera for station in inspection.stations]
     if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC_HALF_VIEW for camera in cameras):
         return []
-    centres = look.session.machine.base_centers()
-    middle = np.concatenate([centres, look.poses[:, :3, 3]]).mean(axis=0)
-    eyes = inverse(np.stack([station.found for station in look.stations]))[:, :3, 3]
-    way = (middle - eyes) / np.linalg.norm(middle - eyes, axis=-1, keepdims=True)
-    sine = np.linalg.norm(np.cross(way[:, None], way), axis=-1)
+    centres = inspection.session.machine.base_centers()
+    middle = np.concatenate([centres, inspection.poses[:, :3, 3]]).mean(axis=0)
+    eyes = inverse(np.stack([station.T_camera_base for station in inspection.stations]))[:, :3, 3]
+    direction = (middle - eyes) / np.linalg.norm(middle - eyes, axis=-1, keepdims=True)
+    sine = np.linalg.norm(np.cross(direction[:, None], direction), axis=-1)
     if (
-        not all(station.recognised for station in look.stations)
+        not all(station.recognised for station in inspection.stations)
         or sine.max() * ADVICE_WORTH_FACTOR > 1
     ):
         return []
@@ -89,16 +94,16 @@ def _from_one_side(look: Look) -> list[Finding]:
     return [note("images.one_side", degrees=angle)]
 
 
-def _hidden(look: Look) -> list[Finding]:
+def _hidden(inspection: Inspection) -> list[Finding]:
     """Legs that no station sees well."""
-    seen = [station for station in look.stations if station.quality is not None]
-    if not seen or len(seen) < len(look.stations):
+    in_view = [station for station in inspection.stations if station.quality is not None]
+    if not in_view or len(in_view) < len(inspection.stations):
         return []
-    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in seen if s.quality is not None])
+    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in in_view if s.quality is not None])
     best = np.argmin(np.nan_to_num(hidden, nan=np.inf), axis=0)
     least = hidden[best, np.arange(hidden.shape[1])]
     out: list[Finding] = []
-    for s, station in enumerate(seen):
+    for s, station in enumerate(in_view):
         bad = np.flatnonzero((least > INFORMATION_LOST_SHARE) & (best == s))
         if not bad.size:
             continue
@@ -109,17 +114,17 @@ def _hidden(look: Look) -> list[Finding]:
                 legs=named(bad),
                 number=bad.size,
                 share=float(least[bad].mean()),
-                station=station.name if len(seen) > 1 else None,
+                station=station.name if len(in_view) > 1 else None,
             )
         )
     return out
 
 
-def _slim(look: Look) -> list[Finding]:
+def _slim(inspection: Inspection) -> list[Finding]:
     """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
-    tubes, least = tubes_of(look.session.machine), 2 * PROFILE_REACH_INSIDE
+    tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_REACH_INSIDE
     out: list[Finding] = []
-    for station in look.stations:
+    for station in inspection.stations:
         if station.quality is None:
             continue
         width = 2 * station.quality.half_width
@@ -135,26 +140,28 @@ def _slim(look: Look) -> list[Finding]:
     return out
 
 
-def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[Finding]:
+def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) -> list[Finding]:
     """Why edges that ought to be seen are lost, where these are many."""
-    expected, lost = int(edges.expected.sum()), edges.expected & ~edges.found
+    expected, lost = int(edges.expected.sum()), edges.expected & ~edges.valid
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
         return []
     level, behind = (
         part[edges.photographs] for part in (station.quality.level, station.quality.behind)
     )
     contrast = np.abs(level - behind)
-    usual = contrast[edges.found & np.isfinite(contrast)]
+    usual = contrast[edges.valid & np.isfinite(contrast)]
     usual = float(np.median(usual)) if usual.size else math.nan
-    known = lost & np.isfinite(contrast)
+    finite = lost & np.isfinite(contrast)
     brighter = np.fmax(level, behind)
     kinds = {"white": brighter >= SATURATED_GREY_LEVEL, "black": brighter <= BLACK_GREY_LEVEL}
     kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
-    number = {name: int(np.sum(known & of)) for name, of in kinds.items()}
+    number = {name: int(np.sum(finite & of)) for name, of in kinds.items()}
     kind = max(number, key=lambda name: number[name])
-    tubes = tubes_of(look.session.machine)
-    by_leg = [int((lost[:, tubes.leg == j]).sum()) for j in range(look.session.machine.n_legs)]
+    tubes = tubes_of(inspection.session.machine)
+    by_leg = [
+        int((lost[:, tubes.leg == j]).sum()) for j in range(inspection.session.machine.n_legs)
+    ]
     worst = np.flatnonzero(np.array(by_leg) > 2 * lost.sum() / len(by_leg))
     at: dict[str, Any] = {
         "station": station.name,
@@ -163,13 +170,13 @@ def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[Finding]:
         "number": worst.size,
     }
     if kind == "faint":
-        faint = contrast[known & kinds["faint"]]
+        faint = contrast[finite & kinds["faint"]]
         at |= {"contrast": float(np.median(faint)) if faint.size else 0.0, "usual": usual}
         at["sheet"] = _sheet(station)
     return [note(f"images.lost_{kind}", station.name, **at)]
 
 
-def _sheet(station: StationLook) -> str:
+def _sheet(station: StationInspection) -> str:
     """Before which the darker and the brighter legs stand out more, those that do least."""
     if station.quality is None:
         return "white"
@@ -180,20 +187,20 @@ def _sheet(station: StationLook) -> str:
 # ------------------------------------------------------------------ the forecast
 
 
-def forecast_figure(told: Forecast) -> Figure:
+def forecast_figure(forecast: Forecast) -> Figure:
     """The card."""
     return Figure(
-        f"What would {told.photographs} such photographs a station give?",
-        ((brief(told.position * 1e3), "mm"), (brief(math.degrees(told.orientation)), "°")),
+        f"What would {forecast.photographs} such photographs a station give?",
+        ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
         "1σ of the platform's pose at given readings, mean over the joints' ranges",
     )
 
 
-def forecast_part(told: Forecast) -> Part:
+def forecast_part(forecast: Forecast) -> Part:
     """What a capture would give, and which legs tell it."""
-    stations = tuple(dict.fromkeys(leg.station for leg in told.legs))
-    numbers = tuple(dict.fromkeys(leg.leg for leg in told.legs))
-    by = {(leg.station, leg.leg): leg for leg in told.legs}
+    stations = tuple(dict.fromkeys(leg.station for leg in forecast.legs))
+    numbers = tuple(dict.fromkeys(leg.leg for leg in forecast.legs))
+    by = {(leg.station, leg.leg): leg for leg in forecast.legs}
     total = {j: sum(by[s, j].tells for s in stations) for j in numbers}
     mean = sum(total.values()) / len(total)
     poor = [j for j in numbers if total[j] < POOR_LEG * mean]
@@ -201,7 +208,7 @@ def forecast_part(told: Forecast) -> Part:
     details = Table(
         "By station and leg",
         ("Station, leg", *columns),
-        tuple(Row(f"{leg.station}, {leg.leg}", _cells(leg)) for leg in told.legs),
+        tuple(Row(f"{leg.station}, {leg.leg}", _cells(leg)) for leg in forecast.legs),
         note=" ".join(ONE_LEGEND),
         brief=False,
         folded=True,
@@ -209,7 +216,7 @@ def forecast_part(told: Forecast) -> Part:
     if len(stations) == 1:
         rows = tuple(
             Row(str(leg.leg), _cells(leg), mark=Level.NOTE if leg.leg in poor else "good")
-            for leg in told.legs
+            for leg in forecast.legs
         )
         tables = (Table("", ("Leg", *columns), rows, " ".join(ONE_LEGEND), legend=ONE_LEGEND),)
     else:
@@ -226,7 +233,7 @@ def forecast_part(told: Forecast) -> Part:
             for j in numbers
         )
         together = [sum(by[s, j].tells for j in numbers) for s in stations]
-        variance = sum(leg.variance for leg in told.legs)
+        variance = sum(leg.variance for leg in forecast.legs)
         all_ = Row(
             "all", tuple(_part(x) for x in (*together, sum(together), variance)), mark="good"
         )
@@ -235,23 +242,31 @@ def forecast_part(told: Forecast) -> Part:
             "", head, (*rows, all_), " ".join(EDGE_SHARES_LEGEND), legend=EDGE_SHARES_LEGEND
         )
         tables = (shares, details)
-    return Part("forecast", "What a full capture would give", said=_said(told, poor), tables=tables)
+    return Part(
+        "forecast",
+        "What a full capture would give",
+        terminal_text=_forecast_lines(forecast, poor),
+        tables=tables,
+    )
 
 
-def _said(told: Forecast, poor: list[int]) -> tuple[str, ...]:
+def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """The forecast, and the legs that tell least, with what is the matter with them."""
-    photographs = sum(len(edges.photographs) for edges in told.edges)
+    photographs = sum(len(edges.photographs) for edges in forecast.edges)
     out = [
-        f"{told.photographs} such photographs a station, over the joints' ranges, would tell the"
-        f" platform's position to {brief(told.position * 1e3)} mm and its orientation to"
-        f" {brief(math.degrees(told.orientation))}° (standard deviations at given readings, by the"
+        f"{forecast.photographs} such photographs a station, over the joints' ranges, would"
+        " tell the"
+        f" platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
+        f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given"
+        " readings, by the"
         f" edges of {count(photographs, 'photograph')}). Of its variance"
-        f" {sum(leg.variance for leg in told.legs):.0%} comes from the edges,"
-        f" {told.readings:.0%} from the readings, {told.drawing:.0%} from what is known beforehand,"
+        f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
+        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is"
+        " known beforehand,"
         " of the drawing and of shading."
     ]
     for j in poor:
-        mine = [leg for leg in told.legs if leg.leg == j]
+        mine = [leg for leg in forecast.legs if leg.leg == j]
         why: list[str] = []
         for leg in mine:
             if leg.seen < 1 - INFORMATION_LOST_SHARE:

@@ -19,25 +19,25 @@ from threadpoolctl import threadpool_limits
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.stations import board_of, station_board
 from pkmcal.boards.views import Boards, StationBoard
-from pkmcal.calibration.byhand import Localization, localize
 from pkmcal.calibration.calibrate import CalibrationProgress, Clock, Settled, settle
-from pkmcal.calibration.departures import model_violations
-from pkmcal.calibration.doubts import turning
-from pkmcal.calibration.gather import measurements_of
-from pkmcal.calibration.known import SeenSession
-from pkmcal.calibration.model_errors import discrepancy_findings, explains_heights
-from pkmcal.calibration.numbering import numbering_told
-from pkmcal.calibration.recognise import (
+from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.case import Case
+from pkmcal.calibration.discrepancy_basis import discrepancy_findings, explains_heights
+from pkmcal.calibration.faults import turning
+from pkmcal.calibration.handheld import Localization, localize
+from pkmcal.calibration.leg_numbering import numbering_note
+from pkmcal.calibration.localization import (
     board_images,
     check_observable,
     legs_stations,
     platform_poses,
 )
+from pkmcal.calibration.model_violations import model_violations
 from pkmcal.check.advice import advice
-from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck
 from pkmcal.check.forecast import forecast
-from pkmcal.check.look import Look, StationLook
-from pkmcal.check.words import (
+from pkmcal.check.inspection import Inspection, StationInspection
+from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck
+from pkmcal.check.sentences import (
     board_findings,
     joint_findings,
     link_findings,
@@ -45,18 +45,18 @@ from pkmcal.check.words import (
 )
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
-from pkmcal.observe.images import KEPT_PHOTOGRAPH_BYTES, Pictures, decode
-from pkmcal.observe.photographs import Photographs
+from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
-from pkmcal.observe.stations import FoundStation
+from pkmcal.observe.station_localization import LocalizedPose
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
+from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station, load_session
-from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
@@ -80,30 +80,30 @@ def check_session(
         return _check(Path(folder), seed, progress or (lambda _text, _share: None))
 
 
-def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
+def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionCheck:
     """:func:`check_session`, step by step."""
-    told("Reading the session", 0.0)
+    progress("Reading the session", 0.0)
     findings = [*untouched_files(folder)]
     try:
         session = load_session(folder)
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    told("Reading photographs", 0.1)
+    progress("Reading photographs", 0.1)
     photographs, broken = _decoded(session)
-    told("Recognising the machine", 0.4)
+    progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
-    seen = _observed(session, photographs, motion.poses, seed, told)
-    stations, joints = seen.stations, joint_checks(session)
-    findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
+    in_view = _observed(session, photographs, motion.poses, seed, progress)
+    stations, joints = in_view.stations, joint_checks(session)
+    findings += [*broken, *motion.findings, *in_view.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
-    findings += numbering_told(session)
-    told("What such photographs will give", 0.8)
+    findings += numbering_note(session)
+    progress("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
     expected = None
-    if seen.look and not by_hand:
+    if in_view.inspection and not by_hand:
         try:
-            expected = forecast(seen.look)
+            expected = forecast(in_view.inspection)
         except (PkmcalError, np.linalg.LinAlgError) as error:
             findings.append(note("images.no_forecast", why=str(error).rstrip(".")))
     for station in stations:
@@ -119,8 +119,8 @@ def _check(folder: Path, seed: int, told: CalibrationProgress) -> SessionCheck:
         singularity=motion.singularity,
         assemblies=motion.assemblies,
         forecast=expected,
-        advice=advice(seen.look, expected) if seen.look else (),
-        look=seen.look,
+        advice=advice(in_view.inspection, expected) if in_view.inspection else (),
+        look=in_view.inspection,
     )
 
 
@@ -139,14 +139,14 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
     """Each station's photographs of legs; those that cannot be decoded are findings."""
     out: list[Photographs | None] = []
     findings: list[Finding] = []
-    room = KEPT_PHOTOGRAPH_BYTES
+    room = CACHED_IMAGE_BYTES
     for number, station in enumerate(session.stations):
         if "legs" not in station.observe:  # decoded one by one where the board is looked for
             out.append(None)
             continue
         rows: list[int] = []
         files: list[tuple[Path, str]] = []
-        kept: dict[int, Integers] = {}
+        cache: dict[int, Integers] = {}
         broken = 0
         for photo in station.photographs:
             label = label_of(session.folder, photo.path)
@@ -158,7 +158,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
                     findings.append(of_error(error, station=station.name))
                 continue
             if image.size <= room:
-                kept[len(rows)], room = image, room - image.size
+                cache[len(rows)], room = image, room - image.size
             rows.append(photo.configuration)
             files.append((photo.path, label))
         if broken > BROKEN_PHOTOGRAPHS_NAMED:
@@ -166,7 +166,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
             findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
-                          [label for _, label in files], kept)  # fmt: skip
+                          [label for _, label in files], cache)  # fmt: skip
         whole = Photographs(
             number, station.camera, at, session.joints[at], images, station.response,
             legs.first_binning(station.camera.image_size),
@@ -201,7 +201,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     """Whether the drawing's machine closes at all readings, and how well it is held there."""
     try:
         poses = platform_poses(session, most=not legs_stations(session))
-        found = session.machine.forward_result(session.joints, poses)
+        fk = session.machine.forward_result(session.joints, poses)
         first = session.joints[0]
         if session.machine.layout.overdetermined:  # with errors they close in no pose
             first = session.machine.inverse(poses[0])
@@ -209,7 +209,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     except PkmcalError as error:
         return _Motion(None, math.nan, 0, (of_error(error),))
     findings: list[Finding] = []
-    weak = [session.configurations[k] for k in np.flatnonzero(found.singularity < NEAR_SINGULAR)]
+    weak = [session.configurations[k] for k in np.flatnonzero(fk.singularity < NEAR_SINGULAR)]
     if weak:
         findings.append(doubtful("configurations.singular_readings", listed(weak), names=weak))
     turns = np.linalg.norm(pose_difference(modes, poses[0])[:, :3], axis=-1)
@@ -217,15 +217,15 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
         turn = float(np.rad2deg(turns[turns > 1e-3].min()))
         first_name = session.configurations[0]
         findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
-    return _Motion(poses, float(found.singularity.min()), len(modes), tuple(findings))
+    return _Motion(poses, float(fk.singularity.min()), len(modes), tuple(findings))
 
 
 class _Observed(NamedTuple):
-    """look : None where the machine could not be looked for."""
+    """inspection : None where the machine could not be looked for."""
 
     stations: tuple[StationCheck, ...]
     findings: tuple[Finding, ...]
-    look: Look | None = None
+    inspection: Inspection | None = None
 
 
 def _observed(
@@ -240,10 +240,10 @@ def _observed(
 
     def unlooked() -> tuple[StationCheck, ...]:
         """Stations in which the machine could not even be looked for."""
-        n_legs, found = session.machine.n_legs, zip(session.stations, photographs, strict=True)
+        n_legs, value = session.machine.n_legs, zip(session.stations, photographs, strict=True)
         return tuple(
             _summary(station, unrecognised_quality(p.images if p else [], n_legs), recognised=False)
-            for station, p in found
+            for station, p in value
         )
 
     try:
@@ -273,8 +273,8 @@ def _observed(
         settled = located.result
     elif not lost and not any(finding.level is Level.WRONG for finding in turns):
         settled = _settled(session, located.result, seed, progress)
-    kept = located.result if not isinstance(settled, Settled) else settled.seen
-    rejected = () if isinstance(kept, PkmcalError) else kept.session.rejected
+    retained = located.result if not isinstance(settled, Settled) else settled.case
+    rejected = () if isinstance(retained, PkmcalError) else retained.session.rejected
     findings = [
         *([_refused(settled)] if isinstance(settled, PkmcalError) else []),
         *boards.findings,
@@ -288,12 +288,12 @@ def _observed(
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
-    places = _found_places(session, whole, located)
+    places = _search_results(session, whole, located)
     # one on a tripod was recognised all the same, and its quality tells why it may be left out
     gone = {one.station.name for one in rejected if one.station.handheld}
-    if isinstance(kept, PkmcalError):  # of photographs by hand none was placed then
+    if isinstance(retained, PkmcalError):  # of photographs by hand none was placed then
         gone = {station.name for station in session.stations if station.handheld}
-    looks: list[StationLook] = []
+    parts: list[StationInspection] = []
     for p in whole:
         if p.station not in places:  # another station's fault came first
             summary = unrecognised_quality(p.images, session.machine.n_legs)
@@ -301,20 +301,20 @@ def _observed(
             continue
         place = places[p.station]
         recognised = place.good and stations[p.station].name not in gone
-        stations[p.station], look = _station(session, p, place, poses, recognised)
-        looks.append(look)
+        stations[p.station], station_edges = _station(session, p, place, poses, recognised)
+        parts.append(station_edges)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
-    look = Look(session, poses, tuple(looks)) if looks else None
-    return _Observed(stations, tuple(findings), look)
+    station_edges = Inspection(session, poses, tuple(parts)) if parts else None
+    return _Observed(stations, tuple(findings), station_edges)
 
 
 def _settled(
-    session: Session, seen: SeenSession, seed: int, progress: CalibrationProgress
+    session: Session, case: Case, seed: int, progress: CalibrationProgress
 ) -> Settled | PkmcalError:
     """Where `calibrate` begins, or why it would not."""
     clock = Clock(lambda text, share: progress(text, 0.4 + 0.4 * share))
     try:
-        return settle(session, seen, False, seed, clock)
+        return settle(session, case, False, seed, clock)
     except PkmcalError as error:
         return error
 
@@ -326,16 +326,20 @@ def _refused(error: PkmcalError) -> Finding:
     return of_error(error, Level.WRONG if error.exit_code > 1 else Level.DOUBTFUL)
 
 
-def _found_places(
+def _search_results(
     session: Session, photographs: list[Photographs], located: Localization
-) -> dict[int, FoundStation]:
+) -> dict[int, LocalizedPose]:
     """Where the search for each station ended, by its number; without those not searched."""
     fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
-    found = located.recognition.found if located.recognition else ()
-    places = dict(zip(fixed, found, strict=bool(found)))
+    results = located.recognition.localizations if located.recognition else ()
+    places = dict(zip(fixed, results, strict=bool(results)))
     for k, one in located.places.items():  # what chance is to others, another place is to one alone
-        places[k] = FoundStation(
-            one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True
+        places[k] = LocalizedPose(
+            one.T_camera_base[0],
+            math.nan,
+            float(one.log_likelihood_ratio[0]),
+            one.rival_probability,
+            has_prior=True,
         )
     return places
 
@@ -343,15 +347,15 @@ def _found_places(
 def _station(
     session: Session,
     photographs: Photographs,
-    pose: FoundStation,
+    pose: LocalizedPose,
     poses: Array,
     recognised: bool,
-) -> tuple[StationCheck, StationLook]:
+) -> tuple[StationCheck, StationInspection]:
     """One station in which the machine was looked for."""
     station, machine = session.stations[photographs.station], session.machine
-    found, by_hand = pose.T_camera_base, station.T_camera_base
+    value, by_hand = pose.T_camera_base, station.T_camera_base
     what = (
-        quality(photographs, machine, found, poses[photographs.configuration])
+        quality(photographs, machine, value, poses[photographs.configuration])
         if recognised
         else unrecognised_quality(photographs.images, machine.n_legs)
     )
@@ -361,11 +365,11 @@ def _station(
         by_chance=pose.by_chance,
     )
     if recognised and by_hand is not None:
-        change = pose_difference(inverse(found), inverse(by_hand))
-        moved, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
-        summary = replace(summary, moved=moved, turned=turned)
-    return summary, StationLook(
-        station.name, photographs, by_hand, found, what if recognised else None
+        change = pose_difference(inverse(value), inverse(by_hand))
+        shifted, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
+        summary = replace(summary, moved=shifted, turned=turned)
+    return summary, StationInspection(
+        station.name, photographs, by_hand, value, what if recognised else None
     )
 
 
@@ -407,42 +411,42 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
         return BoardsCheck(findings=(of_error(error),))
     if board is None:
         return BoardsCheck()
-    found: dict[int, StationBoard] = {}
+    results: dict[int, StationBoard] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         try:
-            found[number] = station_board(session, board, number, images[number])
+            results[number] = station_board(session, board, number, images[number])
         except InputError as error:
             findings.append(of_error(error, station=station.name))
-    checks = {number: _board_check(one) for number, one in found.items()}
+    checks = {number: _board_check(one) for number, one in results.items()}
     for number, check in checks.items():
         findings += board_findings(session, number, check)
-    boards = Boards(found, session.board_body, board.tolerance)
+    boards = Boards(results, session.board_body, board.tolerance)
     return BoardsCheck(boards, checks, tuple(findings))
 
 
 def _unseen(one: StationBoard) -> str:
     """The outer row or column that is never seen though all others are."""
-    board = one.seen.board
+    board = one.views.board
     if board.type == "aruco_grid":
         return ""
-    seen = one.seen.views.seen.any(axis=0).reshape(board.counts[::-1])
+    views = one.views.views.visible.any(axis=0).reshape(board.counts[::-1])
     for name, axis, at in (("row", 0, 0), ("row", 0, -1), ("column", 1, 0), ("column", 1, -1)):
-        if not np.take(seen, at, axis).any() and np.delete(seen, at, axis).all():
+        if not np.take(views, at, axis).any() and np.delete(views, at, axis).all():
             return f"the {'first' if at == 0 else 'last'} {name}"
     return ""
 
 
 def _board_check(one: StationBoard) -> BoardCheck:
-    seen, stood = one.seen, one.stood
+    views, stood = one.views, one.stood
     return BoardCheck(
-        found=len(seen.shown),
-        corners=float(seen.views.seen.sum(axis=1).mean()),
-        corners_of=len(seen.board.points),
-        rms=float(np.median(seen.rms)),
+        found=len(views.numbers),
+        corners=float(views.views.visible.sum(axis=1).mean()),
+        corners_of=len(views.board.points),
+        rms=float(np.median(views.rms)),
         scatter=stood.scatter if stood else math.nan,
-        distance=float(np.median(np.linalg.norm(seen.poses.T_camera_board[:, :3, 3], axis=-1))),
+        distance=float(np.median(np.linalg.norm(views.poses.T_camera_board[:, :3, 3], axis=-1))),
         unseen=_unseen(one),
     )
 
@@ -452,7 +456,7 @@ def _board_check(one: StationBoard) -> BoardCheck:
 
 def joint_checks(session: Session) -> tuple[JointCheck, ...]:
     """All joints' readings."""
-    found: list[JointCheck] = []
+    names: list[JointCheck] = []
     for k, name in enumerate(session.document["joints"]["columns"]):
         values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
         stroke = high - low
@@ -461,8 +465,8 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
             int(np.sum(values > high - STROKE_END_SHARE * stroke)),
         )
         used = float(np.ptp(values) / stroke)
-        found.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
-    return tuple(found)
+        names.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
+    return tuple(names)
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
@@ -478,7 +482,7 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
 
 def _verdict_of_poses(settled: Settled) -> list[Finding]:
     """Whether the mechanism, its parameters adjusted, explains the poses that were measured."""
-    if settled.seen.session.heights_alone:
+    if settled.case.session.heights_alone:
         return _verdict_of_heights(settled)
     return _unexplained_poses(settled)
 
@@ -486,17 +490,17 @@ def _verdict_of_poses(settled: Settled) -> list[Finding]:
 def _verdict_of_heights(settled: Settled) -> list[Finding]:
     """The model violations and the uneven bed that `calibrate` will find."""
     turns = settled.turns
-    found = model_violations(
-        settled.seen.session,
+    value = model_violations(
+        settled.case.session,
         turns.observation,
         turns.measurements,
         turns.estimate,
-        as_ended(turns.measurements, turns.estimate),
+        linearize_at_solution(turns.measurements, turns.estimate),
     )
     return [
-        *(replace(one.finding, level=Level.DOUBTFUL) for one in found.departures),
-        *discrepancy_findings(found.errors),
-        *([] if explains_heights(found.errors) else _unexplained_poses(settled)),
+        *(replace(one.finding, level=Level.DOUBTFUL) for one in value.violations),
+        *discrepancy_findings(value.errors),
+        *([] if explains_heights(value.errors) else _unexplained_poses(settled)),
     ]
 
 

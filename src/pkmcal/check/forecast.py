@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, numbered
-from pkmcal.check.look import Look
+from pkmcal.check.inspection import Inspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
@@ -75,38 +75,40 @@ class Forecast:
     edges: tuple[EdgesOf, ...] = ()
 
 
-def forecast(look: Look, photographs: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
+def forecast(
+    inspection: Inspection, photographs: int = CONFIGURATIONS_A_CAPTURE
+) -> Forecast | None:
     """The forecast from the first photographs; None where the machine was not recognised in all.
 
     By the legs alone, whatever boards and trackers say besides. Raises a `PkmcalError` or a
     `LinAlgError` where these photographs do not carry one.
     """
-    machine, stations = look.session.machine, look.stations
+    machine, stations = inspection.session.machine, inspection.stations
     whole = bool(stations) and all(station.recognised for station in stations)
     # where hinges turn is not known where nothing was measured
     if not whole or machine.layout.n_internal:
         return None
     first = first_edges(
-        look.session,
+        inspection.session,
         [station.photographs for station in stations],
-        look.measured,
-        np.stack([station.found for station in stations]),
-        look.poses,
+        inspection.measured,
+        np.stack([station.T_camera_base for station in stations]),
+        inspection.poses,
     )
-    capture = _planned(look, first, photographs)
-    told = _told(capture)
+    capture = _planned(inspection, first, photographs)
+    information = _capture_information(capture)
     second = np.nan
     one = stations[0].photographs
     if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
-        second = _told(_two_places(capture)).position
+        second = _capture_information(_two_places(capture)).position
     return Forecast(
         photographs=photographs,
-        position=told.position,
-        orientation=told.orientation,
-        readings=told.readings,
-        drawing=told.drawing,
+        position=information.position,
+        orientation=information.orientation,
+        readings=information.readings,
+        drawing=information.drawing,
         second=second,
-        legs=_by_leg(look, first, told),
+        legs=_by_leg(inspection, first, information),
         edges=first.edges,
     )
 
@@ -120,23 +122,23 @@ class _Capture(NamedTuple):
     pairs: Integers
 
 
-class _Told(NamedTuple):
-    """What a capture tells of the platform; tells, variance : (S, L)."""
+class _CaptureInformation(NamedTuple):
+    """What a capture tells of the platform; share, variance : (S, L)."""
 
     position: float
     orientation: float
-    tells: Array
+    share: Array
     variance: Array
     readings: float
     drawing: float
 
 
-def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
+def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
     """Configurations over the joints' ranges, as many extreme ones among them as so far."""
-    machine, stations = first.estimate.machine, look.stations
+    machine, stations = first.estimate.machine, inspection.stations
     low, high = machine.joint_ranges.T
     margin = NEAR_END * (high - low)
-    joints = look.session.joints
+    joints = inspection.session.joints
     ends = np.all((joints < low + margin) | (joints > high - margin), axis=1)
     rows = [set(s.photographs.configuration.tolist()) for s in stations]
     shared = len(rows) > 1 and len(set.union(*rows)) < sum(map(len, rows)) / 2
@@ -146,16 +148,16 @@ def _planned(look: Look, first: FirstEdges, photographs: int) -> _Capture:
     number = np.arange(photographs)
     pairs = [all_pairs([s], number + (0 if shared else photographs * s)) for s in range(len(rows))]
     T_camera_base = first.estimate.state.T_camera_base
-    seen = zip(stations, T_camera_base, first.pools, strict=True)
+    in_view = zip(stations, T_camera_base, first.pools, strict=True)
     rig = Rig(
         machine,
         tuple(station.name for station in stations),
         T_camera_base,
-        numbered(look.session.camera_of_station[[s.photographs.station for s in stations]]),
-        look.session.joint_noise,
+        numbered(inspection.session.camera_of_station[[s.photographs.station for s in stations]]),
+        inspection.session.joint_noise,
         tuple(
             LegsFrom(k, s.photographs.camera, T, pools, s.photographs.binning)
-            for k, (s, T, pools) in enumerate(seen)
+            for k, (s, T, pools) in enumerate(in_view)
         ),
         shading=first.estimate.statistics.shading,
     )
@@ -181,7 +183,7 @@ def _two_places(capture: _Capture) -> _Capture:
     return capture._replace(rig=both, pairs=pairs)
 
 
-def _told(capture: _Capture) -> _Told:
+def _capture_information(capture: _Capture) -> _CaptureInformation:
     """What a capture tells of the platform.
 
     With N = sum of N_g the information of all groups of rows (legs at stations, readings, drawing)
@@ -197,8 +199,8 @@ def _told(capture: _Capture) -> _Told:
     assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)
     problem = assembled.problem
     info = Information(problem, at_truth)
-    seen = np.flatnonzero(assembled.seen)
-    poses, joints = capture.T_base_platform[seen], capture.joints[seen]
+    observed = np.flatnonzero(assembled.observed)
+    poses, joints = capture.T_base_platform[observed], capture.joints[observed]
     by = tool_by_free(rig, problem, joints, poses)
     machine_part = problem.unknowns.machine
     spread = by @ info.covariance[0][machine_part]  # (K, 6, na)
@@ -208,7 +210,7 @@ def _told(capture: _Capture) -> _Told:
     part = np.sum((rows @ place.T) ** 2, axis=-1)  # (K, r)
     prior = float(np.sum((info.linear.shared_by @ place.T) ** 2))
     tolerance = machine.parameters.tolerances_free()
-    told = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
+    values = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
     at = assembled.places.edges
 
     def by_leg(of_rows: Array) -> Array:
@@ -217,36 +219,38 @@ def _told(capture: _Capture) -> _Told:
         np.add.at(out, (edges.station, edges.leg), own)
         return out
 
-    share, tells = by_leg(part), by_leg(told)
+    share, shares = by_leg(part), by_leg(values)
     readings = float(part[:, problem.closure_rows].sum())
     whole = float(share.sum()) + readings + prior
-    return _Told(
+    return _CaptureInformation(
         position=float(np.sqrt(variance[:, 3:].sum(axis=1)).mean()),
         orientation=float(np.sqrt(variance[:, :3].sum(axis=1)).mean()),
-        tells=tells / tells.sum(),
+        share=shares / shares.sum(),
         variance=share / whole,
         readings=readings / whole,
         drawing=prior / whole,
     )
 
 
-def _by_leg(look: Look, first: FirstEdges, told: _Told) -> tuple[LegForecast, ...]:
-    tubes, out = tubes_of(look.session.machine), list[LegForecast]()
-    for s, (station, edges) in enumerate(zip(look.stations, first.edges, strict=True)):
+def _by_leg(
+    inspection: Inspection, first: FirstEdges, information: _CaptureInformation
+) -> tuple[LegForecast, ...]:
+    tubes, out = tubes_of(inspection.session.machine), list[LegForecast]()
+    for s, (station, edges) in enumerate(zip(inspection.stations, first.edges, strict=True)):
         hidden = station.quality.hidden.mean(axis=0) if station.quality else None
         for j in np.unique(tubes.leg):
             mine = tubes.leg == j
             expected = int(edges.expected[:, mine].sum())
-            found = int(edges.found[:, mine].sum())
+            value = int(edges.valid[:, mine].sum())
             out.append(
                 LegForecast(
                     station=station.name,
                     leg=int(j) + 1,
                     seen=float("nan") if hidden is None else float(1 - hidden[j]),
-                    found=found / expected if expected else float("nan"),
+                    found=value / expected if expected else float("nan"),
                     sigma=float(first.sigma[s, j]),
-                    tells=float(told.tells[s, j]),
-                    variance=float(told.variance[s, j]),
+                    tells=float(information.share[s, j]),
+                    variance=float(information.variance[s, j]),
                 )
             )
     return tuple(out)

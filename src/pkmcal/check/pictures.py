@@ -15,12 +15,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.check.look import Look, StationLook
+from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.files import place_below, staged_folder
 from pkmcal.outcome import Part
 from pkmcal.pages import page
-from pkmcal.pages.drawn import Drawn, Picture, Spot, machine_laid_over
 from pkmcal.pages.jpegs import jpeg
+from pkmcal.pages.overlays import Drawn, Picture, Spot, machine_laid_over
 from pkmcal.pages.page import N_COLOURS
 
 DRAWN_PIXEL_BINARY_DIGITS = 4
@@ -31,24 +31,26 @@ PANE_GAP = 6
 """Pixels between the two."""
 
 
-def with_pictures(look: Look) -> Part:
+def with_pictures(inspection: Inspection) -> Part:
     """The page's section: the stations' first photographs, each by every pose that there is."""
     pairs: list[tuple[Picture, ...]] = []
-    for station in look.stations:
+    for station in inspection.stations:
         for k in station.few():
             configuration = int(station.photographs.configuration[k])
-            photo = look.session.stations[station.photographs.station].photographs[k]
+            photo = inspection.session.stations[station.photographs.station].photographs[k]
             width, height = station.photographs.camera.image_size
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
-            for said, T_camera_base in poses_of(station):
+            for text, T_camera_base in poses_of(station):
                 eye = station.photographs.camera
-                edges, spots = drawing_over_photograph(look, station, eye, T_camera_base, int(k))
+                edges, spots = drawing_over_photograph(
+                    inspection, station, eye, T_camera_base, int(k)
+                )
                 pictures.append(
                     Picture(
                         station=station.name,
-                        configuration=look.session.configurations[configuration],
-                        why=said,
+                        configuration=inspection.session.configurations[configuration],
+                        why=text,
                         width=width,
                         height=height,
                         jpeg=shot,
@@ -58,73 +60,75 @@ def with_pictures(look: Look) -> Part:
                     )
                 )
             pairs.append(tuple(pictures))
-    html = page.filled_template("overlay.html.j2", n_legs=look.session.machine.n_legs, pairs=pairs)
+    html = page.filled_template(
+        "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
+    )
     return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
 
 
-def poses_of(station: StationLook) -> tuple[tuple[str, Array], ...]:
+def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
     """The poses, T_camera_base, by which the drawing is laid over, each with its name; first that
     by hand.
     """
     after = "pose found" if station.recognised else "best pose found, not recognised"
     by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
-    return *by_hand, (after, station.found)
+    return *by_hand, (after, station.T_camera_base)
 
 
 def drawing_over_photograph(
-    look: Look, station: StationLook, camera: Camera, T_camera_base: Array, k: int
+    inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
     joint centres. camera : the station's, or that of binned photographs.
     """
     configuration = int(station.photographs.configuration[k])
     return machine_laid_over(
-        look.session.machine,
+        inspection.session.machine,
         camera,
         T_camera_base,
-        look.session.joints[configuration],
-        look.poses[configuration],
+        inspection.session.joints[configuration],
+        inspection.poses[configuration],
     )
 
 
 # ------------------------------------------------------------------ as files
 
 
-def picture_names(look: Look) -> dict[tuple[int, int], str]:
+def picture_names(inspection: Inspection) -> dict[tuple[int, int], str]:
     """File names by station and photograph."""
     out: dict[tuple[int, int], str] = {}
-    for s, station in enumerate(look.stations):
-        photographs = look.session.stations[station.photographs.station].photographs
+    for s, station in enumerate(inspection.stations):
+        photographs = inspection.session.stations[station.photographs.station].photographs
         for k in range(len(photographs)):
             out[s, k] = re.sub(r"[/\\]", "-", f"{station.name}-{photographs[k].path.stem}.png")
     return out
 
 
-def write_pictures(look: Look, folder: Path) -> None:
+def write_pictures(inspection: Inspection, folder: Path) -> None:
     """All photographs as PNG, by hand to the left and as found to the right; all or none."""
     import cv2
 
     with staged_folder(folder) as stage:
-        for (s, k), name in picture_names(look).items():
-            done, packed = cv2.imencode(".png", picture(look, look.stations[s], k))
+        for (s, k), name in picture_names(inspection).items():
+            done, packed = cv2.imencode(".png", picture(inspection, inspection.stations[s], k))
             if not done:
                 raise OSError(f"{name} could not be encoded as PNG")
             place_below(stage, name).write_bytes(packed.tobytes())
 
 
-def picture(look: Look, station: StationLook, k: int) -> Any:
+def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
     """Photograph k in colour, (h, w, 3) uint8, blue first as cv2 has it."""
     import cv2
 
-    name = look.session.configurations[int(station.photographs.configuration[k])]
+    name = inspection.session.configurations[int(station.photographs.configuration[k])]
     small = station.photographs.select(np.array([k])).binned()
     panes: list[Any] = []
-    for said, T_camera_base in poses_of(station):
+    for words, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(small.images[0]), cv2.COLOR_GRAY2BGR)
-        edges, spots = drawing_over_photograph(look, station, small.camera, T_camera_base, k)
+        edges, spots = drawing_over_photograph(inspection, station, small.camera, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
-        text = f"{station.name} / {name}: {said}"
+        text = f"{station.name} / {name}: {words}"
         cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
         panes.append(np.concatenate([bar, pane]))
     gap = np.full((len(panes[0]), PANE_GAP, 3), 32, dtype=np.uint8)
@@ -169,6 +173,6 @@ def leg_colours() -> tuple[tuple[int, int, int], ...]:
     """What the page's style sheet gives legs on photographs: it stands once, there."""
     style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
     (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
-    found = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
-    numbers = [int(found[str(k + 1)], 16) for k in range(N_COLOURS)]
+    results = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
+    numbers = [int(results[str(k + 1)], 16) for k in range(N_COLOURS)]
     return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

@@ -54,8 +54,8 @@ def calibrate(
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
+    from pkmcal.calibration.archive import keep_earlier
     from pkmcal.calibration.calibrate import calibrate_session as run
-    from pkmcal.calibration.kept import keep_earlier
     from pkmcal.calibration.results import check_output
     from pkmcal.files import default_output, output_lock
     from pkmcal.report.calibration import outcome_of
@@ -68,23 +68,25 @@ def calibrate(
     loaded = load_session(session, model)
     folder = out or default_output(loaded.folder / "calibration")
     check_output(folder, force=force)
-    with console.progress(quiet or as_json) as told:
-        found = run(
+    with console.progress(quiet or as_json) as progress:
+        value = run(
             loaded,
             method=method,
             seed=seed,
             refine_camera=refine_camera,
             holdout=holdout,
-            progress=told,
+            progress=progress,
         )
-        told("Writing the report", 0.97)
-        outcome = outcome_of(found)
+        progress("Writing the report", 0.97)
+        outcome = outcome_of(value)
         with output_lock(folder):  # another run may have written there meanwhile
             over = check_output(folder, force=force)
-            kept = None if force else keep_earlier(folder, outcome.texts)
+            archive_folder = None if force else keep_earlier(folder, outcome.texts)
             write_outcome(outcome, folder, CALIBRATION_FILES, over)
         files = dict(CALIBRATION_FILES)
         if rrd is not None:
-            write_rrd(found, rrd)
+            write_rrd(value, rrd)
             files[str(rrd.absolute())] = "rerun opens it"
-    return answer(outcome, folder, files, kept=kept, as_json=as_json, quiet=quiet)
+    return answer(
+        outcome, folder, files, archive_folder=archive_folder, as_json=as_json, quiet=quiet
+    )

@@ -71,11 +71,11 @@ def camera(
     described = load_board(board or there)
     check_writable(default_output(out) if out == CAMERA_FOLDER else out)
     others = [(OTHER_CAMERA_FILES[form.value], form.value) for form in to or []]
-    with console.progress(as_json) as told:
-        told(f"Looking for the board in {len(paths)} photographs", 0.1)
-        found = calibrate_photographs(paths, described, model)
-        told("Writing the report", 0.9)
-        outcome = outcome_of(found, paths, others)
+    with console.progress(as_json) as progress:
+        progress(f"Looking for the board in {len(paths)} photographs", 0.1)
+        calibration = calibrate_photographs(paths, described, model)
+        progress("Writing the report", 0.9)
+        outcome = outcome_of(calibration, paths, others)
     files = {**CAMERA_FILES, **{name: "for that program" for name, _ in others}}
     outcome = replace(outcome, summary={**outcome.document, "files": list(files)})
     return finish(outcome, out, files, as_json=as_json)
@@ -90,8 +90,8 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
 
     session = read_yaml(folder / "session.yaml")
     schema = validated_document(session, session_schema())
-    seen = [schema.cameras[name] for name in schema.observers("board")]
-    if not seen or schema.board is None:
+    in_view = [schema.cameras[name] for name in schema.observers("board")]
+    if not in_view or schema.board is None:
         raise InputError(
             "no station of this session observes a board",
             where=session.where("stations"),
@@ -106,7 +106,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             found=schema.board.file,
             expected=wanted_file(board),
         )
-    cameras = sorted({station.camera for station in seen})
+    cameras = sorted({station.camera for station in in_view})
     if len(cameras) > 1:
         raise InputError(
             "the session's boards are seen by several cameras",
@@ -115,7 +115,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             expected="one camera at a time",
             next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
         )
-    patterns = [glob.escape(station.images) for station in seen]
+    patterns = [glob.escape(station.images) for station in in_view]
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
     paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:

@@ -31,7 +31,7 @@ def check(
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
     from pkmcal.check.check import check_session
-    from pkmcal.check.words import outcome_of
+    from pkmcal.check.sentences import outcome_of
     from pkmcal.files import check_own_folder, check_writable
 
     if out is not None:
@@ -39,31 +39,31 @@ def check(
     if pictures is not None:
         check_writable(pictures)
     study = None
-    with console.progress(as_json) as told:
-        found = check_session(session, seed=seed, progress=told)
-        if repeat and found.exit_code < 2:
+    with console.progress(as_json) as progress:
+        check = check_session(session, seed=seed, progress=progress)
+        if repeat and check.exit_code < 2:
             from pkmcal.calibration.repeats import study_repeats
 
-            study = study_repeats(session, seed=seed, progress=told)
-        outcome = outcome_of(found, study)
+            study = study_repeats(session, seed=seed, progress=progress)
+        outcome = outcome_of(check, study)
         if repeat:
             repeats = study and study.as_dict()
             outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
         files: dict[str, str] = {}
-        if pictures is not None and found.look:
+        if pictures is not None and check.look:
             from pkmcal.check.pictures import picture_names, write_pictures
 
-            told("Drawing", 0.95)
-            names = picture_names(found.look).values()
+            progress("Drawing", 0.95)
+            names = picture_names(check.look).values()
             check_own_folder(pictures, names, "pictures of a check", "an earlier check's")
-            write_pictures(found.look, pictures)
+            write_pictures(check.look, pictures)
             files[str(pictures)] = DRAWINGS_DESCRIPTION
         if out is not None:
-            if found.look:
+            if check.look:
                 from pkmcal.check.pictures import with_pictures
 
-                told("Writing the page", 0.97)
-                outcome = replace(outcome, parts=(*outcome.parts, with_pictures(found.look)))
+                progress("Writing the page", 0.97)
+                outcome = replace(outcome, parts=(*outcome.parts, with_pictures(check.look)))
             write_outcome(outcome, out, CHECK_FILES)
             files |= {str(out / name): what for name, what in CHECK_FILES.items()}
     return answer(outcome, Path(), files, as_json=as_json)

@@ -139,16 +139,16 @@ def _failed(error: BaseException, words: list[str]) -> int:
     """Tell an error in words, or as JSON where that was asked for; returns the exit code."""
     if os.environ.get(DEBUG_VARIABLE):
         sys.stderr.write(legible("".join(traceback.format_exception(error)), keep="\n"))
-    told, code = _in_words(error, words)
+    message, code = _in_words(error, words)
     if "--json" in words and not isinstance(error, LostOutput):
         try:
-            typer.echo(json.dumps({**told.as_dict(), "exit_code": code}, ensure_ascii=False))
+            typer.echo(json.dumps({**message.as_dict(), "exit_code": code}, ensure_ascii=False))
             sys.stdout.flush()
         except LostOutput:
             pass  # what went wrong first is told, where something still can be
         else:
             return code
-    print_error(str(told))
+    print_error(str(message))
     return code
 
 
@@ -158,26 +158,26 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
         return error, error.exit_code
     if isinstance(error, _UsageError):
         command = words[0] + " " if words and words[0] in COMMANDS_IN_ORDER else ""
-        said = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
-        return said, said.exit_code
+        message = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
+        return message, message.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED_EXIT
     if isinstance(error, MemoryError):
-        said = InputError(
+        message = InputError(
             "there is not enough memory",
             next_step="Close other programs, or use fewer or smaller photographs",
         )
-        return said, said.exit_code
+        return message, message.exit_code
     if isinstance(error, OSError):  # no space, no permission, a disk taken away
         from pkmcal.files import next_step_after
 
         reason = (error.strerror or str(error) or type(error).__name__).lower()
-        said = InputError(
+        message = InputError(
             f"the operating system refused: {reason}",
             where=str(error.filename) if error.filename else None,
             next_step=next_step_after(error),
         )
-        return said, said.exit_code
+        return message, message.exit_code
     defect = PkmcalError(
         f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
         next_step=f"Set {DEBUG_VARIABLE}=1, run the command again, and report what it then prints",
@@ -202,8 +202,8 @@ def _usage(error: Exception) -> str:
         message = re.sub(inside, instead, message)
     guess: str | None = None
     if option := re.match(r"No such option:? '?-*([^\s']+)", message):
-        known = [name for p in vars(error)["ctx"].command.params for name in p.opts]
-        bare = {name.lstrip("-"): name for name in known if name.startswith("--")}
+        names = [name for p in vars(error)["ctx"].command.params for name in p.opts]
+        bare = {name.lstrip("-"): name for name in names if name.startswith("--")}
         guess = bare.get(closest(option[1], bare) or "")
     elif command := re.match(r"No such command '(.+)'", message):
         guess = closest(command[1], COMMANDS_IN_ORDER)

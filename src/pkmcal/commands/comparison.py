@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array, rms
-from pkmcal.identify.compared import compare as machine_errors
+from pkmcal.identify.comparison import compare as machine_errors
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.mechanisms import Machine
@@ -62,12 +62,12 @@ def compare_with_truth(calibration: Calibration, session_folder: Path) -> Agains
 
 
 def _errors(machine: Machine, truth: Truth) -> Errors:
-    found = machine_errors(machine, truth.machine, truth.joints)
+    value = machine_errors(machine, truth.machine, truth.joints)
     return Errors(
-        centre=float(found.centre.mean()),
-        offset=rms(found.offset) if found.offset.size else 0.0,
-        position=float(np.nanmean(found.position)),
-        orientation=float(np.nanmean(found.orientation)),
+        centre=float(value.centre.mean()),
+        offset=rms(value.offset) if value.offset.size else 0.0,
+        position=float(np.nanmean(value.position)),
+        orientation=float(np.nanmean(value.orientation)),
     )
 
 
@@ -81,10 +81,10 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
     drawing = calibration.session.machine
-    told, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters
+    covariance, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters
     # an axis by its two turns: along itself it changes by squares of small angles only
-    error = table.to_free(estimate.machine.values) - table.to_free(told.theta)
+    error = table.to_free(estimate.machine.values) - table.to_free(covariance.theta)
     to_free = np.linalg.pinv(table.free_matrix())
     sigma = np.sqrt(np.maximum(np.diag(to_free @ estimate.covariance @ to_free.T), 0.0))
-    known = sigma > 1e-9  # what defines the frames has no deviation
-    return np.abs(error)[known] / sigma[known]
+    above_limit = sigma > 1e-9  # what defines the frames has no deviation
+    return np.abs(error)[above_limit] / sigma[above_limit]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from pkmcal.outcome import Table
 
-ToldProgress = Callable[[str, float], None]
+TextProgress = Callable[[str, float], None]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
@@ -160,21 +160,23 @@ def print_table(console: Console, table: Table) -> None:
 
     columns = table.columns[: table.first]
     marked = any(row.mark for row in table.rows)
-    shown = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    display = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
     if marked:
-        shown.add_column()
+        display.add_column()
     short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
     for place, heading in enumerate(columns):
         left = place == 0 or place in table.words
-        shown.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
+        display.add_column(
+            heading, justify="left" if left else "right", no_wrap=not place and short
+        )
     for row in table.rows:
         mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        shown.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
+        display.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
     console.print()
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
-    console.print(shown)
+    console.print(display)
     for line in table.legend:
         console.print(f"   {line}", style="dim", markup=False)
 
@@ -187,7 +189,7 @@ def escaped(text: str) -> str:
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Generator[ToldProgress]:
+def progress(quiet: bool = False) -> Generator[TextProgress]:
     """A bar on stderr for as long as the block runs; where that is no terminal, such as a log or a
     pipe, a plain line every PROGRESS_LINE_INTERVAL seconds.
     """
@@ -196,8 +198,8 @@ def progress(quiet: bool = False) -> Generator[ToldProgress]:
         return
     console = err()
     if not console.is_terminal:
-        with _lines() as told:
-            yield told
+        with _lines() as values:
+            yield values
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -213,14 +215,14 @@ def progress(quiet: bool = False) -> Generator[ToldProgress]:
 
 
 @contextmanager
-def _lines() -> Generator[ToldProgress]:
+def _lines() -> Generator[TextProgress]:
     """Lines about what is being done, as long as the block runs; none of what ends before."""
     begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
 
-    def told(text: str, share: float) -> None:
+    def report(text: str, share: float) -> None:
         step[0] = text, share
 
-    def tell() -> None:
+    def print_lines() -> None:
         while not over.wait(PROGRESS_LINE_INTERVAL):
             text, share = step[0]
             if text:
@@ -228,18 +230,18 @@ def _lines() -> Generator[ToldProgress]:
                 sys.stderr.write(f"{legible(text)} ({passed})\n")
 
     # by itself, for a step may take minutes in which nothing else is told
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
-        yield told
+        yield report
     finally:
         over.set()
         thread.join()
 
 
-def counted(told: ToldProgress, upto: float = 1.0) -> Callable[[int, int], None]:
+def counted(progress: TextProgress, upto: float = 1.0) -> Callable[[int, int], None]:
     """A callback of photographs done and in all, told as a share of `upto`."""
-    return lambda done, total: told(f"Photograph {done} of {total}", upto * done / total)
+    return lambda done, total: progress(f"Photograph {done} of {total}", upto * done / total)
 
 
 def can_show() -> bool:

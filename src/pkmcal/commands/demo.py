@@ -54,38 +54,38 @@ def demo(
     session, result = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
     _make_room(out)
     check_output(result)
-    with console.progress(as_json) as told:
+    with console.progress(as_json) as progress:
         simulate_session(
             session,
             load_mechanism(DEMO_MECHANISM),
             camera_of_size(FAST_SIZE) if fast else demo_camera(),
             replace(DEMO_SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else DEMO_SETTINGS,
             seed=DEMO_SEED,
-            progress=console.counted(told, upto=SIMULATING_SHARE),
+            progress=console.counted(progress, upto=SIMULATING_SHARE),
         )
         rest = 0.97 - SIMULATING_SHARE
         calibration = calibrate_session(
-            session, progress=lambda text, share: told(text, SIMULATING_SHARE + rest * share)
+            session, progress=lambda text, share: progress(text, SIMULATING_SHARE + rest * share)
         )
-        told("Writing the report", 0.98)
-        found = outcome_of(calibration)
-        write_outcome(found, result, CALIBRATION_FILES)
+        progress("Writing the report", 0.98)
+        outcome = outcome_of(calibration)
+        write_outcome(outcome, result, CALIBRATION_FILES)
     # Only now, with everything written, is the truth looked at.
     comparison = compare_with_truth(calibration, session)
     photographs = sum(len(station.photographs) for station in calibration.session.stations)
-    found = replace(
-        found,
+    outcome = replace(
+        outcome,
         subject=f"A {calibration.machine.name}, not built quite as drawn, in {photographs}"
         f" simulated photographs: {session}",
         summary={
-            **(found.summary or {}),
+            **(outcome.summary or {}),
             "session": session,
             "comparison": asdict(comparison),
         },
     )
-    code = answer(found, result, CALIBRATION_FILES, as_json=as_json)
+    code = answer(outcome, result, CALIBRATION_FILES, as_json=as_json)
     if not as_json:
-        _tell_comparison(console.out(), comparison)
+        _print_comparison(console.out(), comparison)
         if not no_open and console.can_show():
             import webbrowser
 
@@ -115,11 +115,11 @@ def _make_room(out: Path) -> None:
         remove_folder(out / name)
 
 
-def _tell_comparison(out: Console, found: AgainstTruth) -> None:
+def _print_comparison(out: Console, value: AgainstTruth) -> None:
     """Errors before and after, and whether the standard deviations were honest."""
     from pkmcal.outcome import Row, Table
 
-    before, after = found.drawing, found.calibrated
+    before, after = value.drawing, value.calibrated
     rows: list[Row] = []
     for what, old, new, unit in (
         ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),
@@ -132,8 +132,8 @@ def _tell_comparison(out: Console, found: AgainstTruth) -> None:
     columns = ("Against the truth", "Drawing", "Calibrated", "")
     console.print_table(out, Table("", columns, tuple(rows)))
     out.print()
-    said = (
-        f"{found.within} of {found.count} values ({found.within / found.count:.0%}) lie within two"
+    text = (
+        f"{value.within} of {value.count} values ({value.within / value.count:.0%}) lie within two"
         " of their standard deviations of the truth; 95 % should."
     )
-    console.print_points(out, [("[cyan]→[/]", said)])
+    console.print_points(out, [("[cyan]→[/]", text)])

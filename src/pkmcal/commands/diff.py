@@ -35,17 +35,17 @@ def diff(
     """Two calibrations or drawings, and what differs at the tool."""
     from threadpoolctl import threadpool_limits
 
-    from pkmcal.calibration.kept import keep_earlier
+    from pkmcal.calibration.archive import keep_earlier
     from pkmcal.files import check_own_folder, default_output, json_text, output_lock
     from pkmcal.judge.difference import difference
     from pkmcal.report.difference import outcome_of
 
     if out is not None:
         check_own_folder(out, DIFFERENCE_FILES, "a difference")
-    with console.progress(as_json) as told, threadpool_limits(1, "blas"):
-        told("Comparing", 0.1)
-        found = difference(a, b)
-    saved = found.b.saved or found.a.saved
+    with console.progress(as_json) as progress, threadpool_limits(1, "blas"):
+        progress("Comparing", 0.1)
+        value = difference(a, b)
+    saved = value.b.saved or value.a.saved
     folder = out or Path("diff")
     if out is None:
         if saved is not None:
@@ -54,8 +54,12 @@ def diff(
             beside = beside.parent.parent / "diff"
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
         check_own_folder(default_output(folder), DIFFERENCE_FILES, "a difference")
-    outcome = outcome_of(found)
+    outcome = outcome_of(value)
     texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
     with output_lock(folder):  # another run may have written there meanwhile
-        kept = None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
-        return finish(outcome, folder, DIFFERENCE_FILES, kept=kept, as_json=as_json)
+        archive_folder = (
+            None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
+        )
+        return finish(
+            outcome, folder, DIFFERENCE_FILES, archive_folder=archive_folder, as_json=as_json
+        )

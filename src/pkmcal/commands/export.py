@@ -14,7 +14,7 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.calibration.source import MachineSource
+    from pkmcal.calibration.machine_source import MachineSource
     from pkmcal.export.contract import Export
 
 
@@ -41,7 +41,7 @@ def export(
     as_json: console.Json = False,
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
-    from pkmcal.calibration.source import load_source
+    from pkmcal.calibration.machine_source import load_source
     from pkmcal.export.contract import exporter_of, write_export
     from pkmcal.export.contract import make_export as run
     from pkmcal.files import default_output
@@ -54,7 +54,7 @@ def export(
     if as_json:
         console.print_json(summary(made, source, folder))
     else:
-        tell_export(console.out(), made, source, folder)
+        print_export(console.out(), made, source, folder)
     return 0
 
 
@@ -94,7 +94,7 @@ def _trial(made: Export, folder: Path) -> str | None:
     return f"(cd {shlex.quote(str(folder))} && {trial})" if trial else None
 
 
-def tell_export(out: Console, made: Export, source: MachineSource, folder: Path) -> None:
+def print_export(out: Console, made: Export, source: MachineSource, folder: Path) -> None:
     """What the command says, for people."""
     state = "good" if source.calibrated and source.usable else "doubtful"
     console.print_points(out, [(console.MARK_SIGNS[state], f"{source.origin}: {source.headline}")])

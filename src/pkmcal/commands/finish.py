@@ -30,17 +30,18 @@ def finish(
     files: Mapping[str, str],
     *,
     over: Collection[str] = (),
-    kept: Path | None = None,
+    archive_folder: Path | None = None,
     as_json: bool = False,
 ) -> int:
     """Write the files, tell what was found, and return the exit code.
 
-    over : files of an earlier result, of which none is to stay. kept : where a copy of it is.
+    over : files of an earlier result, of which none is to stay. archive_folder : where a copy of it
+    is.
     """
-    with console.progress(as_json) as told:
-        told("Writing the report", 0.97)
+    with console.progress(as_json) as progress:
+        progress("Writing the report", 0.97)
         write_outcome(outcome, folder, files, over)
-    return answer(outcome, folder, files, kept=kept, as_json=as_json)
+    return answer(outcome, folder, files, archive_folder=archive_folder, as_json=as_json)
 
 
 def write_outcome(
@@ -57,7 +58,7 @@ def answer(
     folder: Path,
     files: Mapping[str, str],
     *,
-    kept: Path | None = None,
+    archive_folder: Path | None = None,
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -66,19 +67,23 @@ def answer(
     quiet : say nothing of a result that may be used, and one sentence of another.
     """
     if as_json:
-        earlier = {"kept": str(kept)} if kept else {}
+        earlier = {"kept": str(archive_folder)} if archive_folder else {}
         console.print_json({**printed(outcome, folder, files), **earlier})
     elif not quiet:
         out = console.out()
-        tell_outcome(out, outcome)
+        print_outcome(out, outcome)
         if files:
             out.print()
-            told = [(str(folder / name), what) for name, what in files.items()]
-            if kept:
+            written = [(str(folder / name), what) for name, what in files.items()]
+            if archive_folder:
                 here = Path.cwd()
-                place = kept.relative_to(here) if kept.is_relative_to(here) else kept
-                told.append((str(place), "the earlier result, kept"))
-            console.print_files(out, told)
+                place = (
+                    archive_folder.relative_to(here)
+                    if archive_folder.is_relative_to(here)
+                    else archive_folder
+                )
+                written.append((str(place), "the earlier result, kept"))
+            console.print_files(out, written)
     elif not outcome.verdict.usable:
         verdict = outcome.verdict
         console.print_error(" ".join([verdict.headline, *verdict.reasons]))
@@ -108,7 +113,7 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     }
 
 
-def tell_outcome(out: Console, outcome: Outcome) -> None:
+def print_outcome(out: Console, outcome: Outcome) -> None:
     """What a command found, for people: the verdict, numbers, and what to look at."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:
@@ -127,9 +132,9 @@ def tell_outcome(out: Console, outcome: Outcome) -> None:
         for table in part.tables:
             if table.brief:
                 console.print_table(out, table)
-        if part.said:
+        if part.terminal_text:
             out.print()
-            console.print_points(out, [("", text) for text in part.said])
+            console.print_points(out, [("", text) for text in part.terminal_text])
     checks = [check for part in outcome.parts for check in part.checks]
     for points in (
         [

@@ -12,7 +12,7 @@ import typer
 from pkmcal.commands import console
 
 if TYPE_CHECKING:
-    from pkmcal.session.starter import SeenChoice
+    from pkmcal.session.starter import ObservedChoice
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -63,14 +63,14 @@ def new(
     if printer is not None or probed is not None:
         others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
         return _of_printer(folder, printer, probed, board, places or 1, others, as_json)
-    seen: SeenChoice | None = (
+    what: ObservedChoice | None = (
         "both" if board and legs else "board" if board else "legs" if legs else None
     )
-    plain = machine is None and seen is None and places is None
+    plain = machine is None and what is None and places is None
     if plain and not as_json and on_terminal():
-        machine, seen, places = _asked()
-    names = write_session(folder, machine, seen, places or 1)
-    return _told(folder, names, as_json)
+        machine, what, places = _dialogue()
+    names = write_session(folder, machine, what, places or 1)
+    return _summary_lines(folder, names, as_json)
 
 
 def _of_printer(
@@ -100,10 +100,10 @@ def _of_printer(
             expected="neither --machine nor --legs, and --probed or --board",
         )
     names = write_printer_session(folder, printer, probed, "board" if board else None, places)
-    return _told(folder, names, as_json, done=not board, of_printer=True)
+    return _summary_lines(folder, names, as_json, done=not board, of_printer=True)
 
 
-def _told(
+def _summary_lines(
     folder: Path,
     names: Sequence[str],
     as_json: bool,
@@ -118,9 +118,9 @@ def _told(
     out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
     drawn = {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
     what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else drawn)}
-    known = [name for name in what if name in names]
-    others = sorted(set(names) - set(known))
-    rows = [(name, what[name]) for name in known] + [
+    reference_values = [name for name in what if name in names]
+    others = sorted(set(names) - set(reference_values))
+    rows = [(name, what[name]) for name in reference_values] + [
         (name, PHOTOGRAPHS_DESCRIPTION) for name in others
     ]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
@@ -138,7 +138,7 @@ def on_terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _asked() -> tuple[str | None, SeenChoice | None, int]:
+def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
     """What somebody at a terminal wants: the machine, what is seen of it, from how many places."""
     from rich.prompt import IntPrompt, Prompt
 
@@ -151,18 +151,18 @@ def _asked() -> tuple[str | None, SeenChoice | None, int]:
         choices=names, show_choices=False, default="gough-stewart",
     )  # fmt: skip
     drawn = load_mechanism(machine)
-    seen: SeenChoice | None = None
+    what: ObservedChoice | None = None
     if any(leg.tubes for leg in drawn.document.legs):
         answer = Prompt.ask(
             "What does the camera see of it",
             choices=["legs", "board", "both"], default="legs",
         )  # fmt: skip
-        seen = "both" if answer == "both" else "board" if answer == "board" else "legs"
+        what = "both" if answer == "both" else "board" if answer == "board" else "legs"
     elif drawn.redundancy > 0:
         console.out().print("Its readings alone tell its geometry: no camera is needed.")
         return machine, None, 1
     else:
         console.out().print("Its drawing has no visible cylinders, so a board is seen.")
-    usual = 1 if seen is None or seen == "board" else 2
+    usual = 1 if what is None or what == "board" else 2
     places = IntPrompt.ask("In how many places does the camera stand", default=usual)
-    return machine, seen, min(max(places, 1), 20)
+    return machine, what, min(max(places, 1), 20)

@@ -123,9 +123,9 @@ def plan(
         folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"
     )
     sized = None if session is not None or camera else camera_of_size(parsed_size(size))
-    with console.progress(as_json) as told:
-        told("Looking at what there is", 0.0)
-        found = run(
+    with console.progress(as_json) as progress:
+        progress("Looking at what there is", 0.0)
+        value = run(
             subject,
             count=configurations,
             index=index,
@@ -142,9 +142,9 @@ def plan(
             corner_noise=corner_noise,
             joint_noise=joint_noise,
             seed=seed,
-            progress=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
+            progress=lambda share: progress("Choosing configurations", 0.1 + 0.85 * share),
         )
-    return finish(outcome_of(found), folder, files, over=over, as_json=as_json)
+    return finish(outcome_of(value), folder, files, over=over, as_json=as_json)
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

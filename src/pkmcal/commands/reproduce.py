@@ -55,19 +55,19 @@ def reproduce(
         default_output(out)
     check_own_folder(out, ours, "reproductions", "earlier reproductions")
     wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
-    with console.progress(as_json) as told:
-        options = Options(runs, seed, long, photographs, told)
-        found = {paper: computed(paper, options) for paper in wanted}
+    with console.progress(as_json) as progress:
+        options = Options(runs, seed, long, photographs, progress)
+        results = {paper: computed(paper, options) for paper in wanted}
     texts = {
         name: text
-        for paper, outcome in found.items()
+        for paper, outcome in results.items()
         for name, text in contents(outcome, files[paper]).items()
     }
     write_folder(out, texts)
     if not as_json:
-        return max(answer(outcome, out, files[paper]) for paper, outcome in found.items())
-    code = max(outcome.exit_code for outcome in found.values())
-    documents = {paper: outcome.document for paper, outcome in found.items()}
+        return max(answer(outcome, out, files[paper]) for paper, outcome in results.items())
+    code = max(outcome.exit_code for outcome in results.values())
+    documents = {paper: outcome.document for paper, outcome in results.items()}
     written = [str(out / name) for name in texts]
     console.print_json({"papers": documents, "files": written, "exit_code": code})
     return code

@@ -121,8 +121,8 @@ def servo(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
     )
     try:
-        with console.progress(as_json) as told:
-            outcome = outcome_of(study_servoing(scene, plan, told))
+        with console.progress(as_json) as progress:
+            outcome = outcome_of(study_servoing(scene, plan, progress))
     except InputError as error:  # what a camera does not see is told with its file
         raise error if error.where or camera is None else error.located(str(camera)) from None
     return finish(outcome, folder, SERVO_FILES, as_json=as_json)

@@ -117,12 +117,12 @@ def simulate(
     cameras: Camera | tuple[Camera, ...] = eye
     if planned:
         cameras = planned.cameras
-        settings = replace(settings, stations=planned.places, asked=planned.asked)
+        settings = replace(settings, stations=planned.places, asked=planned.requested)
         if planned.board:
             settings = replace(settings, board=planned.board, board_on="platform")
-    with console.progress(as_json) as told:
+    with console.progress(as_json) as progress:
         truth = simulate_session(
-            folder, machine, cameras, settings, seed=seed, progress=console.counted(told)
+            folder, machine, cameras, settings, seed=seed, progress=console.counted(progress)
         )
     count = len(truth.photographs) * truth.repeats
     if as_json:

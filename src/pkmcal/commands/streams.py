@@ -44,13 +44,13 @@ def withstanding() -> Generator[None]:
 
 
 def _withstanding(stream: TextIO | None, number: int) -> TextIO:
-    told = number == 1
+    raises = number == 1
     if stream is None:
         while (taken := os.open(os.devnull, os.O_RDONLY)) < number:
             pass
         if taken > number:
             os.close(taken)
-        return _text(_Stream(number, told=told), "utf-8")
+        return _text(_Stream(number, raises=raises), "utf-8")
     if isinstance(stream, io.TextIOWrapper):
         # a terminal that lacks a sign shows ? for it; that is no reason to fail
         stream.reconfigure(errors="replace")
@@ -58,26 +58,26 @@ def _withstanding(stream: TextIO | None, number: int) -> TextIO:
         raw = getattr(stream.buffer, "raw", stream.buffer)
         if isinstance(raw, io.FileIO) and not stream.isatty():
             stream.flush()
-            return _text(_Stream(stream.fileno(), told=told), stream.encoding)
+            return _text(_Stream(stream.fileno(), raises=raises), stream.encoding)
     return stream
 
 
 class _Stream(io.FileIO):
-    """A file that fails once at most; told : whether that is raised, as LostOutput."""
+    """A file that fails once at most; raises : whether that is raised, as LostOutput."""
 
-    def __init__(self, number: int, *, told: bool) -> None:
+    def __init__(self, number: int, *, raises: bool) -> None:
         super().__init__(number, "w", closefd=False)
-        self._told = told
+        self._raises = raises
 
     def write(self, data: ReadableBuffer, /) -> int:
         """Write what can be written; after a failure, nothing."""
         try:
             return super().write(data)
         except OSError as error:
-            told, self._told = self._told, False
+            raises, self._raises = self._raises, False
             os.dup2(nowhere := os.open(os.devnull, os.O_WRONLY), self.fileno())
             os.close(nowhere)
-            if told and error.errno not in READER_GONE_ERRORS:
+            if raises and error.errno not in READER_GONE_ERRORS:
                 raise LostOutput(
                     f"standard output cannot be written ({error.strerror})",
                     next_step="Make room, or send it elsewhere; files that were written are whole",

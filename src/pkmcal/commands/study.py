@@ -68,10 +68,10 @@ def study(
         default_output(out)
     over = check_own_folder(out, ours, "a study", "an earlier study")
     try:
-        with console.progress(as_json) as told:
-            found = simulated(
+        with console.progress(as_json) as progress:
+            study = simulated(
                 subject, vary or (), runs=runs, seed=seed, out=out, scheduler=scheduler,
-                progress=told,
+                progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
         if not as_json:
@@ -80,4 +80,4 @@ def study(
                 [("", f"What is finished lies in {out}; the same command goes on from there.")],
             )
         raise
-    return finish(outcome_of(found, table=name), out, files, over=over, as_json=as_json)
+    return finish(outcome_of(study, table=name), out, files, over=over, as_json=as_json)

@@ -36,6 +36,6 @@ def validate(
     loaded = load_session(session)
     folder = out or default_output(loaded.folder / "validation")
     check_own_folder(folder, VALIDATION_FILES, "a validation")
-    with console.progress(as_json) as told:
-        found = run(calibration, loaded, regions=regions, seed=seed, progress=told)
-    return finish(outcome_of(found), folder, VALIDATION_FILES, as_json=as_json)
+    with console.progress(as_json) as progress:
+        outcome = run(calibration, loaded, regions=regions, seed=seed, progress=progress)
+    return finish(outcome_of(outcome), folder, VALIDATION_FILES, as_json=as_json)

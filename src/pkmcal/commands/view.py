@@ -28,6 +28,7 @@ def view(
     """Show photographs with the machine laid over; move it there."""
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
+    from pkmcal.view.content import Viewed
     from pkmcal.view.server import (
         LOOPBACK_ADDRESS,
         application,
@@ -35,7 +36,6 @@ def view(
         new_token,
         serve_until_interrupted,
     )
-    from pkmcal.view.viewed import Viewed
 
     loaded = load_session(session)
     if not loaded.stations:
@@ -51,8 +51,8 @@ def view(
     if calibration is not None:
         _ = viewed.saved  # a wrong one is told before a page stands
     token = new_token()
-    with listening_socket(port) as found:
-        port = found.getsockname()[1]
+    with listening_socket(port) as socket_:
+        port = socket_.getsockname()[1]
         address = f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
         app = application(viewed, token, port)
         if as_json:
@@ -66,5 +66,5 @@ def view(
             import webbrowser
 
             webbrowser.open(address)
-        serve_until_interrupted(app, found)
+        serve_until_interrupted(app, socket_)
     return 0

@@ -44,13 +44,13 @@ def watch(
     loaded = load_session(session)
     folder = out or default_output(loaded.folder / "watch")
     check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")
-    with console.progress(as_json) as told:
-        found = run(
+    with console.progress(as_json) as progress:
+        value = run(
             calibration,
             loaded,
             alpha=alpha,
             seed=seed,
             same_place=same_place or (),
-            progress=told,
+            progress=progress,
         )
-    return finish(outcome_of(found), folder, WATCH_FILES, as_json=as_json)
+    return finish(outcome_of(value), folder, WATCH_FILES, as_json=as_json)

@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.laws import Task, task_of
-from pkmcal.control.seen import SeenMachine, legs_at, moved_to, true_edges
+from pkmcal.control.machine_view import MachineView, legs_at, moved_to, true_edges
 from pkmcal.control.simulation import outside, platform_joints
 from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms.kinematics import on_manifold
@@ -28,7 +28,7 @@ FADING_VISIBILITY_SHARE = 0.1
 MOST_DESCENT_STEPS = 80
 DESCENT_END_STEP = 1e-13
 """m or rad; a descent whose steps are shorter has ended."""
-LOOKS_ALIKE_ERROR = 1e-7
+INDISTINGUISHABLE_ERROR = 1e-7
 """Norm of e below which two poses look the same: a tenth of a thousandth of a pixel."""
 CANCELLED_ERROR_SHARE = 1e-6
 """Norm of N^T e, as a part of |N| |e|, below which the errors cancel."""
@@ -36,16 +36,16 @@ DIFFERENT_POSE_DISTANCE = 1e-3
 """m, root mean square of the platform's joints, beyond which two poses are different ones."""
 
 
-def matrix_at(seen: SeenMachine, law: str, poses: Array) -> Array:
+def matrix_at(view: MachineView, law: str, poses: Array) -> Array:
     """N (R, s, k 3, f) at goals themselves, poses (R, 4, 4), by the free twists in metres."""
-    task = _task(seen, law, poses, true_edges(seen, poses))
-    return task.matrix.reshape(len(poses), len(seen.legs), -1, task.matrix.shape[-1])
+    task = _task(view, law, poses, true_edges(view, poses))
+    return task.matrix.reshape(len(poses), len(view.legs), -1, task.matrix.shape[-1])
 
 
-def _task(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Task:
-    legs = legs_at(seen, poses)
+def _task(view: MachineView, law: str, poses: Array, goal: Array) -> Task:
+    legs = legs_at(view, poses)
     legs = moved_to(legs, legs.b.mean(axis=-2))
-    return task_of(law, seen, true_edges(seen, poses), goal, legs)
+    return task_of(law, view, true_edges(view, poses), goal, legs)
 
 
 def visibility(matrix: Array) -> Array:
@@ -83,49 +83,49 @@ def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
 
     matrix : (R, s, k, f) of all legs. legs : (s,) their numbers.
     """
-    found: list[Subset] = []
+    results: list[Subset] = []
     for size in range(1, len(legs) + 1):
         several: list[Subset] = []
         for rows in combinations(range(len(legs)), size):
             values = visibility(matrix[:, list(rows)])
             numbers = tuple(int(legs[row]) for row in rows)
             several.append(Subset(numbers, float(values.min()), float(np.median(values))))
-        found += sorted(several, key=lambda subset: -subset.worst)
-    return tuple(found)
+        results += sorted(several, key=lambda subset: -subset.worst)
+    return tuple(results)
 
 
 @dataclass(frozen=True)
 class Equilibria:
     """Where the control could come to rest, from S starts to G goals each.
 
-    reached, alike, cancelled, out : parts of the starts whose descent ends at the goal; at another
-    pose that looks the same; where errors cancel; and outside of the workspace.
+    reached, same_image, cancelled, out : parts of the starts whose descent ends at the goal; at
+    another pose that looks the same; where errors cancel; and outside of the workspace.
     T_base_platform : (k, 4, 4) poses other than the goal, in the workspace and the goal's assembly.
-    goal : (k,) of which goal. looks_alike : (k,). distance : (k,) m of the platform's joints.
+    goal : (k,) of which goal. same_edges : (k,). distance : (k,) m of the platform's joints.
     readings : (k,) largest difference of a reading from the goal's, m or rad.
     """
 
     reached: float
-    alike: float
+    same_image: float
     cancelled: float
     out: float
     T_base_platform: Array
     goal: Integers
-    looks_alike: Booleans
+    same_edges: Booleans
     distance: Array
     readings: Array
 
 
-def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equilibria:
+def equilibria(view: MachineView, law: str, goals: Array, starts: Array) -> Equilibria:
     """Descents of |e|^2 from starts (S, 4, 4) to every goal (G, 4, 4), batched.
 
     Every equilibrium that is found is one; that none is missing is not proven.
     """
-    machine = seen.machine
+    machine = view.machine
     g, s = len(goals), len(starts)
     goal = np.repeat(goals, s, axis=0)
-    poses = _descended(seen, law, np.tile(starts, (g, 1, 1)), true_edges(seen, goal))
-    task = _task(seen, law, poses, true_edges(seen, goal))
+    poses = _descended(view, law, np.tile(starts, (g, 1, 1)), true_edges(view, goal))
+    task = _task(view, law, poses, true_edges(view, goal))
     size = np.sqrt(dot(task.error, task.error))
     slope = (task.matrix.mT @ task.error[..., None])[..., 0]
     largest = np.sqrt(np.sum(task.matrix**2, axis=(-1, -2)))
@@ -133,35 +133,35 @@ def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equi
     distance = np.sqrt(np.mean(dot(off, off), axis=-1))
     readings, wanted = machine.inverse(poses), machine.inverse(goal)
     inside = ~outside(machine, readings)
-    here, there = (assembly_sign(machine.layout, seen.theta, T) for T in (poses, goal))
+    here, there = (assembly_sign(machine.layout, view.theta, T) for T in (poses, goal))
     inside &= here * there >= 0
-    looks = size < LOOKS_ALIKE_ERROR
+    indistinguishable = size < INDISTINGUISHABLE_ERROR
     flat = np.sqrt(dot(slope, slope)) < CANCELLED_ERROR_SHARE * largest * np.maximum(
-        size, LOOKS_ALIKE_ERROR
+        size, INDISTINGUISHABLE_ERROR
     )
-    at_goal = looks & (distance < DIFFERENT_POSE_DISTANCE)
-    other = inside & ~at_goal & (looks | flat)
+    at_goal = indistinguishable & (distance < DIFFERENT_POSE_DISTANCE)
+    other = inside & ~at_goal & (indistinguishable | flat)
     goal_of = np.repeat(np.arange(g), s)
-    kept = _distinct(platform_joints(machine, poses), other, goal_of)
+    retained = _distinct(platform_joints(machine, poses), other, goal_of)
     return Equilibria(
         reached=float(at_goal.mean()),
-        alike=float((other & looks).mean()),
-        cancelled=float((other & ~looks).mean()),
+        same_image=float((other & indistinguishable).mean()),
+        cancelled=float((other & ~indistinguishable).mean()),
         out=float((~inside & ~at_goal).mean()),
-        T_base_platform=poses[kept],
-        goal=goal_of[kept],
-        looks_alike=looks[kept],
-        distance=distance[kept],
-        readings=np.abs(readings - wanted).max(axis=-1)[kept],
+        T_base_platform=poses[retained],
+        goal=goal_of[retained],
+        same_edges=indistinguishable[retained],
+        distance=distance[retained],
+        readings=np.abs(readings - wanted).max(axis=-1)[retained],
     )
 
 
-def _descended(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Array:
+def _descended(view: MachineView, law: str, poses: Array, goal: Array) -> Array:
     """Levenberg-Marquardt on |e|^2 with the poses' free twists, (R, 4, 4)."""
-    layout, theta = seen.machine.layout, seen.theta
+    layout, theta = view.machine.layout, view.theta
     bound = layout.n_equations > layout.driven_rows.size or layout.shares_motors
     damping = np.full(len(poses), 1e-3)
-    now = _Slope.of(_task(seen, law, poses, goal))
+    now = _Slope.of(_task(view, law, poses, goal))
     for _ in range(MOST_DESCENT_STEPS):
         step = now.step(damping, poses)
         if np.abs(step).max() < DESCENT_END_STEP:
@@ -169,7 +169,7 @@ def _descended(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Array:
         trial = perturb(poses, step)
         if bound:
             trial = on_manifold(layout, theta, trial).T_base_platform
-        new = _Slope.of(_task(seen, law, trial, goal))
+        new = _Slope.of(_task(view, law, trial, goal))
         with np.errstate(invalid="ignore"):
             better = new.cost < now.cost
         poses = np.where(better[:, None, None], trial, poses)
@@ -211,19 +211,19 @@ class _Slope:
         size = np.sqrt(dot(step, step))[:, None]
         step = step * np.minimum(1.0, 0.1 / np.maximum(size, 1e-300))
         twist = (self.twist @ step[..., None])[..., 0]
-        moved = twist[:, 3:] + np.cross(twist[:, :3], poses[:, :3, 3] - self.pivot)
-        return np.concatenate([twist[:, :3], moved], axis=-1)
+        shifted = twist[:, 3:] + np.cross(twist[:, :3], poses[:, :3, 3] - self.pivot)
+        return np.concatenate([twist[:, :3], shifted], axis=-1)
 
 
 def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
     """Of rows that are the same pose for the same goal the first."""
-    kept: list[int] = []
+    retained_rows: list[int] = []
     for row in np.flatnonzero(which):  # few distinct ones: a loop over results
-        same = [k for k in kept if goal_of[k] == goal_of[row]]
+        same = [k for k in retained_rows if goal_of[k] == goal_of[row]]
         off = joints[same] - joints[row]
         if (
             not same
             or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > DIFFERENT_POSE_DISTANCE
         ):
-            kept.append(int(row))
-    return np.array(kept, dtype=int)
+            retained_rows.append(int(row))
+    return np.array(retained_rows, dtype=int)

@@ -8,12 +8,12 @@ from enum import Enum
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.control.seen import (
+from pkmcal.control.machine_view import (
     Legs,
-    SeenMachine,
+    MachineView,
     directions_of,
+    leg_ends_in_view,
     legs_at,
-    seen_ends,
     true_edges,
 )
 from pkmcal.control.track import Sight, first_track_state, track
@@ -35,7 +35,7 @@ class Status(Enum):
     RUNNING = "on its way to the goal"
     CONVERGED = "at the goal"
     LOST = "stopped: too few legs are seen"
-    NOT_FOUND = "stopped: the machine is not seen where its readings put it"
+    NOT_AT_READINGS = "stopped: the machine is not seen where its readings put it"
     WRONG_ASSEMBLY = "stopped: the machine stands in another assembly than the start's"
     TOO_FAR = "stopped: the goal is too far away"
     CROSSING = "stopped: a singular pose lies between the machine and the goal"
@@ -146,36 +146,36 @@ class Goal:
     aspect: float
 
 
-def goal_of(sight: Sight | None, seen: SeenMachine, goal: Array | GoalPhotograph) -> Goal:
+def goal_of(sight: Sight | None, view: MachineView, goal: Array | GoalPhotograph) -> Goal:
     """A platform pose (4, 4), edges (s, 2, 3) or a photograph as a goal.
 
     Raises InputError for what cannot be one.
     """
     if isinstance(goal, GoalPhotograph):
-        return _of_photograph(sight, seen, goal)
+        return _of_photograph(sight, view, goal)
     array = np.asarray(goal, dtype=float)
     if array.shape == (4, 4):
-        return _of_pose(seen, array)
-    if array.shape == (len(seen.legs), 2, 3):
-        return Goal(checked_normals(seen, array, "the goal's edges"), 0.0)
+        return _of_pose(view, array)
+    if array.shape == (len(view.legs), 2, 3):
+        return Goal(checked_normals(view, array, "the goal's edges"), 0.0)
     raise InputError(
         what="the goal is neither a platform pose nor edges",
         found=f"an array of shape {array.shape}",
-        expected=f"(4, 4), or ({len(seen.legs)}, 2, 3) for the {len(seen.legs)} seen legs",
+        expected=f"(4, 4), or ({len(view.legs)}, 2, 3) for the {len(view.legs)} seen legs",
     )
 
 
-def checked_normals(seen: SeenMachine, normals: Array, name: str) -> Array:
+def checked_normals(view: MachineView, normals: Array, name: str) -> Array:
     """Edges (s, 2, 3) as given, NaN where a leg is not seen.
 
     Raises InputError for what cannot be edges of these legs.
     """
     array = np.asarray(normals, dtype=float)
-    if array.shape != (len(seen.legs), 2, 3):
+    if array.shape != (len(view.legs), 2, 3):
         raise InputError(
             what=f"{name} have the wrong shape",
             found=str(array.shape),
-            expected=f"({len(seen.legs)}, 2, 3), two normals for each seen leg",
+            expected=f"({len(view.legs)}, 2, 3), two normals for each seen leg",
         )
     length = dot(array, array)
     if np.any(np.abs(length - 1) > 2 * UNIT_LENGTH_TOLERANCE):  # NaN passes: a leg that is not seen
@@ -198,13 +198,13 @@ def aspect_of(machine: Machine, legs: Legs) -> float:
     return float(sign_of(legs.rows @ machine.layout.motion))
 
 
-def check_sides(seen: SeenMachine, normals: Array, T_base_platform: Array) -> None:
+def check_sides(view: MachineView, normals: Array, T_base_platform: Array) -> None:
     """Raise InputError where edges (s, 2, 3) point along the legs from platform to base, seen from
     a pose (4, 4) of the right assembly: the two sides are exchanged.
     """
-    a, b = seen_ends(seen, T_base_platform)
-    known = np.isfinite(normals).all(axis=(-1, -2))
-    cosine = dot(directions_of(normals), line_through(a, b)[0])[known]
+    a, b = leg_ends_in_view(view, T_base_platform)
+    finite = np.isfinite(normals).all(axis=(-1, -2))
+    cosine = dot(directions_of(normals), line_through(a, b)[0])[finite]
     if cosine.size and np.median(cosine) < 0:
         raise InputError(
             what="the edges have their two sides exchanged",
@@ -213,11 +213,11 @@ def check_sides(seen: SeenMachine, normals: Array, T_base_platform: Array) -> No
         )
 
 
-def _of_pose(seen: SeenMachine, T_base_platform: Array) -> Goal:
-    machine = seen.machine
+def _of_pose(view: MachineView, T_base_platform: Array) -> Goal:
+    machine = view.machine
     if not np.isfinite(T_base_platform).all():
         raise InputError("the goal's pose holds a value that is not a finite number")
-    _check_closes(seen, T_base_platform)
+    _check_closes(view, T_base_platform)
     readings = machine.inverse(T_base_platform[None])[0]
     ranges = machine.joint_ranges
     with np.errstate(invalid="ignore"):
@@ -233,54 +233,54 @@ def _of_pose(seen: SeenMachine, T_base_platform: Array) -> Goal:
             expected=f"{ranges[k, 0]:.4g} to {ranges[k, 1]:.4g} {unit}",
             next_step="choose a goal inside the workspace",
         )
-    edges = true_edges(seen, T_base_platform)
+    edges = true_edges(view, T_base_platform)
     if np.isnan(edges).any():
         raise InputError(
             what="at the goal a leg passes through the camera's centre of projection",
             next_step="check T_camera_base",
         )
-    return Goal(edges, aspect_of(machine, legs_at(seen, T_base_platform)))
+    return Goal(edges, aspect_of(machine, legs_at(view, T_base_platform)))
 
 
-def _check_closes(seen: SeenMachine, T_base_platform: Array) -> None:
+def _check_closes(view: MachineView, T_base_platform: Array) -> None:
     """The machine can be there, and the pose is not singular."""
-    machine = seen.machine
+    machine = view.machine
     readings = machine.inverse(T_base_platform[None])[0]
     if not np.isfinite(readings).all():
         return  # said better by what follows
-    found = machine.forward_result(readings, T_base_platform)
-    moved = np.abs(found.T_base_platform - T_base_platform).max()
-    if not bool(found.converged) or moved > UNIT_LENGTH_TOLERANCE:
+    fk = machine.forward_result(readings, T_base_platform)
+    shifted = np.abs(fk.T_base_platform - T_base_platform).max()
+    if not bool(fk.converged) or shifted > UNIT_LENGTH_TOLERANCE:
         raise InputError(
             what="the machine cannot take the goal's pose",
             expected=f"a pose that a machine of motion {machine.document.motion!r} can take",
             next_step="give machine.forward(readings) of readings at the goal",
         )
-    if float(found.singularity) < NEAR_SINGULAR:
+    if float(fk.singularity) < NEAR_SINGULAR:
         raise InputError(
             what="the goal is nearly singular: there the platform moves with its motors locked",
-            found=f"smallest singular value {float(found.singularity):.2g}",
+            found=f"smallest singular value {float(fk.singularity):.2g}",
             expected=f"more than {NEAR_SINGULAR}; 1 is a good pose",
         )
 
 
-def _of_photograph(sight: Sight | None, seen: SeenMachine, goal: GoalPhotograph) -> Goal:
+def _of_photograph(sight: Sight | None, view: MachineView, goal: GoalPhotograph) -> Goal:
     if sight is None:
         raise InputError(
             "a goal photograph needs the camera", next_step="give camera to VisualServo"
         )
     readings = np.asarray(goal.readings, dtype=float)
-    found = track(sight, first_track_state(seen), goal.image, readings)
-    if not found.closed:
+    value = track(sight, first_track_state(view), goal.image, readings)
+    if not value.closed:
         raise GeometryError(
             what="no pose of the machine fits the readings of the goal photograph",
             next_step="check that they are in metres or radians, in the order of the motors",
         )
-    if not found.found.any():
+    if not value.valid.any():
         raise GeometryError(
             what="no leg was found in the goal photograph",
-            found=found.reasons[0],
+            found=value.reasons[0],
             next_step="check the camera, its place and the light",
         )
-    legs = legs_at(seen, found.state.T_base_platform, readings)
-    return Goal(found.lines.normal, aspect_of(seen.machine, legs))
+    legs = legs_at(view, value.state.T_base_platform, readings)
+    return Goal(value.lines.normal, aspect_of(view.machine, legs))

@@ -13,7 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras import Camera
-from pkmcal.control.seen import SeenMachine, visible_tubes
+from pkmcal.control.machine_view import MachineView, visible_tubes
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
 from pkmcal.observe.predict import (
@@ -38,12 +38,12 @@ class Eye:
     by leg in the order of ``true.legs``.
     """
 
-    true: SeenMachine
+    true: MachineView
     camera: Camera
     tubes: TubeList
 
     @classmethod
-    def of(cls, true: SeenMachine, camera: Camera) -> Eye:
+    def of(cls, true: MachineView, camera: Camera) -> Eye:
         """The edges of one tube a leg."""
         every = tubes_of(true.machine)
         chosen = visible_tubes(true.machine, true.legs)

@@ -25,7 +25,7 @@ from typing import ClassVar, Literal, NamedTuple, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.control.seen import Legs, SeenMachine, directions_of, legs_from_image, moved_to
+from pkmcal.control.machine_view import Legs, MachineView, directions_of, legs_from_image, moved_to
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, cross, dot, skew
 
@@ -50,12 +50,12 @@ class Rates(NamedTuple):
     free: Array
 
 
-def rates(seen: SeenMachine, legs: Legs) -> Rates:
+def rates(view: MachineView, legs: Legs) -> Rates:
     """Readings' and hinges' rates by the twist, and the twists that nothing forbids.
 
     Least squares where several rods share a motor. NaN where a crank is in line with its rod.
     """
-    layout = seen.machine.layout
+    layout = view.machine.layout
     m, spread = layout.n_readings, legs.b - legs.b.mean(axis=-2, keepdims=True)
     scale = np.sqrt(np.mean(dot(spread, spread), axis=-1))
     scale = np.where(scale > 0, scale, 1.0)
@@ -67,12 +67,12 @@ def rates(seen: SeenMachine, legs: Legs) -> Rates:
         gain = legs.drives[..., column, np.arange(m)]
         usable = np.abs(gain) > 0
         solved = -legs.rows[..., column, :] / np.where(usable, gain, np.nan)[..., None]
-    return Rates(solved[..., :m, :], solved[..., m:, :], _free(seen, legs, driving, scale))
+    return Rates(solved[..., :m, :], solved[..., m:, :], _free(view, legs, driving, scale))
 
 
-def _free(seen: SeenMachine, legs: Legs, driving: Array, scale: Array) -> Array:
+def _free(view: MachineView, legs: Legs, driving: Array, scale: Array) -> Array:
     """Twists (..., 6, f) that neither the motion nor undriven rows of the closure forbid."""
-    layout = seen.machine.layout
+    layout = view.machine.layout
     units = np.ones((*scale.shape, 6))
     units[..., :3] /= scale[..., None]
     motion = np.broadcast_to(layout.motion, (*scale.shape, *layout.motion.shape))
@@ -89,33 +89,33 @@ def _free(seen: SeenMachine, legs: Legs, driving: Array, scale: Array) -> Array:
     return units[..., :, None] * motion
 
 
-def moving(seen: SeenMachine, legs: Legs, rate: Rates) -> tuple[Array, Array]:
+def moving(view: MachineView, legs: Legs, rate: Rates) -> tuple[Array, Array]:
     """Derivatives (..., s, 3, 6) of the seen legs' ends A and B by the twist, base frame."""
-    layout = seen.machine.layout
-    column = layout.actuated[seen.legs]
+    layout = view.machine.layout
+    column = layout.actuated[view.legs]
     own = np.where((column >= 0)[:, None], rate.readings[..., np.maximum(column, 0), :], 0.0)
-    by_a = legs.a_by_reading[..., seen.legs, :, None] * own[..., None, :]
-    by_b = legs.b_by_pose[..., seen.legs, :, :]
+    by_a = legs.a_by_reading[..., view.legs, :, None] * own[..., None, :]
+    by_b = legs.b_by_pose[..., view.legs, :, :]
     if layout.n_internal:
-        by_b = by_b + legs.b_by_internal[..., seen.legs, :, :] @ rate.hinges[..., None, :, :]
+        by_b = by_b + legs.b_by_internal[..., view.legs, :, :] @ rate.hinges[..., None, :, :]
     return np.broadcast_to(by_a, by_b.shape), by_b
 
 
-def direction_interaction(seen: SeenMachine, legs: Legs, rate: Rates | None = None) -> Array:
+def direction_interaction(view: MachineView, legs: Legs, rate: Rates | None = None) -> Array:
     """L (..., s, 3, 6): rates of the seen legs' directions, camera frame, by the twist.
 
     [B] eq. 8-9; its twist is this one with the pivot in the camera's centre, told in the camera
-    frame, its velocity first. See :class:`pkmcal.control.seen.Legs` for the twist.
+    frame, its velocity first. See :class:`pkmcal.control.machine_view.Legs` for the twist.
     """
-    by_a, by_b = moving(seen, legs, rates(seen, legs) if rate is None else rate)
-    u, length = legs.u[..., seen.legs, :], legs.length[..., seen.legs, None, None]
-    moved = (by_b - by_a) / length
-    across = moved - u[..., :, None] * (u[..., None, :] @ moved)
-    return seen.T_camera_base[..., None, :3, :3] @ across
+    by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
+    u, length = legs.u[..., view.legs, :], legs.length[..., view.legs, None, None]
+    shifted = (by_b - by_a) / length
+    across = shifted - u[..., :, None] * (u[..., None, :] @ shifted)
+    return view.T_camera_base[..., None, :3, :3] @ across
 
 
 def edge_interaction(
-    seen: SeenMachine, legs: Legs, normals: Array, rate: Rates | None = None
+    view: MachineView, legs: Legs, normals: Array, rate: Rates | None = None
 ) -> Array:
     """(..., s, 2, 3, 6): rates of the edges' normals, camera frame, by the twist.
 
@@ -123,9 +123,9 @@ def edge_interaction(
     :func:`pkmcal.geometry.cylinders.edge_normal_jacobians`. Where A stays this is the errata's
     J L, with J = -(A x n) n^T / (u . (A x n)) and the direction's L; [B] 12-13 differentiated.
     """
-    by_a, by_b = moving(seen, legs, rates(seen, legs) if rate is None else rate)
-    T = seen.T_camera_base[..., None, :, :]
-    a, b = (apply(T, p[..., seen.legs, :])[..., None, :] for p in (legs.a, legs.b))
+    by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
+    T = view.T_camera_base[..., None, :, :]
+    a, b = (apply(T, p[..., view.legs, :])[..., None, :] for p in (legs.a, legs.b))
     by_a, by_b = (T[..., :3, :3] @ by for by in (by_a, by_b))
     side_a, side_b = cross(b, normals), cross(normals, a)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -156,7 +156,7 @@ class Law(ABC):
 
     @staticmethod
     @abstractmethod
-    def matrix(seen: SeenMachine, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
+    def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
         """N (..., s, k, 3, 6) by the twist, with the limbs and normals at one moment."""
 
 
@@ -173,10 +173,10 @@ class DirectionLaw(Law):
         return cross(directions_of(measured), directions_of(goal))[..., None, :]
 
     @staticmethod
-    def matrix(seen: SeenMachine, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
+    def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
         """N (..., s, 1, 3, 6)."""
         del normals
-        by_twist = -skew(directions_of(goal)) @ direction_interaction(seen, legs, rate)
+        by_twist = -skew(directions_of(goal)) @ direction_interaction(view, legs, rate)
         return by_twist[..., None, :, :]
 
 
@@ -193,9 +193,9 @@ class EdgeLaw(Law):
         return cross(measured, goal)
 
     @staticmethod
-    def matrix(seen: SeenMachine, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
+    def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
         """N (..., s, 2, 3, 6)."""
-        return -skew(goal) @ edge_interaction(seen, legs, normals, rate)
+        return -skew(goal) @ edge_interaction(view, legs, normals, rate)
 
 
 CONTROL_LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
@@ -228,7 +228,7 @@ class Task:
 
 def task_of(
     law: str,
-    seen: SeenMachine,
+    view: MachineView,
     measured: Array,
     goal: Array,
     legs: Legs,
@@ -239,10 +239,10 @@ def task_of(
 
     goal_legs : the limbs at the goal, needed where N is to be taken there or in the mean.
     """
-    kind, rate = law_named(law), rates(seen, legs)
+    kind, rate = law_named(law), rates(view, legs)
     parts: list[Array] = []
     if at != "goal":
-        parts.append(kind.matrix(seen, legs, measured, goal, rate))
+        parts.append(kind.matrix(view, legs, measured, goal, rate))
     if at != "measured":
         if goal_legs is None:
             raise InputError(
@@ -250,7 +250,7 @@ def task_of(
                 expected="goal_readings, or the interaction as measured",
             )
         there = moved_to(goal_legs, legs.pivot)
-        parts.append(kind.matrix(seen, there, goal, goal, rates(seen, there)))
+        parts.append(kind.matrix(view, there, goal, goal, rates(view, there)))
     by_twist = sum(parts[1:], parts[0]) / len(parts)
     error = kind.error(measured, goal)
     by_twist = by_twist.reshape(*by_twist.shape[:-4], -1, 6)
@@ -269,22 +269,24 @@ def solution(task: Task) -> Array:
 
     NaN where an edge or a limb has no place.
     """
-    known = np.asarray(np.isfinite(task.matrix).all(axis=(-1, -2)))
-    known = known & np.isfinite(task.error).all(axis=-1)
-    matrix = np.where(known[..., None, None], task.matrix, 0.0)
-    error = np.where(known[..., None], task.error, 0.0)
+    finite = np.asarray(np.isfinite(task.matrix).all(axis=(-1, -2)))
+    finite = finite & np.isfinite(task.error).all(axis=-1)
+    matrix = np.where(finite[..., None, None], task.matrix, 0.0)
+    error = np.where(finite[..., None], task.error, 0.0)
     turned = matrix.mT
     values, vectors = np.linalg.eigh(turned @ matrix)
-    seen = values > UNCOMMANDED_MOTION_SHARE**2 * values[..., -1:]
-    weights = np.where(seen & (values > 0), 1 / np.where(seen & (values > 0), values, 1.0), 0.0)
+    observable = values > UNCOMMANDED_MOTION_SHARE**2 * values[..., -1:]
+    weights = np.where(
+        observable & (values > 0), 1 / np.where(observable & (values > 0), values, 1.0), 0.0
+    )
     wanted = vectors.mT @ (turned @ error[..., None])
     step = (vectors @ (weights[..., None] * wanted))[..., 0]
-    return np.where(known[..., None], step, np.nan)
+    return np.where(finite[..., None], step, np.nan)
 
 
 def joint_velocities(
     law: str,
-    seen: SeenMachine,
+    view: MachineView,
     measured: Array,
     goal: Array,
     readings: Array,
@@ -300,11 +302,11 @@ def joint_velocities(
     gain : 1/s. at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
     NaN where an edge has no place, or a limb cannot be where the readings put it.
     """
-    legs = legs_from_image(seen, directions_of(measured), readings)
+    legs = legs_from_image(view, directions_of(measured), readings)
     goal_legs = None
     if at != "measured" and goal_readings is not None:
-        goal_legs = legs_from_image(seen, directions_of(goal), goal_readings)
-    task = task_of(law, seen, measured, goal, legs, goal_legs, at)
+        goal_legs = legs_from_image(view, directions_of(goal), goal_readings)
+    task = task_of(law, view, measured, goal, legs, goal_legs, at)
     return -gain * (task.readings @ solution(task)[..., None])[..., 0]
 
 

@@ -33,7 +33,7 @@ from pkmcal.control.laws import (
     solution,
     task_of,
 )
-from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
+from pkmcal.control.machine_view import MachineView, directions_of, legs_from_image, machine_view
 from pkmcal.control.track import (
     READINGS_LAG_SIGMA,
     SAME_ASSEMBLY_ANGLE,
@@ -60,7 +60,7 @@ GOAL_READING_TOLERANCE = 5e-4
 pixels tells it to 0.3 mm."""
 UNEXPLAINED_READINGS_LAG = 3 * READINGS_LAG_SIGMA
 """Metres between a photograph and its readings that a control loop's delay does not explain."""
-VAGUE_WAY_TOLERANCES = 4.0
+VAGUE_DISTANCE_TOLERANCES = 4.0
 """Tolerances that the standard deviation of a reading's way to the goal may have without a word."""
 AT_GOAL_DEVIATIONS = 5.0
 """The same in standard deviations, where a photograph says what these are."""
@@ -69,7 +69,7 @@ UNSEEN_READING_SIGMA = 0.05
 OTHER_PLACE_ANGLE = 0.02
 """Root mean square angle (rad) that is no noise: where readings are to stay and the edges are this
 far from the goal, the law has come to rest in another place."""
-NOT_FOUND = (
+NO_EDGES_TEXT = (
     "likely causes: another assembly than the start's, readings of another photograph, a camera"
     " that was moved, too little light"
 )
@@ -127,15 +127,15 @@ class VisualServo:
         _check_positive("tolerance", tolerance)
         self.machine, self.law, self.gain = machine, law, gain
         self.tolerance, self.period = tolerance, period
-        self.seen = seen_machine(machine, np.asarray(T_camera_base, dtype=float), legs)
+        self.view = machine_view(machine, np.asarray(T_camera_base, dtype=float), legs)
         self.rate_limits = _limits(machine, rate_limits)
         self._sight: Sight | None = None
         if camera is not None:
             pixels = binning or first_binning(camera.image_size)
-            self._sight = Sight(self.seen, camera, edge_shift, pixels)
+            self._sight = Sight(self.view, camera, edge_shift, pixels)
         self._ranges = machine.joint_ranges
-        self._parts: dict[bytes, SeenMachine] = {}
-        self.goal: Goal = goal_of(self._sight, self.seen, goal)
+        self._parts: dict[bytes, MachineView] = {}
+        self.goal: Goal = goal_of(self._sight, self.view, goal)
         self.reset(start)
 
     @classmethod
@@ -154,8 +154,8 @@ class VisualServo:
         the class. Raises InputError where the calibration has no such station, and ResultError
         for a calibration that was refused.
         """
-        from pkmcal.calibration.saved import load
-        from pkmcal.calibration.source import load_source
+        from pkmcal.calibration.machine_source import load_source
+        from pkmcal.calibration.saved_calibration import load
 
         saved = load(folder)
         if not saved.verdict.usable:
@@ -192,14 +192,14 @@ class VisualServo:
         """Forget all samples; the next one is a first one near ``start`` (4, 4), or home."""
         self._start = np.asarray(self.machine.home() if start is None else start, dtype=float)
         self._pose, self._started = self._start, False
-        self._track = first_track_state(self.seen, self._start)
+        self._track = first_track_state(self.view, self._start)
 
     def step_edges(self, normals: Array, readings: Array) -> Step:
         """Velocities from the edges (s, 2, 3) of the seen legs, camera frame, NaN for a leg that
         is not seen, and the readings (m,). Raises InputError for arrays that cannot be these.
         """
-        edges = checked_normals(self.seen, normals, "the edges")
-        reasons = ("no edges were given",) * len(self.seen.legs)
+        edges = checked_normals(self.view, normals, "the edges")
+        reasons = ("no edges were given",) * len(self.view.legs)
         return self._step(_Sample(edges, self._checked(readings), reasons))
 
     def step_image(self, image: Integers, readings: Array) -> Step:
@@ -218,37 +218,37 @@ class VisualServo:
         )
         if not at.closed:
             return self._stopped(sample, Status.UNREACHABLE, "")
-        if not self._started and 2 * at.found.sum() < len(at.found):
-            legs = self.seen.legs[at.found].tolist()
-            found = f"only {named(legs)} found" if legs else "no leg was found"
-            return self._stopped(sample, Status.NOT_FOUND, f"{found}; {NOT_FOUND}")
+        if not self._started and 2 * at.valid.sum() < len(at.valid):
+            legs = self.view.legs[at.valid].tolist()
+            value = f"only {named(legs)} found" if legs else "no leg was found"
+            return self._stopped(sample, Status.NOT_AT_READINGS, f"{value}; {NO_EDGES_TEXT}")
         return self._step(sample)
 
     def _step(self, sample: _Sample) -> Step:
         """Everything after the edges."""
-        known = np.isfinite(sample.normals + self.goal.normals)
-        used = np.all(known.reshape(len(known), -1), axis=1)
+        finite = np.isfinite(sample.normals + self.goal.normals)
+        used = np.all(finite.reshape(len(finite), -1), axis=1)
         if not used.any():
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
-        seen = self._part(used)
-        pose = self._pose_of(sample, seen)
+        in_view = self._part(used)
+        pose = self._pose_of(sample, in_view)
         if pose is None:
             return self._stopped(sample, Status.UNREACHABLE, "")
         if not self._started:
-            check_sides(self.seen, sample.normals, pose)
-            off = misfit(self.seen, sample.normals, pose, sample.readings)
+            check_sides(self.view, sample.normals, pose)
+            off = misfit(self.view, sample.normals, pose, sample.readings)
             if off > SAME_ASSEMBLY_ANGLE:
-                why = assembly_sentence(self.seen, sample.normals, pose, sample.readings)
+                why = assembly_sentence(self.view, sample.normals, pose, sample.readings)
                 return self._stopped(sample, Status.WRONG_ASSEMBLY, why)
         self._pose = pose
         cosine = dot(sample.normals[used], self.goal.normals[used])
         if np.min(cosine) < 0:
-            far = named(seen.legs[np.min(cosine, axis=1) < 0])
+            far = named(in_view.legs[np.min(cosine, axis=1) < 0])
             why = f"{far} would turn by more than 90 degrees in the image; go there in parts"
             return self._stopped(sample, Status.TOO_FAR, why)
         u = directions_of(sample.normals[used])
-        legs = legs_from_image(seen, u, sample.readings, self._pose)
-        task = task_of(self.law, seen, sample.normals[used], self.goal.normals[used], legs)
+        legs = legs_from_image(in_view, u, sample.readings, self._pose)
+        task = task_of(self.law, in_view, sample.normals[used], self.goal.normals[used], legs)
         error, noise = _root_mean_square(task.error), float("nan")
         if sample.lines is not None:
             task, noise = weighted_task(self.law, task, sample.lines, used)
@@ -261,9 +261,9 @@ class VisualServo:
         stop = self._unfit(sample, used, task)
         if stop is not None:
             return stop
-        known = noise > 0
-        sigma = noise * _spread(task) if known else np.full(self.machine.n_joints, np.nan)
-        vague = float(sigma.max()) if known else 0.0
+        above_limit = noise > 0
+        sigma = noise * _spread(task) if above_limit else np.full(self.machine.n_joints, np.nan)
+        vague = float(sigma.max()) if above_limit else 0.0
         if vague > UNSEEN_READING_SIGMA:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
         self._started = True
@@ -277,7 +277,7 @@ class VisualServo:
             return self._stopped(sample, Status.OUT_OF_RANGE, why)
         still = bool(np.max(np.abs(off)) <= self.tolerance)
         # a leg's direction scatters by more than that, so photographs are asked in sigmas
-        typical = _root_mean_square(task.error / np.sqrt(3)) / noise if known else np.inf
+        typical = _root_mean_square(task.error / np.sqrt(3)) / noise if above_limit else np.inf
         converged = still and (error < OTHER_PLACE_ANGLE or typical < AT_GOAL_DEVIATIONS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:
@@ -287,7 +287,7 @@ class VisualServo:
                 " place"
             )
             warnings = (*warnings, elsewhere)
-        if vague > VAGUE_WAY_TOLERANCES * self.tolerance:
+        if vague > VAGUE_DISTANCE_TOLERANCES * self.tolerance:
             warnings = (*warnings, vague_sentence(self.machine, sigma))
         status = Status.CONVERGED if converged else Status.RUNNING
         return Step(
@@ -318,23 +318,23 @@ class VisualServo:
             return float(np.linalg.svd(rows, compute_uv=False)[-1])
         return float(self.machine.forward_result(sample.readings, self._pose).singularity)
 
-    def _pose_of(self, sample: _Sample, seen: SeenMachine) -> Array | None:
+    def _pose_of(self, sample: _Sample, view: MachineView) -> Array | None:
         """The pose (4, 4) by forward kinematics, None where there is none.
 
         Where the law does without, the last one known serves: it decides the assembly only.
         """
         if sample.pose is not None:
             return sample.pose
-        if seen.by_image_alone and self._started:
+        if view.by_image_alone and self._started:
             return self._pose
-        found = self.machine.forward_result(sample.readings, self._pose)
-        return found.T_base_platform if bool(found.converged) else None
+        fk = self.machine.forward_result(sample.readings, self._pose)
+        return fk.T_base_platform if bool(fk.converged) else None
 
-    def _part(self, used: Booleans) -> SeenMachine:
+    def _part(self, used: Booleans) -> MachineView:
         """The seen machine with some of its legs only; made once for each choice."""
         key = used.tobytes()
         if key not in self._parts:
-            self._parts[key] = self.seen.only(used)
+            self._parts[key] = self.view.only(used)
         return self._parts[key]
 
     def _stopped(self, sample: _Sample, status: Status, why: str) -> Step:
@@ -348,7 +348,7 @@ class VisualServo:
             status=status,
             sentence=f"{status.value}: {why}" if why else status.value,
             warnings=(),
-            used=np.zeros(len(self.seen.legs), dtype=bool),
+            used=np.zeros(len(self.view.legs), dtype=bool),
             normals=sample.normals,
         )
 
@@ -357,11 +357,11 @@ class VisualServo:
         lost = "; ".join(self._lost(sample, used))
         if not used.any():
             return lost
-        left = f"{named(self.seen.legs[used])} alone cannot show every motion"
-        return f"{left}; {lost}" if lost else left
+        remainder = f"{named(self.view.legs[used])} alone cannot show every motion"
+        return f"{remainder}; {lost}" if lost else remainder
 
     def _lost(self, sample: _Sample, used: Booleans) -> list[str]:
-        return missing_clauses(self.seen.legs, used, self.goal.normals, sample.reasons)
+        return missing_clauses(self.view.legs, used, self.goal.normals, sample.reasons)
 
     def _warnings(
         self, sample: _Sample, used: Booleans, slowed: bool, outside: Booleans

@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.image import Eye
 from pkmcal.control.laws import MatrixPlace, joint_velocities, law_named, limited, solution, task_of
-from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
+from pkmcal.control.machine_view import MachineView, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
@@ -24,15 +24,15 @@ from pkmcal.simulation.edges import EdgeNoise
 
 IMAGES_A_GOAL = 24
 """Images of each goal; the standard deviation over all goals is then good to a few percent."""
-ARRIVED_WAY_LEFT = 0.02
+ARRIVED_DISTANCE_SHARE = 0.02
 """Part of the way at which a platform counts as arrived, as control engineers have it."""
-LEAST_WAY = 5e-4
+LEAST_DISTANCE = 5e-4
 """m, of the platform's joints, within which a goal is reached however short the way was."""
 FINAL_RUN_SHARE = 0.1
 """Part of a run, at its end, whose mean decides where it ended."""
 AT_GOAL_NOISE_DEVIATIONS = 3.0
 """Standard deviations of the noise at the goal within which a platform is there."""
-TREMBLING_WAY_SHARE = 0.1
+TREMBLING_DISTANCE_SHARE = 0.1
 """Part of the way beyond which a platform that trembles is not at its goal."""
 AT_REST = 0.02
 """Part of the rate that the error would ask for, below which a run stands still."""
@@ -84,7 +84,7 @@ class End(Enum):
         "a leg left the camera's view, so the control was stopped",
         "move the camera back, or lead the platform through a pose in between",
     )
-    LEFT_WORKSPACE = (
+    OUTSIDE_WORKSPACE = (
         "left_workspace",
         "a drive came to the end of its range, or a leg could not follow",
         "lead the platform through a pose in between, or improve the geometry that the control"
@@ -161,7 +161,7 @@ def loop_factor(step: float, delay: int) -> float:
 
 def one_image(
     eye: Eye,
-    believed: SeenMachine,
+    believed: MachineView,
     law: str,
     goals: Array,
     readings: Array,
@@ -215,7 +215,7 @@ class LoopSettings:
 class ServoRuns:
     """R runs of K samples.
 
-    time : (K,) s. error : (R, K) norm of e. way : (R, K) m, root mean square distance of the
+    time : (K,) s. error : (R, K) norm of e. travel : (R, K) m, root mean square distance of the
     platform's joints from the goal. past : (R, K) part of the way by which they are beyond it.
     T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R of them. last : (R,) the sample at
     which a run was stopped; later ones repeat it. goals : (R, 4, 4).
@@ -223,7 +223,7 @@ class ServoRuns:
 
     time: Array
     error: Array
-    way: Array
+    travel: Array
     past: Array
     T_base_platform: Array
     readings: Array
@@ -239,7 +239,7 @@ class ServoRuns:
 
 def simulate_servo_runs(
     eye: Eye,
-    believed: SeenMachine,
+    believed: MachineView,
     starts: Array,
     goals: Array,
     loop: LoopSettings,
@@ -269,7 +269,7 @@ def simulate_servo_runs(
                 loop.law, believed, edges, wanted, readings, loop.gain, at=loop.at,
                 goal_readings=goal_readings if loop.at != "measured" else None,
             )  # fmt: skip
-            now = _moved(eye.true.machine, now, limited(speeds, loop.speed) / loop.rate, k)
+            now = _driven(eye.true.machine, now, limited(speeds, loop.speed) / loop.rate, k)
         if k % 16 == 0:
             progress(k / loop.samples)
     return record.runs(now, goals, loop, floor)
@@ -303,7 +303,7 @@ def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
     )
     now = _Now(starts, np.nan_to_num(readings), sign, np.full(n, -1), np.zeros(n, dtype=int))
     out = outside(machine, readings) | outside(machine, wanted)
-    now = _stopped(now, out, End.LEFT_WORKSPACE, 0)
+    now = _stopped(now, out, End.OUTSIDE_WORKSPACE, 0)
     return _stopped(now, sign * wanted_sign < 0, End.WRONG_ASSEMBLY, 0)
 
 
@@ -317,20 +317,18 @@ def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
     )
 
 
-def _moved(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
+def _driven(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
     """Drives go by steps (R, m), and the platforms follow."""
     step = np.where(now.active[:, None], step, 0.0)
     now = _stopped(now, ~np.all(np.isfinite(step), axis=-1), End.LOST_LEG, sample)
     wanted = now.readings + np.nan_to_num(step)
-    now = _stopped(now, outside(machine, wanted), End.LEFT_WORKSPACE, sample)
+    now = _stopped(now, outside(machine, wanted), End.OUTSIDE_WORKSPACE, sample)
     wanted = np.where(now.active[:, None], wanted, now.readings)
-    found = forward(machine.layout, machine.values, wanted, now.poses)
-    poses, closed = found.T_base_platform, found.converged
+    fk = forward(machine.layout, machine.values, wanted, now.poses)
+    poses, closed = fk.T_base_platform, fk.converged
     turned = assembly_sign(machine.layout, machine.values, poses) * now.sign < 0
-    now = _stopped(
-        now, closed & (turned | (found.singularity < NEAR_SINGULAR)), End.SINGULAR, sample
-    )
-    now = _stopped(now, ~closed, End.LEFT_WORKSPACE, sample)
+    now = _stopped(now, closed & (turned | (fk.singularity < NEAR_SINGULAR)), End.SINGULAR, sample)
+    now = _stopped(now, ~closed, End.OUTSIDE_WORKSPACE, sample)
     return replace(
         now,
         readings=np.where(now.active[:, None], wanted, now.readings),
@@ -361,7 +359,7 @@ class _Record:
     goals: Array
     first: Array
     error: Array
-    way: Array
+    travel: Array
     past: Array
     poses: Array
     readings: Array
@@ -382,7 +380,7 @@ class _Record:
         off = platform_joints(self.machine, now.poses) - self.goals
         whole = np.sum(self.first**2, axis=(-1, -2))
         self.error[:, sample] = np.sqrt(np.sum(flat * flat, axis=-1))
-        self.way[:, sample] = np.sqrt(np.mean(dot(off, off), axis=-1))
+        self.travel[:, sample] = np.sqrt(np.mean(dot(off, off), axis=-1))
         ahead = np.sum(off * self.first, axis=(-1, -2))
         self.past[:, sample] = -ahead / np.where(whole > 0, whole, np.inf)
         self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
@@ -390,11 +388,11 @@ class _Record:
     def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> ServoRuns:
         """What the runs were, with their ends judged."""
         last = np.where(now.active, loop.samples - 1, now.last)
-        judged = _judged(self.error, self.way, loop, floor)
+        judged = _judged(self.error, self.travel, loop, floor)
         ends = [RUN_ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
         time = np.arange(loop.samples) / loop.rate
         return ServoRuns(
-            time, self.error, self.way, self.past, self.poses, self.readings, tuple(ends), last,
+            time, self.error, self.travel, self.past, self.poses, self.readings, tuple(ends), last,
             goals,
         )  # fmt: skip
 
@@ -410,28 +408,28 @@ def _floor(
     )
 
 
-def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[End]:
+def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) -> list[End]:
     """Where runs (R, K) that used all their time ended, by the means over their last part.
 
     floor : (R,) m, what noise alone explains.
     """
     n = max(1, round(FINAL_RUN_SHARE * error.shape[1]))
-    e, w = error[:, -n:].mean(axis=1), way[:, -n:].mean(axis=1)
-    before = way[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
-    near = np.maximum(ARRIVED_WAY_LEFT * way[:, 0], LEAST_WAY)
-    arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_WAY_SHARE * way[:, 0]))
+    e, w = error[:, -n:].mean(axis=1), direction[:, -n:].mean(axis=1)
+    before = direction[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
+    near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], LEAST_DISTANCE)
+    arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_DISTANCE_SHARE * direction[:, 0]))
     shaken = w < floor
     # what an exponential of this gain would still go in that time, were the control not at rest
     rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
-    alike = e < ARRIVED_WAY_LEFT * error[:, 0]
-    worse = w > way[:, 0]
-    return [_end(*case) for case in zip(arrived, shaken, alike, rest, worse, strict=True)]
+    same = e < ARRIVED_DISTANCE_SHARE * error[:, 0]
+    worse = w > direction[:, 0]
+    return [_end(*case) for case in zip(arrived, shaken, same, rest, worse, strict=True)]
 
 
-def _end(arrived: bool, shaken: bool, alike: bool, rest: bool, worse: bool) -> End:
+def _end(arrived: bool, shaken: bool, similar: bool, rest: bool, worse: bool) -> End:
     if arrived or shaken:
         return End.REACHED if arrived else End.UNSTEADY
-    if alike and rest:
+    if similar and rest:
         return End.OTHER_POSE
     if rest:
         return End.STUCK

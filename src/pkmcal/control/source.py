@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.saved import SavedCalibration, SavedStation, load
-from pkmcal.calibration.source import MachineSource, load_source
+from pkmcal.calibration.machine_source import MachineSource, load_source
+from pkmcal.calibration.saved_calibration import SavedCalibration, SavedStation, load
 from pkmcal.cameras import Camera, load_camera
-from pkmcal.control.seen import seen_machine
+from pkmcal.control.machine_view import machine_view
 from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
@@ -98,15 +98,15 @@ def _station(
             expected=" or ".join(names),
         )
     wanted = [one for one in saved.stations if name in (None, one.name)]
-    known = [one for one in wanted if eye is not None or one.name in source.cameras]
-    if not known:
+    reference_values = [one for one in wanted if eye is not None or one.name in source.cameras]
+    if not reference_values:
         raise InputError(
             "the station's camera file was not found",
             where=str(saved.path.parent),
             expected=", ".join(sorted({one.camera for one in wanted})),
             next_step="Name the session with --session, or the camera's file with --camera",
         )
-    return known[0]
+    return reference_values[0]
 
 
 def _of_drawing(
@@ -114,7 +114,7 @@ def _of_drawing(
 ) -> Plant:
     """A machine built within its drawing's tolerances."""
     machine = source.machine
-    seen_machine(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
+    machine_view(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
     rng = np.random.default_rng(stream(seed, "stations"))
     place = default_stations(machine, (eye,), rng)[0]
     table = machine.parameters

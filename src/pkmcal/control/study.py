@@ -18,9 +18,9 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, subsets
 from pkmcal.control.image import Eye
-from pkmcal.control.seen import SeenMachine, seen_machine
+from pkmcal.control.machine_view import MachineView, machine_view
 from pkmcal.control.simulation import (
-    ARRIVED_WAY_LEFT,
+    ARRIVED_DISTANCE_SHARE,
     End,
     LoopSettings,
     ServoRuns,
@@ -46,7 +46,7 @@ RANGE_END_SHARE = 0.15
 by its image does not go straight in its readings."""
 VISIBILITY_POSES = 60
 """Poses of the workspace at which visibility is judged."""
-TOLD_POSE_ROUNDING = 1e-6
+WRITTEN_POSE_ROUNDING = 1e-6
 """m; a pose told with six decimals leaves so much."""
 MOST_LEGS = 8
 """Legs of which all choices are compared."""
@@ -69,15 +69,15 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Belief:
-    """One estimate of the geometry. seen : values (R, P) and camera's places (R, 4, 4)."""
+    """One estimate of the geometry. view : values (R, P) and camera's places (R, 4, 4)."""
 
     name: str
     title: str
-    seen: SeenMachine
+    view: MachineView
 
 
 def estimates(
-    true: SeenMachine,
+    true: MachineView,
     drawing: Array,
     uncertainty: Uncertainty,
     runs: int,
@@ -98,7 +98,7 @@ def estimates(
     drawn = true.machine.with_values(drawing)
     fitted = _fitted(drawn, identified)
     exact = _fitted(drawn, replace(true, T_camera_base=T_camera_base))
-    by_hand = _moved_by_hand(exact, hand_position, hand_rotation, rng)
+    by_hand = _placed_by_hand(exact, hand_position, hand_rotation, rng)
     return (
         Belief("true", "True geometry", repeated),
         Belief("identified", "Identified", identified),
@@ -108,8 +108,8 @@ def estimates(
 
 
 def _identified(
-    true: SeenMachine, uncertainty: Uncertainty, runs: int, rng: np.random.Generator
-) -> SeenMachine:
+    true: MachineView, uncertainty: Uncertainty, runs: int, rng: np.random.Generator
+) -> MachineView:
     """Values and camera's places as a calibration would have them."""
     size, axes = np.linalg.eigh(uncertainty.covariance)
     root = axes * np.sqrt(np.maximum(size, 0.0))
@@ -120,25 +120,25 @@ def _identified(
     return replace(true, machine=machine, T_camera_base=inverse(T_base_camera))
 
 
-def _fitted(drawing: Machine, seen: SeenMachine) -> SeenMachine:
+def _fitted(drawing: Machine, view: MachineView) -> MachineView:
     """The drawing with the camera where the seen machine's base centres put it, [B] eq. 15."""
     middle, poses = drawing.middle_readings(), np.eye(4)
     here = limb_ends(drawing.layout, drawing.values, middle, poses).a
-    there = limb_ends(seen.machine.layout, seen.theta, middle, poses).a
-    target = apply(seen.T_camera_base[..., None, :, :], there)
+    there = limb_ends(view.machine.layout, view.theta, middle, poses).a
+    target = apply(view.T_camera_base[..., None, :, :], there)
     T = register(np.broadcast_to(here, target.shape), target)
-    return replace(seen, machine=drawing, T_camera_base=T)
+    return replace(view, machine=drawing, T_camera_base=T)
 
 
-def _moved_by_hand(
-    seen: SeenMachine, position: float, turn: float, rng: np.random.Generator
-) -> SeenMachine:
+def _placed_by_hand(
+    view: MachineView, position: float, turn: float, rng: np.random.Generator
+) -> MachineView:
     """The camera's places off by the sizes, m and rad, in random directions."""
-    drawn = rng.standard_normal((2, *seen.T_camera_base.shape[:-2], 3))
-    way, axis = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
-    T = inverse(seen.T_camera_base)
-    moved = pose(rotation(turn * axis) @ T[..., :3, :3], T[..., :3, 3] + position * way)
-    return replace(seen, T_camera_base=inverse(moved))
+    drawn = rng.standard_normal((2, *view.T_camera_base.shape[:-2], 3))
+    direction, axis = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+    T = inverse(view.T_camera_base)
+    shifted = pose(rotation(turn * axis) @ T[..., :3, :3], T[..., :3, 3] + position * direction)
+    return replace(view, T_camera_base=inverse(shifted))
 
 
 @dataclass(frozen=True)
@@ -175,10 +175,10 @@ class Plant:
     station: str | None = None
     findings: tuple[Finding, ...] = ()
 
-    def seen(self) -> SeenMachine:
+    def view(self) -> MachineView:
         """The true machine before the camera."""
         legs = None if self.legs is None else np.array(self.legs, dtype=int)
-        return seen_machine(self.machine, self.T_camera_base, legs)
+        return machine_view(self.machine, self.T_camera_base, legs)
 
 
 @dataclass(frozen=True)
@@ -187,9 +187,9 @@ class Trials:
 
     overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
     largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
-    s after which the platform is within ARRIVED_WAY_LEFT of its way, NaN where it never is. astray
-    : (R,) m, root mean square of the platform's joints, by which the platform left the way that it
-    takes with the true geometry, at most.
+    s after which the platform is within ARRIVED_DISTANCE_SHARE of its way, NaN where it never is.
+    astray : (R,) m, root mean square of the platform's joints, by which the platform left the way
+    that it takes with the true geometry, at most.
     """
 
     estimate: Belief
@@ -249,7 +249,7 @@ def study_servoing(
     """
     check_loop(plan.loop)
     seeds = np.random.SeedSequence(plan.seed).spawn(5)
-    eye = Eye.of(scene.seen(), scene.camera)
+    eye = Eye.of(scene.view(), scene.camera)
     progress("Looking at the workspace", 0.02)
     drawn = draw_configurations(
         scene.machine, VISIBILITY_POSES, 0.2, np.random.default_rng(seeds[0])
@@ -262,10 +262,10 @@ def study_servoing(
     )  # fmt: skip
     outcomes: list[Trials] = []
     for k, belief in enumerate(beliefs):
-        told = _told(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
+        subprogress = _subprogress(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
         # the same noise for all, so that differences are the estimates'
         rng = np.random.default_rng(seeds[3])
-        runs = simulate_servo_runs(eye, belief.seen, starts, goals, plan.loop, rng, told)
+        runs = simulate_servo_runs(eye, belief.view, starts, goals, plan.loop, rng, subprogress)
         ideal = outcomes[0].runs if outcomes else runs
         outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
     progress("Looking for other equilibria", 0.87)
@@ -273,9 +273,9 @@ def study_servoing(
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
     image = one_image(eye, eye.true, loop.law, goals, joints, loop.noise, rng)
     # of all legs with tubes; of those seen where there are too many to choose from
-    seen = seen_machine(scene.machine, scene.T_camera_base)
-    if len(seen.legs) > MOST_LEGS and scene.legs is not None:
-        seen = scene.seen()
+    view = machine_view(scene.machine, scene.T_camera_base)
+    if len(view.legs) > MOST_LEGS and scene.legs is not None:
+        view = scene.view()
     return Study(
         scene=scene,
         plan=plan,
@@ -284,7 +284,7 @@ def study_servoing(
         image=image,
         held=image.held(loop.gain / loop.rate, loop.delay),
         hidden=eye.hidden(ends, np.nan_to_num(scene.machine.inverse(ends))).mean(axis=0),
-        choices=subsets(matrix_at(seen, loop.law, workspace), seen.legs),
+        choices=subsets(matrix_at(view, loop.law, workspace), view.legs),
         equilibria=equilibria(
             eye.true, loop.law, goals[:EQUILIBRIA_GOALS], workspace[:EQUILIBRIA_STARTS]
         ),
@@ -338,10 +338,10 @@ def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
 
 
 def _settling(runs: ServoRuns) -> Array:
-    """Time (R,) after which the platform stays within ARRIVED_WAY_LEFT of its way; NaN where
+    """Time (R,) after which the platform stays within ARRIVED_DISTANCE_SHARE of its way; NaN where
     never.
     """
-    far = runs.way > ARRIVED_WAY_LEFT * runs.way[:, :1]
+    far = runs.travel > ARRIVED_DISTANCE_SHARE * runs.travel[:, :1]
     n = far.shape[1]
     after = n - np.argmax(far[:, ::-1], axis=1)
     after = np.where(far.any(axis=1), after, 0)
@@ -349,7 +349,7 @@ def _settling(runs: ServoRuns) -> Array:
     return np.where(runs.reached, time, np.nan)
 
 
-def _told(
+def _subprogress(
     progress: Callable[[str, float], None], text: str, first: float
 ) -> Callable[[float], None]:
     return lambda share: progress(text, first + 0.2 * share)
@@ -376,7 +376,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
     unreached = np.flatnonzero(~np.isfinite(readings))
     c = closure(layout, theta, np.nan_to_num(readings), T_base_platform, internal)
     gap = float(np.abs(c.rows.value).max())
-    if unreached.size or gap > TOLD_POSE_ROUNDING:
+    if unreached.size or gap > WRITTEN_POSE_ROUNDING:
         raise InputError(
             "the machine cannot take this pose",
             where=where,
@@ -398,10 +398,10 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
 def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
     """Poses (count, 4, 4) well inside the ranges, with all seen legs in view."""
     machine, tried = eye.true.machine, 0
-    found: list[Array] = [np.zeros((0, 4, 4))]
+    results: list[Array] = [np.zeros((0, 4, 4))]
     low, high = machine.joint_ranges.T
     for _ in range(6):
-        if sum(map(len, found)) >= count:
+        if sum(map(len, results)) >= count:
             break
         poses, joints = draw_configurations(machine, 4 * count + 20, 0.0, rng)
         with np.errstate(invalid="ignore"):
@@ -409,9 +409,9 @@ def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
             out = (joints < low + edge) | (joints > high - edge)
         in_view = eye.in_view(eye.points(poses, joints)).all(axis=-1)
         good = ~np.asarray(out.any(axis=-1)) & np.asarray(in_view)
-        found.append(poses[good])
+        results.append(poses[good])
         tried += len(poses)
-    out = np.concatenate(found)[:count]
+    out = np.concatenate(results)[:count]
     if len(out) < count:
         raise InputError(
             "the camera does not see all legs that it should in enough poses of the workspace",

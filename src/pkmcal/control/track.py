@@ -14,20 +14,20 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.control.laws import Task
-from pkmcal.control.seen import SeenMachine, directions_of, seen_ends
+from pkmcal.control.machine_view import MachineView, directions_of, leg_ends_in_view
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, skew
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
+from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.legs import (
     OUT_OF_SIGHT_REASON,
     StationEdges,
     measure,
     search,
 )
-from pkmcal.observe.photographs import Photographs
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -37,7 +37,7 @@ SHADING_EDGE_SHIFT = 0.1
 """Pixels, of those in which edges are looked for, by which a whole edge may lie off, whatever its
 own sigma: shading that the edge model leaves out (docs/observation.md measures 0.14 and 0.22 px a
 place)."""
-LEG_ENDS_ASIDE_SIGMA = 0.1
+LEG_ENDS_LATERAL_SIGMA = 0.1
 """Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
 it keeps the line of a leg with one edge finite until that leg is found to be lost."""
 READINGS_LAG_SIGMA = 0.001
@@ -60,14 +60,14 @@ class LegLines:
     normal : (L, 2, 3) unit, NaN where the leg was not found. basis : (L, 2, 3, 2) tangent bases,
     shift first. joint : (L, 4, 4) covariance in these, rad^2, side 0 before side 1: how far away a
     leg is turns both against each other. agrees : (L,) its edges fit one leg.
-    found : (L,) an edge of either side was measured, and they agree.
+    valid : (L,) an edge of either side was measured, and they agree.
     """
 
     normal: Array
     basis: Array
     joint: Array
     agrees: Booleans
-    found: Booleans
+    valid: Booleans
 
     @classmethod
     def nothing(cls, count: int) -> LegLines:
@@ -75,8 +75,8 @@ class LegLines:
         normal, basis, joint = (
             np.full((count, *shape), np.nan) for shape in ((2, 3), (2, 3, 2), (4, 4))
         )
-        agrees, found = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-        return cls(normal, basis, joint, agrees, found)
+        agrees, valid = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        return cls(normal, basis, joint, agrees, valid)
 
 
 @dataclass(frozen=True)
@@ -105,16 +105,16 @@ class EdgeMisfits:
 
 
 def edge_misfits(
-    seen: SeenMachine, readings: Array, T_base_platform: Array, edges: EdgeSet, edge_shift: float
+    view: MachineView, readings: Array, T_base_platform: Array, edges: EdgeSet, edge_shift: float
 ) -> EdgeMisfits:
     """Edges of the seen legs against the machine at a pose (4, 4) and its readings (m,).
 
     edge_shift : px by which the camera shows all edges outward.
     """
-    machine = seen.machine
+    machine = view.machine
     c = closure(machine.layout, machine.values, readings, T_base_platform)
-    a, b = (apply(seen.T_camera_base, p[seen.legs]) for p in (c.a, c.b))
-    own = edges.leg[:, None] == seen.legs
+    a, b = (apply(view.T_camera_base, p[view.legs]) for p in (c.a, c.b))
+    own = edges.leg[:, None] == view.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
     radius = machine.radii_of(edges.leg, edges.tube)
@@ -135,13 +135,13 @@ def edge_misfits(
     )
 
 
-def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
+def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
     """Lines of the seen legs from their edges.
 
     A leg's line has four freedoms, its two ends across the leg; every edge tells two, whatever its
     tube's radius. One Gauss-Newton step: a prediction right to 1.5 px leaves 1e-5 rad.
     """
-    count = len(seen.legs)
+    count = len(view.legs)
     pick = rows.of_leg(count)
     d = rows.b - rows.a
     across = tangent_basis(d / np.sqrt(dot(d, d))[:, None], rows.a)
@@ -149,20 +149,20 @@ def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     jac = np.concatenate([rows.by_a @ e, rows.by_b @ e], axis=-1)
     to_right = jac.mT @ rows.information
     covariance = np.linalg.inv(
-        np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / LEG_ENDS_ASIDE_SIGMA**2
+        np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / LEG_ENDS_LATERAL_SIGMA**2
     )
     right = pick @ (to_right @ rows.misfit[..., None])[..., 0]
-    moved = (covariance @ right[..., None])[..., 0]
-    left = rows.misfit - (jac @ moved[rows.leg][..., None])[..., 0]
-    square = pick @ dot(left, (rows.information @ left[..., None])[..., 0])
+    shifted = (covariance @ right[..., None])[..., 0]
+    residual = rows.misfit - (jac @ shifted[rows.leg][..., None])[..., 0]
+    square = pick @ dot(residual, (rows.information @ residual[..., None])[..., 0])
     agrees = square < ONE_LEG_MISFIT * np.maximum(2 * pick.sum(axis=1) - 4, 1)
     both = np.logical_and(*(pick @ (rows.side == side) > 0 for side in LEG_EDGE_SIDES))
     a, b = (
         p + (across @ m[..., None])[..., 0]
-        for p, m in ((rows.a, moved[:, :2]), (rows.b, moved[:, 2:]))
+        for p, m in ((rows.a, shifted[:, :2]), (rows.b, shifted[:, 2:]))
     )
     # and as the edges that a cylinder of the controller's radius would show
-    radius = seen.radius[:, None]
+    radius = view.radius[:, None]
     at = edge_normal_jacobians(a[:, None], b[:, None], radius, LEG_EDGE_SIDES)
     middle = (a + b)[:, None] / 2 + radius[..., None] * at.n
     basis = tangent_basis(at.n, middle / np.sqrt(dot(middle, middle))[..., None])
@@ -220,18 +220,18 @@ def _direction_spread(normal: Array, basis: Array, joint: Array) -> tuple[Array,
 
 
 def corrected_pose(
-    seen: SeenMachine, T_base_platform: Array, rows: EdgeMisfits, found: Booleans
+    view: MachineView, T_base_platform: Array, rows: EdgeMisfits, valid: Booleans
 ) -> Array:
     """The pose (4, 4) moved so that the edges of the legs found (s,) fit best: one Gauss-Newton
     step, in the directions in which the platform moves.
 
     Edges far off count less (Cauchy), so that one leg taken for another does not carry the pose.
     """
-    use = found[rows.leg]
+    use = valid[rows.leg]
     if not use.any():
         return T_base_platform
-    motion, c, rot = seen.machine.layout.motion, rows.closure, seen.T_camera_base[:3, :3]
-    leg, misfit, information = seen.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
+    motion, c, rot = view.machine.layout.motion, rows.closure, view.T_camera_base[:3, :3]
+    leg, misfit, information = view.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
     jac = rows.by_b[use] @ (rot @ c.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
@@ -253,7 +253,7 @@ class Sight:
     how many pixels across, and down, are one where they are looked for.
     """
 
-    seen: SeenMachine
+    view: MachineView
     camera: Camera
     edge_shift: float = 0.0
     binning: int = 1
@@ -267,7 +267,7 @@ class Sight:
     def misfits(self, readings: Array, T_base_platform: Array, edges: EdgeSet) -> EdgeMisfits:
         """The :func:`edge_misfits` of edges found in one."""
         shift = self.edge_shift / self.binning
-        return edge_misfits(self.seen, readings, T_base_platform, edges, shift)
+        return edge_misfits(self.view, readings, T_base_platform, edges, shift)
 
 
 @dataclass(frozen=True)
@@ -275,13 +275,13 @@ class TrackState:
     """What one photograph tells the next.
 
     T_base_platform : (4, 4) pose that the readings gave. correction : (6,) by which the edges lay
-    beside it (left perturbation). found : (L,) seen legs that were found. blur : px, NaN before
+    beside it (left perturbation). valid : (L,) seen legs that were found. blur : px, NaN before
     legs were found for the first time. searched : whether they had to be searched.
     """
 
     T_base_platform: Array
     correction: Array
-    found: Booleans
+    valid: Booleans
     blur: float = float("nan")
     searched: bool = False
 
@@ -291,14 +291,14 @@ class TrackedLegs:
     """The seen legs in one photograph; L seen legs, camera frame.
 
     lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost.
-    found : (L,). reasons : (L,) why a leg is lost, "" where it is not.
+    valid : (L,). reasons : (L,) why a leg is lost, "" where it is not.
     T_base_platform : (4, 4) pose that the edges show, near the one that the readings give.
     closed : False where no pose fits the readings. beside : m, the largest error of a rod's length
     that this pose means: readings that are late, or another photograph's. state : for the next one.
     """
 
     lines: LegLines
-    found: Booleans
+    valid: Booleans
     reasons: tuple[str, ...]
     T_base_platform: Array
     closed: bool
@@ -306,10 +306,10 @@ class TrackedLegs:
     state: TrackState
 
 
-def first_track_state(seen: SeenMachine, start: Array | None = None) -> TrackState:
+def first_track_state(view: MachineView, start: Array | None = None) -> TrackState:
     """Before the first photograph; start : (4, 4) pose near which the machine stands."""
-    begin = seen.machine.home() if start is None else start
-    none = np.zeros(len(seen.legs), dtype=bool)
+    begin = view.machine.home() if start is None else start
+    none = np.zeros(len(view.legs), dtype=bool)
     return TrackState(np.asarray(begin, dtype=float), np.zeros(6), none)
 
 
@@ -331,89 +331,91 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
     image that is not this camera's.
     """
     check_image(image, sight.camera)
-    seen = sight.seen
-    forward = seen.machine.forward_result(readings, state.T_base_platform)
+    view = sight.view
+    forward = view.machine.forward_result(readings, state.T_base_platform)
     if not bool(forward.converged):
-        lines = LegLines.nothing(len(seen.legs))
-        reasons = ("the readings cannot be the machine's",) * len(seen.legs)
-        lost = replace(state, found=lines.found)
-        return TrackedLegs(lines, lines.found, reasons, state.T_base_platform, False, 0.0, lost)
+        lines = LegLines.nothing(len(view.legs))
+        reasons = ("the readings cannot be the machine's",) * len(view.legs)
+        lost = replace(state, valid=lines.valid)
+        return TrackedLegs(lines, lines.valid, reasons, state.T_base_platform, False, 0.0, lost)
     closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
     photograph = sight.photograph(image, readings)
     predicted = perturb(closed, state.correction)
-    searched = not first and _poor(state.found) and not state.searched
+    searched = not first and _poor(state.valid) and not state.searched
     if searched:
         predicted = _searched(sight, photograph, predicted)
-    at = _look(sight, photograph, predicted, blur)
+    at = _edge_pass(sight, photograph, predicted, blur)
     if first:
-        again = _look(sight, photograph, _searched(sight, photograph, predicted), blur)
-        searched = again.evidence > at.evidence
+        again = _edge_pass(sight, photograph, _searched(sight, photograph, predicted), blur)
+        searched = again.quality > at.quality
         at = again if searched else at
-    found = at.lines.found
-    if found.any() and first:
-        blur = at.look.blur
+    value = at.lines.valid
+    if value.any() and first:
+        blur = at.station_edges.blur
         warm_up(blur)
-    T = closed if _poor(found) else corrected_pose(seen, at.predicted, at.rows, found)
+    T = closed if _poor(value) else corrected_pose(view, at.predicted, at.rows, value)
     correction = pose_difference(T, closed)
     beside = np.abs(at.rows.closure.rows.by_pose @ correction)
-    next_state = TrackState(closed, correction, found, blur, searched)
+    next_state = TrackState(closed, correction, value, blur, searched)
     reasons = _reasons(sight, at)
-    return TrackedLegs(at.lines, found, reasons, T, True, float(beside.max()), next_state)
+    return TrackedLegs(at.lines, value, reasons, T, True, float(beside.max()), next_state)
 
 
-def _poor(found: Booleans) -> bool:
+def _poor(valid: Booleans) -> bool:
     """Fewer than half of the legs: the prediction is at fault and not what hides them."""
-    return 2 * int(found.sum()) < len(found)
+    return 2 * int(valid.sum()) < len(valid)
 
 
 @dataclass(frozen=True)
-class _Look:
+class _EdgePass:
     """A sub-pixel look about a predicted pose (4, 4), and the legs' lines from it; far : the
     prediction was so wrong that they are not believed.
     """
 
     predicted: Array
-    look: StationEdges
+    station_edges: StationEdges
     rows: EdgeMisfits
     lines: LegLines
     far: bool
 
     @property
-    def evidence(self) -> tuple[int, float]:
+    def quality(self) -> tuple[int, float]:
         """More edges are better, then smaller distances from the prediction."""
-        return (0 if self.far else len(self.rows.leg), -self.look.moved)
+        return (0 if self.far else len(self.rows.leg), -self.station_edges.shift)
 
 
-def _look(sight: Sight, photograph: Photographs, predicted: Array, blur: float) -> _Look:
-    seen = sight.seen
-    known = None if np.isnan(blur) else blur
-    look = measure(photograph, seen.machine, seen.T_camera_base, predicted[None], known)
-    rows = sight.misfits(photograph.joints[0], predicted, look.edges)
-    far = look.moved > LOST_EDGE_DISTANCE
-    lines = LegLines.nothing(len(seen.legs)) if far else leg_lines(seen, rows)
-    return _Look(predicted, look, rows, lines, far)
+def _edge_pass(sight: Sight, photograph: Photographs, predicted: Array, blur: float) -> _EdgePass:
+    view = sight.view
+    reference = None if np.isnan(blur) else blur
+    station_edges = measure(
+        photograph, view.machine, view.T_camera_base, predicted[None], reference
+    )
+    rows = sight.misfits(photograph.joints[0], predicted, station_edges.edges)
+    far = station_edges.shift > LOST_EDGE_DISTANCE
+    lines = LegLines.nothing(len(view.legs)) if far else leg_lines(view, rows)
+    return _EdgePass(predicted, station_edges, rows, lines, far)
 
 
 def _searched(sight: Sight, photograph: Photographs, predicted: Array) -> Array:
     """The pose (4, 4) that the wide search gives."""
-    seen, readings = sight.seen, photograph.joints[0]
-    look = search(photograph, seen.machine, seen.T_camera_base, predicted[None])
-    every = np.ones(len(seen.legs), dtype=bool)
+    view, readings = sight.view, photograph.joints[0]
+    station_edges = search(photograph, view.machine, view.T_camera_base, predicted[None])
+    every = np.ones(len(view.legs), dtype=bool)
     for _ in range(SEARCH_ROUNDS):
-        rows = sight.misfits(readings, predicted, look.edges)
-        predicted = corrected_pose(seen, predicted, rows, every)
+        rows = sight.misfits(readings, predicted, station_edges.edges)
+        predicted = corrected_pose(view, predicted, rows, every)
     return predicted
 
 
-def _reasons(sight: Sight, at: _Look) -> tuple[str, ...]:
+def _reasons(sight: Sight, at: _EdgePass) -> tuple[str, ...]:
     if at.far:
-        return ("its edges are not where they were predicted",) * len(sight.seen.legs)
+        return ("its edges are not where they were predicted",) * len(sight.view.legs)
     out: list[str] = []
-    for leg, found, agrees in zip(sight.seen.legs, at.lines.found, at.lines.agrees, strict=True):
-        mine = [r.reason for r in at.look.rejected if r.leg == leg]
-        shown = [reason for reason in mine if reason != OUT_OF_SIGHT_REASON]
-        why = (shown or mine or ["only one of its sides is seen"])[0]
-        out.append("" if found else why if agrees else "its edges do not belong to one leg")
+    for leg, results, agrees in zip(sight.view.legs, at.lines.valid, at.lines.agrees, strict=True):
+        mine = [r.reason for r in at.station_edges.rejected if r.leg == leg]
+        display = [reason for reason in mine if reason != OUT_OF_SIGHT_REASON]
+        why = (display or mine or ["only one of its sides is seen"])[0]
+        out.append("" if results else why if agrees else "its edges do not belong to one leg")
     return tuple(out)
 
 
@@ -436,40 +438,40 @@ def check_image(image: Integers, camera: Camera) -> None:
         )
 
 
-def misfit(seen: SeenMachine, normals: Array, T_base_platform: Array, readings: Array) -> float:
+def misfit(view: MachineView, normals: Array, T_base_platform: Array, readings: Array) -> float:
     """Median angle (rad) between the legs as seen, (s, 2, 3), and at a pose (4, 4)."""
-    a, b = seen_ends(seen, T_base_platform, readings)
-    known = np.isfinite(normals).all(axis=(-1, -2))
-    cosine = dot(directions_of(normals[known]), line_through(a[known], b[known])[0])
+    a, b = leg_ends_in_view(view, T_base_platform, readings)
+    finite = np.isfinite(normals).all(axis=(-1, -2))
+    cosine = dot(directions_of(normals[finite]), line_through(a[finite], b[finite])[0])
     return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def nearest_assembly(
-    seen: SeenMachine, normals: Array, readings: Array
+    view: MachineView, normals: Array, readings: Array
 ) -> tuple[Array, float] | None:
     """Of all assemblies at the readings the one that the legs (s, 2, 3) show best, and its misfit;
     None where there is none. A search: takes a fraction of a second.
     """
-    modes = seen.machine.assembly_modes(readings, np.random.default_rng(0))
+    modes = view.machine.assembly_modes(readings, np.random.default_rng(0))
     if not len(modes):
         return None
-    angles = [misfit(seen, normals, T, readings) for T in modes]
+    angles = [misfit(view, normals, T, readings) for T in modes]
     best = int(np.argmin(angles))
     return modes[best], angles[best]
 
 
-def assembly_sentence(seen: SeenMachine, normals: Array, expected: Array, readings: Array) -> str:
+def assembly_sentence(view: MachineView, normals: Array, expected: Array, readings: Array) -> str:
     """What the legs show instead of the expected pose (4, 4)."""
-    off = np.rad2deg(misfit(seen, normals, expected, readings))
+    off = np.rad2deg(misfit(view, normals, expected, readings))
     text = f"the legs point {off:.0f} degrees away from where the start and the readings put them"
-    found = nearest_assembly(seen, normals, readings)
-    if found is None or found[1] > SAME_ASSEMBLY_ANGLE:
+    value = nearest_assembly(view, normals, readings)
+    if value is None or value[1] > SAME_ASSEMBLY_ANGLE:
         return (
             f"{text}, and no other assembly fits them: check the readings' order and units,"
             " and the camera's place"
         )
-    x, y, z = found[0][:3, 3]
-    turn = np.rad2deg(np.linalg.norm(pose_difference(found[0], expected)[:3]))
+    x, y, z = value[0][:3, 3]
+    turn = np.rad2deg(np.linalg.norm(pose_difference(value[0], expected)[:3]))
     return (
         f"{text}; they show the assembly with the platform at ({x:.3f}, {y:.3f}, {z:.3f}) m,"
         f" turned by {turn:.0f} degrees against it: give that pose as start, or bring the machine"

@@ -21,17 +21,21 @@ MODEL_POSE_ROUNDING = 1e-9
 def differences(model: ReadModel, machine: Machine) -> list[Difference]:
     """Joint centres at home, loops there and at other poses, radii."""
     turned, shifted, n = _forward(model, machine)
-    known = {
+    reference_values = {
         f"leg{j + 1}_tube{t + 1}": float(radius)
         for j, radii in enumerate(machine.radii())
         for t, radius in enumerate(radii)
     }
-    found = [model.radii.get(name, np.nan) for name in known]
+    results = [model.radii.get(name, np.nan) for name in reference_values]
     loops = largest(model.gaps(model.key))
     return [
         *_centres(model, machine),
         Difference("loops at home", loops, MODEL_GEOMETRY_ROUNDING),
-        Difference("tubes' radii", largest(found, list(known.values())), MODEL_GEOMETRY_ROUNDING),
+        Difference(
+            "tubes' radii",
+            largest(results, list(reference_values.values())),
+            MODEL_GEOMETRY_ROUNDING,
+        ),
         Difference(f"platform's place at {n} poses", shifted, MODEL_POSE_ROUNDING),
         Difference(f"platform's turn at {n} poses", turned, MODEL_POSE_ROUNDING, "rad"),
     ]
@@ -40,13 +44,13 @@ def differences(model: ReadModel, machine: Machine) -> list[Difference]:
 def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
     """Limbs' ends at home beside the machine's at the keyframe's pose and readings."""
     T = model.places(model.key)["platform"]
-    found = machine.forward_result(model.ctrl, T)
-    ends = limb_ends(machine.layout, machine.values, model.ctrl, T, found.internal)
+    fk = machine.forward_result(model.ctrl, T)
+    ends = limb_ends(machine.layout, machine.values, model.ctrl, T, fk.internal)
     places = model.site_places(model.key)
-    told = {"base": "joint centres on the base", "platform": "joint centres on the platform"}
-    told["tip"] = "ends of the rods"
+    what_is = {"base": "joint centres on the base", "platform": "joint centres on the platform"}
+    what_is["tip"] = "ends of the rods"
     out: list[Difference] = []
-    for site, what in told.items():
+    for site, what in what_is.items():
         read_again = np.array([places[f"leg{j + 1}_{site}"] for j in range(machine.n_legs)])
         gap = largest(read_again, ends.a if site == "base" else ends.b)
         out.append(Difference(f"{what} at home", gap, MODEL_GEOMETRY_ROUNDING))

@@ -76,7 +76,7 @@ class RoundBar:
     start: Array
     stop: Array | None
     radius: float
-    look: str
+    colour: str
     name: str = ""
 
     @property
@@ -101,7 +101,7 @@ class TreeBody:
     """A body, its place (4, 4) as drawn in its parent's frame, and its joints, one after the other.
 
     free : it has all six freedoms instead. middle, size : m, the middle of what is drawn of it and
-    its length. said : what people should know of it. points : named places (3,).
+    its length. comment : what people should know of it. points : named places (3,).
     """
 
     name: str
@@ -110,7 +110,7 @@ class TreeBody:
     middle: Array
     size: float
     free: bool = False
-    said: str = ""
+    comment: str = ""
     joints: list[BodyJoint] = field(default_factory=list[BodyJoint])
     shapes: list[RoundBar] = field(default_factory=list[RoundBar])
     points: dict[str, Array] = field(default_factory=dict[str, Array])
@@ -146,7 +146,7 @@ class Coupling:
     name: str
     follower: str
     leader: str
-    said: str
+    comment: str
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def _add_platform(
             home.middle,
             2.4 * radius,
             free=motion == "spatial",
-            said=WHY_RESTRICTED.get(motion, "The platform has all six freedoms."),
+            comment=WHY_RESTRICTED.get(motion, "The platform has all six freedoms."),
         ),
     )
     if not platform.free:
@@ -229,7 +229,7 @@ def _holders(
 ) -> list[tuple[TreeBody, Array]]:
     """What holds each leg; bars are made as legs ask for them."""
     limbs, out = home.limbs, list[tuple[TreeBody, Array]]()
-    known: dict[str, tuple[int, TreeBody]] = {}
+    numbers: dict[str, tuple[int, TreeBody]] = {}
     for j, held in enumerate(limbs.held):
         if held == FIXED_CARRIER:
             out.append((bodies[1], limbs.platform[j]))
@@ -237,9 +237,9 @@ def _holders(
         node = home.leg(j).platform
         number = platform_carriers()[node.joint].body
         name = f"{number}{getattr(node, number)}" if number else f"leg{j + 1}_bar"
-        if name not in known:
-            known[name] = j, _side_bar(bodies, couplings, home, j, name)
-        first, bar = known[name]
+        if name not in numbers:
+            numbers[name] = j, _side_bar(bodies, couplings, home, j, name)
+        first, bar = numbers[name]
         hinges = np.stack([limbs.platform, limbs.hinge_axis], axis=1)
         if np.abs(hinges[j] - hinges[first]).max() > SAME_HINGE_DIFFERENCE:
             raise InputError(
@@ -268,11 +268,11 @@ def _side_bar(
     bar = _body(bodies, TreeBody(name, platform, pose(home.rot.T, hinge), np.zeros(3), reach))
     if "translation" not in home.machine.document.motion:
         bar.joints.append(BodyJoint(f"{name}_turn", "hinge", BASE_FRAME_UP))
-        said = (
+        text = (
             f"{name} keeps its direction: it turns back by what the platform turns. Its forearms' "
             "parallelograms, each drawn as one rod, do this in the machine."
         )
-        couplings.append(Coupling(f"{name}_keeps_direction", f"{name}_turn", "platform_turn", said))
+        couplings.append(Coupling(f"{name}_keeps_direction", f"{name}_turn", "platform_turn", text))
     return bar
 
 
@@ -291,7 +291,7 @@ def _add_legs(
         place = pose(np.eye(3), home.a[j] - origin)
         middle = home.u[j] * length / 2
         rod = _body(
-            bodies, TreeBody(f"{name}_rod", parent, place, middle, length, said=_words(home, j))
+            bodies, TreeBody(f"{name}_rod", parent, place, middle, length, comment=_words(home, j))
         )
         for hinge, axis in _base_hinges(home, j):
             rod.joints.append(BodyJoint(f"{name}_{hinge}", "hinge", axis))
@@ -303,19 +303,19 @@ def _add_legs(
 
 def _words(home: HomeState, j: int) -> str:
     """A leg in words."""
-    leg, found = home.leg(j), home.equations[j]
+    leg, value = home.leg(j), home.equations[j]
     rod = "a rod of constant length"
-    if home.gives_way(j):
+    if home.length_varies(j):
         driven = home.limbs.drive[j] == TELESCOPE_ROD
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not found and home.machine.document.motion not in PLANAR_MOTIONS:
+    if not value and home.machine.document.motion not in PLANAR_MOTIONS:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
-    if "torsion" in found:
+    if "torsion" in value:
         out += " Its universal joints keep it from twisting."
-    if any("platform" in kind for kind in found):
+    if any("platform" in kind for kind in value):
         out += " It may turn about its own line; its equations say nothing of that."
     return out
 
@@ -379,28 +379,28 @@ def _motor(
 
 def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
     """Names and axes (3,) of a leg's hinges on the base side, in their order."""
-    found = home.equations[j]
+    value = home.equations[j]
     if home.machine.document.motion in PLANAR_MOTIONS:
         yield "base", BASE_FRAME_UP
         return
-    if "revolute base" in found:
+    if "revolute base" in value:
         axis = joint_axis(home, "base", j)
         yield "base", BASE_FRAME_UP if axis is None else axis
     else:
         first, second = universal_hinges(home, j)
         yield "base_first", first
         yield "base_second", second
-    if "revolute platform" in found:
+    if "revolute platform" in value:
         yield "twist", home.u[j]
 
 
 def _end_hinges(home: HomeState, j: int) -> tuple[tuple[str, Array], ...]:
     """Likewise on the platform side where its axes count; none for a ball."""
-    found, own = home.equations[j], joint_axis(home, "platform", j)
-    if own is not None and "torsion" in found:
+    value, own = home.equations[j], joint_axis(home, "platform", j)
+    if own is not None and "torsion" in value:
         second = universal_hinges(home, j)[1]
         return ("platform_second", second), ("platform_first", home.rot @ own)
-    if own is not None and "revolute platform" in found:
+    if own is not None and "revolute platform" in value:
         return (("platform", home.rot @ own),)
     return ()
 
@@ -415,7 +415,7 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
     tubes = _tubes(home, j, reach)
     names = [f"leg{j + 1}_tube{k + 1}" for k in range(len(home.leg(j).tubes))]
     names += [""] * (len(tubes) - len(names))
-    if not home.gives_way(j):
+    if not home.length_varies(j):
         for (radius, start, stop), name in zip(tubes, names, strict=True):
             rod.shapes.append(RoundBar(start * u, min(stop, length) * u, radius, "rod", name))
         return rod, length * u
@@ -441,7 +441,7 @@ def _tubes(home: HomeState, j: int, reach: float) -> list[tuple[float, float, fl
         (float(r), float(t.start), float(t.stop))
         for r, t in zip(radii, home.leg(j).tubes, strict=True)
     ]
-    if not home.gives_way(j):
+    if not home.length_varies(j):
         return tubes or [(length / 80, 0.0, length)]
     if not tubes:
         tubes = [(length / 60, 0.0, 0.55 * length)]

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import legible
 from pkmcal.export.contract import Difference, Exporter, exact, largest
 from pkmcal.export.limbs import (
@@ -342,7 +342,7 @@ _WORD = re.compile(r"(?<![\w.])[A-Z_]+")
 def _body(text: str, name: str) -> str:
     """A constant's value, with its braces, without comments."""
     plain = _without_comments(text)
-    ends = (found.end() for found in _CONSTANT.finditer(plain) if found[1] == name)
+    ends = (match.end() for match in _CONSTANT.finditer(plain) if match[1] == name)
     return next((plain[end:].partition("= ")[2].partition(";")[0] for end in ends), "")
 
 

@@ -1,9 +1,9 @@
 """What a format of other programs offers, and an export from start to end.
 
 A format is one file in this folder: a subclass of :class:`Exporter`, which turns a
-:class:`~pkmcal.calibration.source.MachineSource` into texts and reads them again by itself, as the
-other program would: with that program's units, signs and formulas, and with nothing of ours but the
-text. :func:`make_export` gives out only what agrees with the machine.
+:class:`~pkmcal.calibration.machine_source.MachineSource` into texts and reads them again by itself,
+as the other program would: with that program's units, signs and formulas, and with nothing of ours
+but the text. :func:`make_export` gives out only what agrees with the machine.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome.finding import Finding
@@ -87,14 +87,14 @@ def exporters() -> dict[str, Exporter]:
 
 def exporter_of(name: str) -> Exporter:
     """A format by its word after ``--to``; InputError lists them."""
-    known = exporters()
-    if name in known:
-        return known[name]
-    guess = closest(name, known)
+    reference_values = exporters()
+    if name in reference_values:
+        return reference_values[name]
+    guess = closest(name, reference_values)
     raise InputError(
         "there is no such format to export to",
         found=name,
-        expected=(f"{guess}, or another of " if guess else "") + listed(list(known), 20),
+        expected=(f"{guess}, or another of " if guess else "") + listed(list(reference_values), 20),
     )
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference
 from pkmcal.export.limbs import (
@@ -114,8 +114,8 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     limbs, motion = all_limbs(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
         joints = sorted({leg.base.joint for leg in machine.document.legs})
-        found = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
-        raise _no_delta(machine, program, found)
+        value = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
+        raise _no_delta(machine, program, value)
     rods = rod_limbs(machine)
     if len(rods) != 3 or machine.n_joints != 3 or FLOAT_CARRIER in rods.held:
         raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
@@ -152,11 +152,11 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     )
 
 
-def _no_delta(machine: Machine, program: str, found: str) -> InputError:
+def _no_delta(machine: Machine, program: str, text: str) -> InputError:
     return InputError(
         f"{program} has settings for linear and rotary deltas, and mechanism {machine.name!r}"
         " is neither",
-        found=found,
+        found=text,
         expected="motion: translation with three sliders, or three cranks, and rods",
         next_step="Export it with --to c",
     )
@@ -196,13 +196,13 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     home = machine.home()
     begin = machine.inverse(home)
     begin = np.where(np.isfinite(begin), begin, grid)  # of a motor that cannot reach home
-    found = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
+    fk = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
     for share in np.linspace(0, 1, STEPS_FROM_HOME + 1)[1:]:
         here = begin + share * (grid - begin)
-        found = machine.forward_result(here, found.T_base_platform)
-    poses = found.T_base_platform
+        fk = machine.forward_result(here, fk.T_base_platform)
+    poses = fk.T_base_platform
     back = machine.inverse(poses)
-    good = found.converged & (found.singularity > LEAST_DELTA_SINGULARITY)
+    good = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
     ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
     good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
@@ -324,19 +324,19 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
 
     # central differences: at an exact model the error ends below a nanometre
     solution = least_squares(off, packed.zeros, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14)
-    found = packed.fit(solution.x)
-    error = np.linalg.norm(_tool_error(found, points, readings, by_reading), axis=1)
-    found = replace(
-        found, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
+    values = packed.fit(solution.x)
+    error = np.linalg.norm(_tool_error(values, points, readings, by_reading), axis=1)
+    values = replace(
+        values, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
     )
-    if not found.largest <= MOST_TOOL_ERROR:
+    if not values.largest <= MOST_TOOL_ERROR:
         raise InputError(
             f"{delta.program} cannot follow this machine: its parameters leave the tool off",
-            found=f"{found.largest:.2f} mm",
+            found=f"{values.largest:.2f} mm",
             expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
             next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
         )
-    return found
+    return values
 
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
@@ -551,12 +551,12 @@ def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list
 def switch_values(text: str, readings: Array) -> Array:
     """The values (3,) that lines of :func:`proportional_switches` give at readings (3,)."""
     lines = (line.partition(" * (reading - ") for line in text.splitlines())
-    found = [
+    results = [
         (*head.replace("+ ", "+").replace("- ", "-").split()[-2:], tail.partition(")")[0])
         for head, times, tail in lines
         if times
     ]
-    value, rate, end = np.array(found, dtype=float).T
+    value, rate, end = np.array(results, dtype=float).T
     return value + rate * (readings - end)
 
 
@@ -596,8 +596,8 @@ def read_firmware_from_base(text: str) -> Array:
 
 def stated(text: str) -> float:
     """The error that a text admits, m."""
-    found = _STATED.search(text)
-    return float(found.group(1)) / MM_A_METRE if found else 0.0
+    match = _STATED.search(text)
+    return float(match.group(1)) / MM_A_METRE if match else 0.0
 
 
 def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
@@ -612,12 +612,12 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
     off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
     largest = float(np.where(result.converged, off, np.inf).max())
-    told = stated(text)
+    given_values = stated(text)
     return Difference(
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         largest,
         # the fit is judged to first order, so a large error may be a fiftieth larger
-        1.02 * told + TOOL_ROUNDING,
+        1.02 * given_values + TOOL_ROUNDING,
     )
 
 

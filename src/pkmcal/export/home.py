@@ -94,7 +94,7 @@ class HomeState:
             float(np.linalg.norm(self.limbs.arm[j])) if self.limbs.drive[j] == TURN_CARRIER else 1.0
         )
 
-    def gives_way(self, j: int) -> bool:
+    def length_varies(self, j: int) -> bool:
         """Whether leg j's length changes, by its motor or because it is passive."""
         return self.limbs.drive[j] == TELESCOPE_ROD or not np.isfinite(self.limbs.length[j])
 
@@ -108,29 +108,31 @@ def home_state(machine: Machine) -> HomeState:
     near = on_manifold(layout, values, machine.home()).T_base_platform
     readings, internal = inverse_result(layout, values, near)
     reached = bool(np.isfinite(readings).all())
-    found = forward(layout, values, readings, near, internal) if reached else None
-    if found is None or not bool(found.converged):
+    fk = forward(layout, values, readings, near, internal) if reached else None
+    if fk is None or not bool(fk.converged):
         raise GeometryError(
             f"mechanism {machine.name!r} does not close at its home pose",
-            found="no readings" if found is None else f"a gap of {float(found.error) * 1e3:.3g} mm",
+            found="no readings" if fk is None else f"a gap of {float(fk.error) * 1e3:.3g} mm",
             expected="a pose that all legs reach",
             next_step="give home: {position: [x, y, z]} in the mechanism file",
         )
-    ends = limb_ends(layout, values, readings, found.T_base_platform, found.internal)
+    ends = limb_ends(layout, values, readings, fk.T_base_platform, fk.internal)
     line = ends.b - ends.a
     distance = np.sqrt(dot(line, line))
-    known = equations(machine.document)
+    reference = equations(machine.document)
     return HomeState(
         machine,
         all_limbs(machine),
-        found.T_base_platform,
+        fk.T_base_platform,
         readings,
-        found.internal,
+        fk.internal,
         np.array(ends.a),
         np.array(ends.b),
         line / distance[:, None],
         distance,
-        tuple(frozenset(kind for leg, kind in known if leg == j) for j in range(machine.n_legs)),
+        tuple(
+            frozenset(kind for leg, kind in reference if leg == j) for j in range(machine.n_legs)
+        ),
     )
 
 
@@ -139,9 +141,9 @@ def joint_axis(home: HomeState, side: str, j: int) -> Array | None:
     drawn where nothing depends on it; None where the joint has none.
     """
     machine = home.machine
-    known = (machine.base_axes() if side == "base" else machine.platform_axes())[j]
-    if np.isfinite(known).all():
-        return known
+    finite = (machine.base_axes() if side == "base" else machine.platform_axes())[j]
+    if np.isfinite(finite).all():
+        return finite
     drawn = getattr(getattr(home.leg(j), side), "axis", None)
     return None if drawn is None else _unit(np.array(drawn, dtype=float))
 

@@ -15,7 +15,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.export.delta import (
@@ -87,23 +87,23 @@ class Klipper(Exporter):
         """Read as Klipper does, and moved by its formulas."""
         fit = _fit(source)
         text = files[FILE]
-        found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
-        found.read_string(text)
+        config = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+        config.read_string(text)
         move = klipper_carriage_heights if fit.kind == "linear" else klipper_arm_angles
-        zero = homed(found) - fit.rate * fit.delta.ends[fit.order]
+        zero = homed(config) - fit.rate * fit.delta.ends[fit.order]
         elsewhere = [
             np.where(
                 np.isnan(readings),
                 0.0,
-                _homed_by(found, values) - (fit.rate * readings + fit.zero),
+                _homed_by(config, values) - (fit.rate * readings + fit.zero),
             )
             for readings, values in _endstops_elsewhere(text, fit)
         ]
         radius = workspace_radius(source) if fit.kind == "linear" else None
-        own = found.getfloat("printer", "print_radius", fallback=None)
+        own = config.getfloat("printer", "print_radius", fallback=None)
         same = own == (None if radius is None else float(radius))
         return [
-            firmware_tool_difference(text, fit, lambda points: move(found, points), zero),
+            firmware_tool_difference(text, fit, lambda points: move(config, points), zero),
             Difference(
                 f"motors at end switches elsewhere, {len(elsewhere)} readings",
                 largest(elsewhere) if elsewhere else np.inf,
@@ -163,8 +163,10 @@ def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[st
     back = np.array([_homed_by(config, row) for row in heights])
     lines: list[str] = []
     for k, name in enumerate(KLIPPER_STEPPERS):
-        known = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
-        pairs = [f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in known]
+        above_limit = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
+        pairs = [
+            f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in above_limit
+        ]
         lines.append(f"stepper_{name}.position_endstop = {', '.join(pairs)}")
     return lines
 
@@ -185,12 +187,12 @@ def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
     return out
 
 
-def _homed_by(found: ConfigParser, endstops: Array) -> Array:
+def _homed_by(config: ConfigParser, endstops: Array) -> Array:
     """Motor positions (3,) by other end switches than those of a configuration; NaN where one's is
     not given.
     """
     other = ConfigParser()
-    other.read_dict(found)
+    other.read_dict(config)
     for name, value in zip(KLIPPER_STEPPERS, endstops, strict=True):
         other[f"stepper_{name}"]["position_endstop"] = repr(float(value))
     return homed(other)
@@ -222,39 +224,39 @@ def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
     return sections
 
 
-def _each(found: ConfigParser, key: str) -> Array:
-    return np.array([found.getfloat(f"stepper_{name}", key) for name in KLIPPER_STEPPERS])
+def _each(config: ConfigParser, key: str) -> Array:
+    return np.array([config.getfloat(f"stepper_{name}", key) for name in KLIPPER_STEPPERS])
 
 
-def homed(found: ConfigParser) -> Array:
+def homed(config: ConfigParser) -> Array:
     """Motor positions (3,), mm or degrees, where the end switches trigger."""
-    ends = _each(found, "position_endstop")
-    if found.get("printer", "kinematics") == "delta":
-        radius = found.getfloat("printer", "delta_radius")
-        return ends + np.sqrt(_each(found, "arm_length") ** 2 - radius**2)
+    ends = _each(config, "position_endstop")
+    if config.get("printer", "kinematics") == "delta":
+        radius = config.getfloat("printer", "delta_radius")
+        return ends + np.sqrt(_each(config, "arm_length") ** 2 - radius**2)
     middle = np.zeros((3, 3))
     middle[:, 2] = ends
-    return np.diag(klipper_arm_angles(found, middle))
+    return np.diag(klipper_arm_angles(config, middle))
 
 
-def klipper_carriage_heights(found: ConfigParser, points: Array) -> Array:
+def klipper_carriage_heights(config: ConfigParser, points: Array) -> Array:
     """Carriages' heights (n, 3) mm at points (n, 3) mm."""
-    radius = found.getfloat("printer", "delta_radius")
-    angle = _each(found, "angle") / DEGREES_A_RADIAN
+    radius = config.getfloat("printer", "delta_radius")
+    angle = _each(config, "angle") / DEGREES_A_RADIAN
     dx = radius * np.cos(angle) - points[:, :1]
     dy = radius * np.sin(angle) - points[:, 1:2]
-    return np.sqrt(_each(found, "arm_length") ** 2 - dx**2 - dy**2) + points[:, 2:]
+    return np.sqrt(_each(config, "arm_length") ** 2 - dx**2 - dy**2) + points[:, 2:]
 
 
-def klipper_arm_angles(found: ConfigParser, points: Array) -> Array:
+def klipper_arm_angles(config: ConfigParser, points: Array) -> Array:
     """Arms' angles (n, 3) degrees at points (n, 3) mm: a circle cut by a line, as Klipper does."""
-    angle = _each(found, "angle") / DEGREES_A_RADIAN
+    angle = _each(config, "angle") / DEGREES_A_RADIAN
     c, s = np.cos(angle), np.sin(angle)
     across = points[:, 1:2] * c - points[:, :1] * s
-    dx = points[:, :1] * c + points[:, 1:2] * s - found.getfloat("printer", "shoulder_radius")
-    dy = points[:, 2:] - found.getfloat("printer", "shoulder_height")
-    upper = _each(found, "upper_arm_length") ** 2
-    lower = _each(found, "lower_arm_length") ** 2 - across**2
+    dx = points[:, :1] * c + points[:, 1:2] * s - config.getfloat("printer", "shoulder_radius")
+    dy = points[:, 2:] - config.getfloat("printer", "shoulder_height")
+    upper = _each(config, "upper_arm_length") ** 2
+    lower = _each(config, "lower_arm_length") ** 2 - across**2
     first = (dx**2 + dy**2 + upper - lower) / (2 * dy)
     slope = dx / dy
     scale = slope**2 + 1

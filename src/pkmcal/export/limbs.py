@@ -83,17 +83,17 @@ class Limbs:
 def all_limbs(machine: Machine) -> Limbs:
     """All limbs of a machine; InputError where a carrier is no elementary joint."""
     layout, values = machine.layout, machine.parameters.unit_axes(machine.values)
-    base, axis, arm, moved = _chains(
+    base, axis, arm, shifted = _chains(
         machine, "base", layout.base, (FIXED_CARRIER, SLIDE_CARRIER, TURN_CARRIER)
     )
     hinge, hinge_axis, bar, held = _chains(
         machine, "platform", layout.platform, (FIXED_CARRIER, TURN_CARRIER, FLOAT_CARRIER)
     )
     # an arm that nothing turns belongs to its place; of one that turns, what lies along the axis
-    turns = np.array([kind == TURN_CARRIER for kind in moved])[:, None]
+    turns = np.array([kind == TURN_CARRIER for kind in shifted])[:, None]
     along = np.where(turns, dot(axis, arm)[:, None] * axis, arm)
     barred = np.array([kind != FIXED_CARRIER for kind in held])[:, None]
-    driven = np.where(layout.rod_reads, TELESCOPE_ROD, moved)
+    driven = np.where(layout.rod_reads, TELESCOPE_ROD, shifted)
     rods = np.where(layout.rod >= 0, layout.rod, 0)
     return Limbs(
         leg=np.arange(machine.n_legs) + 1,
@@ -129,7 +129,7 @@ def rod_limbs(machine: Machine) -> Limbs:
 
 
 def _chains(
-    machine: Machine, side: str, groups: tuple[CarrierGroup, ...], known: tuple[str, ...]
+    machine: Machine, side: str, groups: tuple[CarrierGroup, ...], names: tuple[str, ...]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     """Points, axes and arms (L, 3) of one side's joints, and their motions."""
     values = machine.parameters.unit_axes(machine.values)
@@ -137,13 +137,13 @@ def _chains(
     motion = [""] * machine.n_legs
     for group in groups:
         chain: Chain | None = group.carrier.chain(group.of(values))
-        if chain is None or chain.motion not in known:
+        if chain is None or chain.motion not in names:
             leg = int(group.legs[0])
             raise InputError(
                 f"leg {leg + 1} of mechanism {machine.name!r} is carried on its {side} side by no"
                 " joint that an export knows",
                 found=getattr(machine.document.legs[leg], side).joint,
-                expected="a joint that is one of " + ", ".join(known),
+                expected="a joint that is one of " + ", ".join(names),
                 next_step="Give its carrier a chain, see docs/export.md",
             )
         point[group.legs], axis[group.legs], arm[group.legs] = chain.point, chain.axis, chain.arm

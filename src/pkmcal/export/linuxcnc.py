@@ -29,7 +29,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_HEADER_FILE, C_SOURCE_FILE
 from pkmcal.export.contract import Difference, Exporter, commented, exact, largest

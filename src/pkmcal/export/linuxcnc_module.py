@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_HEADER_FILE, C_SELFTEST_FILE, CSource, c_value, filled, numbers_of
 from pkmcal.export.contract import Difference, largest

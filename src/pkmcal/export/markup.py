@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Comment, Element, indent, tostring
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import legible
 
 
@@ -44,5 +44,5 @@ def document(root: Element, source: MachineSource, conventions: Iterable[str]) -
 
 def file_name(name: str) -> str:
     """A machine's name as a file's, without an ending."""
-    kept = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
-    return kept.strip("-") or "machine"
+    retained = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
+    return retained.strip("-") or "machine"

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import BODY_COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
 from pkmcal.export.contract import Difference, Exporter
@@ -73,7 +73,7 @@ def _mjcf(source: MachineSource) -> str:
     _fill(world, tree.bodies[0], tree)
     equality = SubElement(root, "equality")
     for coupling in tree.couplings:
-        comment(equality, coupling.said)
+        comment(equality, coupling.comment)
         out = SubElement(equality, "joint", name=coupling.name, joint1=coupling.follower)
         out.set("joint2", coupling.leader)
         out.set("polycoef", "0 -1 0 0 0")
@@ -106,8 +106,8 @@ def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
     for name, point in body.points.items():
         SubElement(node, "site", name=name, pos=numbers_text(point))
     for child in tree.children(body):
-        if child.said:
-            comment(node, child.said)
+        if child.comment:
+            comment(node, child.comment)
         mass = MUJOCO_PLATFORM_MASS if child is tree.platform else MUJOCO_PART_MASS
         made = _body(node, child.name, child.T_parent_body, mass, child.middle, child.size)
         if child.free:
@@ -151,7 +151,7 @@ def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0)
 
 
 def _geom(parent: Element, shape: RoundBar) -> None:
-    size, rgba = numbers_text(shape.radius), BODY_COLOURS[shape.look]
+    size, rgba = numbers_text(shape.radius), BODY_COLOURS[shape.colour]
     if shape.stop is None:
         SubElement(
             parent, "geom", type="sphere", pos=numbers_text(shape.start), size=size, rgba=rgba

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, final
 
 import yaml
 
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
@@ -42,8 +42,8 @@ class MechanismYaml(Exporter):
         document = yaml.safe_load(files[PLAIN_MECHANISM_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        found = _values_in(document, table.names)
-        return [Difference(f"{len(found)} values read again", largest(found, values), 0.0)]
+        count = _values_in(document, table.names)
+        return [Difference(f"{len(count)} values read again", largest(count, values), 0.0)]
 
 
 @final
@@ -94,10 +94,10 @@ class MachineJson(Exporter):
         document = json.loads(files[PLAIN_MACHINE_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        found = [p["value"] for p in document["parameters"]]
+        results = [p["value"] for p in document["parameters"]]
         again = _values_in(document["mechanism"], table.names)
         out = [
-            Difference(f"{len(found)} values read again", largest(found, values), 0.0),
+            Difference(f"{len(results)} values read again", largest(results, values), 0.0),
             Difference("values in the mechanism", largest(again, values), 0.0),
         ]
         if source.covariance is not None:

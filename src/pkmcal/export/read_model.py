@@ -139,7 +139,7 @@ class ReadModel:
         goal : (n, 4, 4) poses that the body ``platform`` shall take besides.
         """
 
-        def left(x: Array) -> Array:
+        def remainder(x: Array) -> Array:
             gaps = self.gaps(x)
             if goal is None:
                 return gaps
@@ -149,8 +149,10 @@ class ReadModel:
 
         steps = DIFFERENCE_QUOTIENT_STEP * np.eye(x.shape[-1])[~held]
         for _ in range(MOST_CLOSING_STEPS):
-            value = left(x)
-            by_freedom = (left(x[:, None] + steps) - value[:, None]).mT / DIFFERENCE_QUOTIENT_STEP
+            value = remainder(x)
+            by_freedom = (
+                remainder(x[:, None] + steps) - value[:, None]
+            ).mT / DIFFERENCE_QUOTIENT_STEP
             step = np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ value[..., None]
             x = x.copy()
             x[:, ~held] -= step[..., 0]
@@ -170,8 +172,10 @@ def body_poses(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
             if j.kind == "free":
                 here = perturb(here, x[..., j.dof : j.dof + 6])
                 continue
-            way = (x[..., j.dof, None] - j.ref) * j.axis
+            sense = (x[..., j.dof, None] - j.ref) * j.axis
             turns = j.kind == "hinge"
-            here = here @ (pose(rotation(way), NO_TRANSLATION) if turns else pose(np.eye(3), way))
+            here = here @ (
+                pose(rotation(sense), NO_TRANSLATION) if turns else pose(np.eye(3), sense)
+            )
         at.append(here)
     return at

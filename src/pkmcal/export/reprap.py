@@ -16,7 +16,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.export.delta import (
@@ -63,8 +63,8 @@ class RepRap(Exporter):
     def files(self, source: MachineSource) -> dict[str, str]:
         """One file of G-code."""
         fit = _fit(source)
-        way = "mm" if fit.kind == "linear" else "degree"
-        correcting = f"Divide its steps per {way} (M92) by that."
+        sense = "mm" if fit.kind == "linear" else "degree"
+        correcting = f"Divide its steps per {sense} (M92) by that."
         lines = about(source, fit, "XYZ", correcting)
         names = [f"M666 {letter}" for letter in "XYZ"]
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]

@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.cameras.files import foreign_text, load_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact
@@ -58,8 +58,8 @@ class Ros(Exporter):
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
         """Transforms by the quaternions' own formula, cameras by the reader of foreign files."""
         frames = frame_names(source)
-        found = transforms(files[ROS_LAUNCH_FILE])
-        off = [float(np.abs(found[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
+        results = transforms(files[ROS_LAUNCH_FILE])
+        off = [float(np.abs(results[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
         out = [Difference(f"{len(off)} transforms read again", max(off), TRANSFORM_ROUNDING)]
         for station, camera in source.cameras.items():
             text = files.get(f"camera_info_{frames[station]}.yaml")

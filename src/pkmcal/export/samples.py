@@ -30,20 +30,20 @@ def samples(
     ranges = machine.joint_ranges
     if np.isfinite(ranges).all() and not machine.layout.overdetermined:  # which few readings close
         wanted = rng.uniform(ranges[:, 0], ranges[:, 1], (4 * count, machine.n_joints))
-        found = machine.forward_result(wanted)
+        fk = machine.forward_result(wanted)
     else:
         away = machine.base_centers() - machine.home()[:3, 3]
         reach = float(np.linalg.norm(away, axis=1).mean())  # m, of the limbs at home
         shifts = rng.uniform(-1, 1, (4 * count, 6)) * [0.1, 0.1, 0.1, *[0.05 * reach] * 3]
         motion = machine.layout.motion
-        moved = perturb(machine.home(), shifts @ motion @ motion.T)
-        found = on_manifold(machine.layout, machine.values, moved)
+        shifted = perturb(machine.home(), shifts @ motion @ motion.T)
+        fk = on_manifold(machine.layout, machine.values, shifted)
         wanted = None
-    poses = found.T_base_platform
+    poses = fk.T_base_platform
     joints = machine.inverse(poses)
     good = (
-        found.converged
-        & (found.singularity > LEAST_SAMPLE_SINGULARITY)
+        fk.converged
+        & (fk.singularity > LEAST_SAMPLE_SINGULARITY)
         & np.isfinite(joints).all(axis=-1)
     )
     if wanted is not None:

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
     BODY_COLOURS,
@@ -78,11 +78,13 @@ def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
     root = Element("sdf", {"version": version, "xmlns:pkmcal": SDF_NAMESPACE})
     model = SubElement(root, "model", name=name)
     for k, reading in enumerate(tree.home.readings):
-        known = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
-        SubElement(model, "pkmcal:reading", known, scale=numbers_text(tree.home.scale(k)))
+        reference_values = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
+        SubElement(
+            model, "pkmcal:reading", reference_values, scale=numbers_text(tree.home.scale(k))
+        )
     for body in tree.bodies:
-        if body.said:
-            comment(model, body.said)
+        if body.comment:
+            comment(model, body.comment)
         _chain(model, body, tree)
         node = SubElement(model, "link", name=body.name)
         if body.parent is not None:
@@ -152,8 +154,8 @@ def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
     if joint.column < 0:
         SubElement(limit, "effort").text = "0"  # or readers take a motor for what has no limit
     else:
-        known = np.sort(tree.home.values(joint.column)[1:] - joint.value)
-        for end, value in zip(("lower", "upper"), known, strict=True):
+        reference_values = np.sort(tree.home.values(joint.column)[1:] - joint.value)
+        for end, value in zip(("lower", "upper"), reference_values, strict=True):
             if np.isfinite(value):
                 SubElement(limit, end).text = numbers_text(value)
     for coupling in tree.couplings:
@@ -195,4 +197,4 @@ def _visual(link: Element, shape: RoundBar, name: str) -> None:
         SubElement(form, "length").text = numbers_text(length)
     material = SubElement(out, "material")
     for light in ("ambient", "diffuse"):
-        SubElement(material, light).text = BODY_COLOURS[shape.look]
+        SubElement(material, light).text = BODY_COLOURS[shape.colour]

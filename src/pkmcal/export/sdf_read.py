@@ -36,7 +36,11 @@ def read_sdf(text: str) -> ReadModel:
         bodies=tuple(made.bodies),
         loops=tuple(loops),
         couplings=tuple(
-            ReadCoupling(made.known[name].dof, made.known[mimic.attrib["joint"]].dof, *_way(mimic))
+            ReadCoupling(
+                made.joints_by_name[name].dof,
+                made.joints_by_name[mimic.attrib["joint"]].dof,
+                *_ratio_and_offset(mimic),
+            )
             for name, node in made.joints.items()
             if (mimic := node.find("axis/mimic")) is not None
         ),
@@ -45,9 +49,9 @@ def read_sdf(text: str) -> ReadModel:
             node.attrib["name"]: float(node.findtext("geometry/cylinder/radius", "nan"))
             for node in model.iter("visual")
         },
-        actuated=np.array([made.known[name].dof for name in made.readings], dtype=int),
-        gear=np.array([1 / float(told["scale"]) for told in made.readings.values()]),
-        ctrl=np.array([float(told["home"]) for told in made.readings.values()]),
+        actuated=np.array([made.joints_by_name[name].dof for name in made.readings], dtype=int),
+        gear=np.array([1 / float(values["scale"]) for values in made.readings.values()]),
+        ctrl=np.array([float(values["home"]) for values in made.readings.values()]),
         key=np.array(made.key),
     )
 
@@ -73,7 +77,7 @@ class _Links:
         }
         self.bodies = [ReadBody(SDF_WORLD_FRAME, 0, np.eye(4), ())]
         self.numbers = {SDF_WORLD_FRAME: 0}
-        self.known: dict[str, ReadJoint] = {}
+        self.joints_by_name: dict[str, ReadJoint] = {}
         self.key: list[float] = []
 
     def drawn(self, name: str) -> Array:
@@ -123,9 +127,9 @@ class _Links:
 
     def _axes(self, name: str, at: Array) -> tuple[ReadJoint, ...]:
         """A joint's axes in its own frame, which is drawn at a place (4, 4)."""
-        node, told = self.joints[name], self.readings.get(name)
+        node, reading = self.joints[name], self.readings.get(name)
         # a reading's joint counts from home, its state here from reading zero
-        ref = 0.0 if told is None else float(told["scale"]) * float(told["home"])
+        ref = 0.0 if reading is None else float(reading["scale"]) * float(reading["home"])
         kind = "slide" if node.attrib["type"] == "prismatic" else "hinge"
         out: list[ReadJoint] = []
         for tag in SDF_JOINT_AXES.get(node.attrib["type"], ()):
@@ -136,7 +140,7 @@ class _Links:
             out.append(ReadJoint(name, kind, axis, len(self.key), ref))
             self.key.append(ref)
         if out:
-            self.known[name] = out[0]
+            self.joints_by_name[name] = out[0]
         return tuple(out)
 
 
@@ -144,7 +148,7 @@ def _named(model: Element, tag: str) -> dict[str, Element]:
     return {node.attrib["name"]: node for node in model.findall(tag)}
 
 
-def _way(mimic: Element) -> tuple[float, float]:
+def _ratio_and_offset(mimic: Element) -> tuple[float, float]:
     """Ratio and offset of multiplier * (leader - reference) + offset."""
     ratio, offset, zero = (
         float(mimic.findtext(word, "nan")) for word in ("multiplier", "offset", "reference")

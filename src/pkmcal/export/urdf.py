@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.source import MachineSource
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
     BODY_COLOURS,
@@ -96,11 +96,11 @@ def _file_names(source: MachineSource) -> tuple[str, str]:
 
 def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
     root = Element("robot", name=file_name(source.machine.name))
-    for look, rgba in BODY_COLOURS.items():
-        SubElement(SubElement(root, "material", name=look), "color", rgba=rgba)
+    for style, rgba in BODY_COLOURS.items():
+        SubElement(SubElement(root, "material", name=style), "color", rgba=rgba)
     for body in tree.bodies:
-        if body.said:
-            comment(root, body.said)
+        if body.comment:
+            comment(root, body.comment)
         last = "" if body.parent is None else body.parent.name
         for link, joint, origin in _steps(body):
             _joint(root, joint, (last, link), origin, tree)
@@ -112,12 +112,12 @@ def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
             _visual(node, shape)
     for loop in tree.loops:
         _ends(root, loop, tree)
-    told = {
+    transmissions = {
         "loops": loops,
         "pose": FREE_PLATFORM_WORDS if tree.platform.free else RESTRICTED_PLATFORM_WORDS,
         "reach": JOINT_LIMIT_ROD_LENGTHS,
     }
-    return document(root, source, [line.format(**told) for line in CONVENTIONS])
+    return document(root, source, [line.format(**transmissions) for line in CONVENTIONS])
 
 
 def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
@@ -183,9 +183,9 @@ def _limits(joint: BodyJoint | None, tree: BodyTree) -> Array | None:
     if joint is None:
         return None
     if joint.column >= 0:
-        known = tree.home.values(joint.column)[1:]
-        if np.isfinite(known).all():
-            return np.sort(known)
+        finite = tree.home.values(joint.column)[1:]
+        if np.isfinite(finite).all():
+            return np.sort(finite)
     if joint.kind == "slide":
         return joint.value + JOINT_LIMIT_ROD_LENGTHS * tree.home.size * np.array([-1.0, 1.0])
     return None
@@ -226,7 +226,7 @@ def _visual(link: Element, shape: RoundBar) -> None:
         SubElement(geometry, "sphere", radius=radius)
     else:
         SubElement(geometry, "cylinder", radius=radius, length=numbers_text(length))
-    SubElement(out, "material", name=shape.look)
+    SubElement(out, "material", name=shape.colour)
 
 
 def _loops(tree: BodyTree, source: MachineSource) -> str:

@@ -19,7 +19,7 @@ URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "sl
 def read_urdf(text: str, loops: str) -> ReadModel:
     """The model of a URDF and of the text that tells its loops."""
     root, beside = fromstring(text), yaml.safe_load(loops)
-    found = {node.attrib["name"]: node for node in root.findall("link")}
+    results = {node.attrib["name"]: node for node in root.findall("link")}
     above = {_link(node, "child"): node for node in root.findall("joint")}
     bodies: list[ReadBody] = []
     numbers: dict[str, int] = {}
@@ -43,7 +43,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
         numbers[link] = len(bodies) - 1
         return numbers[link]
 
-    for link in found:
+    for link in results:
         put(link)
     couplings: list[ReadCoupling] = []
     for node in root.findall("joint"):

@@ -27,7 +27,7 @@ from pkmcal.files.limits import (
 from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
-LONGEST_SHOWN = 60
+LONGEST_QUOTE = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
 one line."""
 SHORTEST_PART = 4
@@ -123,9 +123,9 @@ def wanted_file(path: Path) -> str:
     return f"a file {path}" + (f" (there is {neighbour})" if neighbour else "")
 
 
-def closest(name: str, known: Iterable[str]) -> str | None:
+def closest(name: str, names: Iterable[str]) -> str | None:
     """Return the known name that a misspelt one most likely means, or None."""
-    by_lower = {candidate.lower(): candidate for candidate in known}
+    by_lower = {candidate.lower(): candidate for candidate in names}
     if len(name) >= SHORTEST_PART:  # such as gough of gough-stewart
         whole = [candidate for candidate in by_lower if name.lower() in candidate]
         if len(whole) == 1:
@@ -135,14 +135,14 @@ def closest(name: str, known: Iterable[str]) -> str | None:
     return by_lower[matches[0]] if matches else None
 
 
-def shown(value: object) -> str:
+def quoted(value: object) -> str:
     """Quote a found value briefly."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
         return str(value).lower()
     text = repr(value)
-    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 1] + "…"
+    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 1] + "…"
 
 
 Keys = tuple[str | int, ...]
@@ -196,10 +196,10 @@ class Document:
 
         A field that is missing has its nearest parent's line, and none at the top.
         """
-        known = keys
-        while known and known not in self.lines:
-            known = known[:-1]
-        line = f", line {self.lines[known]}" if known else ""
+        reference_values = keys
+        while reference_values and reference_values not in self.lines:
+            reference_values = reference_values[:-1]
+        line = f", line {self.lines[reference_values]}" if reference_values else ""
         return f"{self.label}{line}" + (f", {field_path(keys)}" if keys else "")
 
 
@@ -246,7 +246,7 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
         raise InputError(
             "the top of the file is not a mapping",
             where=label,
-            found=shown(data),
+            found=quoted(data),
             expected="lines of the form key: value",
         )
     return _checked(Document(path, label, data, builder.lines))
@@ -290,7 +290,7 @@ def _check_characters(document: Document, keys: Keys, text: str) -> None:
         raise InputError(
             "this text holds a character that cannot be written",
             where=_NO_TEXT.sub("?", document.where(*keys)),
-            found=f"\\u{ord(bad[0]):04x} in {shown(text)}",
+            found=f"\\u{ord(bad[0]):04x} in {quoted(text)}",
             expected="letters, digits and signs",
         )
 
@@ -403,16 +403,16 @@ class _Builder:
             self._open.discard(id(node))
 
     def _mapping(self, node: yaml.MappingNode, keys: Keys) -> dict[str, Any]:
-        seen: dict[str, int] = {}
+        names_so_far: dict[str, int] = {}
         for key_node, _ in node.value:
             key, line = self._key(key_node), key_node.start_mark.line + 1
-            if key in seen:
+            if key in names_so_far:
                 raise InputError(
-                    f"the key {key} stands twice, on lines {seen[key]} and {line}",
+                    f"the key {key} stands twice, on lines {names_so_far[key]} and {line}",
                     where=f"{self.label}, line {line}, {field_path((*keys, key))}",
                     next_step="Remove one of the two",
                 )
-            seen[key] = line
+            names_so_far[key] = line
         pairs = self._pairs(node)
         for key, (key_node, _) in pairs.items():
             self.lines[(*keys, key)] = key_node.start_mark.line + 1
@@ -466,7 +466,7 @@ class _Builder:
         try:
             return _CONSTRUCT[kind](node.value)
         except ValueError:
-            raise self._error(node, f"{shown(node.value)} is not a usable {kind}") from None
+            raise self._error(node, f"{quoted(node.value)} is not a usable {kind}") from None
 
     def _key(self, node: yaml.Node) -> str:
         if not isinstance(node, yaml.ScalarNode):
@@ -491,9 +491,9 @@ def json_value(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
+        finite = value.dtype.kind != "f" or bool(np.isfinite(value).all())
         return (
-            value.tolist() if known and value.dtype.kind in "fiub" else json_value(value.tolist())
+            value.tolist() if finite and value.dtype.kind in "fiub" else json_value(value.tolist())
         )
     if isinstance(value, (list, tuple)):
         if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
@@ -565,15 +565,15 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
             f"not valid JSON ({error.msg})", where=f"{label}, line {error.lineno}"
         ) from None
     except ValueError:  # a number that JSON has not, or one of thousands of digits
-        odd = next(found for found in _ODD.finditer(text) if found["number"])
+        odd = next(match for match in _ODD.finditer(text) if match["number"])
         raise InputError(
             "not a number in JSON",
             where=f"{label}, line {text.count(chr(10), 0, odd.start()) + 1}",
-            found=shown(odd["number"]),
+            found=quoted(odd["number"]),
             expected="digits with at most one point and exponent, or null",
         ) from None
     if not isinstance(data, dict):
-        raise InputError("the top of the file is not an object", where=label, found=shown(data))
+        raise InputError("the top of the file is not an object", where=label, found=quoted(data))
     return _checked(Document(path, label, data, {}))
 
 

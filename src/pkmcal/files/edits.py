@@ -165,15 +165,15 @@ def _parts(node: yaml.Node) -> list[yaml.Node]:
 
 def _shared(root: yaml.Node) -> set[int]:
     """Nodes that an alias repeats, by id; not what stands in them."""
-    seen: set[int] = set()
+    names_so_far: set[int] = set()
     twice: set[int] = set()
     todo = [root]
     while todo:
         node = todo.pop()
-        if id(node) in seen:
+        if id(node) in names_so_far:
             twice.add(id(node))
             continue
-        seen.add(id(node))
+        names_so_far.add(id(node))
         if isinstance(node, yaml.MappingNode):
             todo += [part for pair in node.value for part in pair]
         elif isinstance(node, yaml.SequenceNode):

@@ -110,14 +110,14 @@ def _tiff(stream: BinaryIO, order: Literal["little", "big"]) -> _Stated:
 
     stream.seek(4)
     stream.seek(number(stream.read(4)))
-    found: dict[int, int] = {}
+    results: dict[int, int] = {}
     for _ in range(number(stream.read(2))):
         entry = stream.read(12)
         if len(entry) < 12:
             break
         size = 2 if number(entry[2:4]) == _TIFF_SHORT else 4
-        found[number(entry[:2])] = number(entry[8 : 8 + size])
-    return found.get(_TIFF_WIDTH, 0), found.get(_TIFF_HEIGHT, 0), 8.0 * MOST_DEFLATE_EXPANSION
+        results[number(entry[:2])] = number(entry[8 : 8 + size])
+    return results.get(_TIFF_WIDTH, 0), results.get(_TIFF_HEIGHT, 0), 8.0 * MOST_DEFLATE_EXPANSION
 
 
 def _pair(width: bytes, height: bytes) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator
 
-from pkmcal.files.documents import shown
+from pkmcal.files.documents import quoted
 
 LARGEST_UNITLESS_LENGTH = 50.0
 """m; a machine or a camera's place without a unit that is larger was written in millimetres."""
@@ -64,8 +64,8 @@ def _registry() -> Any:
 
 def written_unit(value: object) -> Unit | None:
     """The unit with which a file's value is written, or None."""
-    found = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
-    return unit(found[2]) if found else None
+    match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    return unit(match[2]) if match else None
 
 
 def any_unit(data: object) -> bool:
@@ -77,27 +77,27 @@ def any_unit(data: object) -> bool:
 
 def split_head(head: str) -> tuple[str, Unit | None]:
     """A column's name, and the unit that its head names behind it."""
-    found = _HEAD.fullmatch(head)
-    known = unit(found[2] or found[3]) if found else None
-    return (found[1], known) if found and known else (head, None)
+    match = _HEAD.fullmatch(head)
+    reference_values = unit(match[2] or match[3]) if match else None
+    return (match[1], reference_values) if match and reference_values else (head, None)
 
 
-def no_such(kind: str, found: object) -> str:
+def no_such(kind: str, value: object) -> str:
     """A sentence about a value with a unit of another kind."""
     what, plain, example = _KINDS[kind]
-    return f"{shown(found)} is not {what}; write it in {plain}, or with a unit, such as {example}"
+    return f"{quoted(value)} is not {what}; write it in {plain}, or with a unit, such as {example}"
 
 
 def _read(kind: str, value: Any) -> Any:
     """A number in SI of a text with a unit; anything else is left to the schema to judge."""
-    found = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
-    if not found:
+    match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    if not match:
         return value
-    known = unit(found[2])
-    if known is None or known.kind not in kind.split(" or "):
+    reference_values = unit(match[2])
+    if reference_values is None or reference_values.kind not in kind.split(" or "):
         raise ValueError(no_such(kind, value))
     # decimal, so that 269.3 mm is what 0.2693 is
-    return float(Decimal(found[1]) * Decimal(repr(known.factor)))
+    return float(Decimal(match[1]) * Decimal(repr(reference_values.factor)))
 
 
 Metres = Annotated[float, BeforeValidator(partial(_read, "m"))]

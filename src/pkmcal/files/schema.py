@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
-from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, Document, Keys, closest, shown
+from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, Document, Keys, closest, quoted
 from pkmcal.files.limits import MOST_FAULTS_NAMED
 from pkmcal.wording import listed
 
@@ -42,14 +42,14 @@ def validated_document(document: Document, model: type[SchemaModel]) -> SchemaMo
     """
     try:
         # By way of JSON, because there a list may become a tuple while types stay exact.
-        found = model.model_validate_json(json.dumps(document.data))
-        _check_numbers(document, found.model_dump(by_alias=True))
-        return found
+        value = model.model_validate_json(json.dumps(document.data))
+        _check_numbers(document, value.model_dump(by_alias=True))
+        return value
     except ValidationError as error:
-        found = error.errors()
-        found.sort(key=lambda details: _line(document, details))
+        value = error.errors()
+        value.sort(key=lambda details: _line(document, details))
         schema = model.model_json_schema()
-        faults = [_fault(document, schema, details) for details in found[:MOST_FAULTS_NAMED]]
+        faults = [_fault(document, schema, details) for details in value[:MOST_FAULTS_NAMED]]
     # A required key that is misspelt is one mistake, not one unknown and one missing key.
     meant = {(*fault.keys[:-1], fault.guess) for fault in faults if fault.guess}
     faults = [fault for fault in faults if not (fault.missing and fault.keys in meant)]
@@ -82,7 +82,7 @@ def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
             raise InputError(
                 "this number is too large for any quantity",
                 where=document.where(*keys),
-                found=shown(value),
+                found=quoted(value),
                 expected=f"at most {LARGEST_WRITTEN_NUMBER:g}",
             )
 
@@ -112,14 +112,14 @@ def _fault(document: Document, root: JsonSchema, details: ErrorDetails) -> _Faul
     keys = keys[:-1] if short else keys
     location = details["loc"][:-1] if short else details["loc"]
     schemas = _schemas_at(root, location)
-    what, found, expected = _phrases(details, keys, schemas, short=short)
+    what, value, expected = _phrases(details, keys, schemas, short=short)
     unknown = details["type"] == "extra_forbidden"
     return _Fault(
         line=document.lines.get(keys, document.lines.get(keys[:-1], 0)),
         keys=keys,
         missing=missing,
-        guess=closest(str(keys[-1]), _known_keys(schemas)) if unknown else None,
-        error=InputError(what, where=document.where(*keys), found=found, expected=expected),
+        guess=closest(str(keys[-1]), _schema_keys(schemas)) if unknown else None,
+        error=InputError(what, where=document.where(*keys), found=value, expected=expected),
     )
 
 
@@ -130,13 +130,17 @@ def _phrases(
     kind, context, value = details["type"], details.get("ctx", {}), details["input"]
     if short:
         wanted = max(len(schema.get("prefixItems", ())) for schema in schemas)
-        return _WHAT["too_short"], shown(value), _description(schemas) or f"{wanted} entries"
+        return _WHAT["too_short"], quoted(value), _description(schemas) or f"{wanted} entries"
     if kind == "missing":
         return "this is missing", None, _description(schemas) or "a value"
     if kind == "extra_forbidden":
-        known = _known_keys(schemas)
-        guess = closest(str(keys[-1]), known)
-        expected = f"{guess} (known here: {', '.join(known)})" if guess else listed(known, 12)
+        reference_values = _schema_keys(schemas)
+        guess = closest(str(keys[-1]), reference_values)
+        expected = (
+            f"{guess} (known here: {', '.join(reference_values)})"
+            if guess
+            else listed(reference_values, 12)
+        )
         return "this key is not known", str(keys[-1]), expected or None
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = context.get("expected_tags") or _tags(schemas)
@@ -157,7 +161,7 @@ def _phrases(
         if kind in _EXPECTED
         else details["msg"].removeprefix("Input should be ")
     )
-    return _WHAT.get(kind, "this value cannot be used"), shown(value), expected
+    return _WHAT.get(kind, "this value cannot be used"), quoted(value), expected
 
 
 _WHAT = {
@@ -205,12 +209,12 @@ def _keys_in(data: Any, location: tuple[int | str, ...], *, missing: bool) -> Ke
 
 def _schemas_at(root: JsonSchema, location: tuple[int | str, ...]) -> list[JsonSchema]:
     """JSON schemas (every member of a union) of a location; its parent's where it has none."""
-    found = _members(root, root)
+    value = _members(root, root)
     for key in location:
-        children = [child for schema in found for child in _children(schema, key)]
+        children = [child for schema in value for child in _children(schema, key)]
         if children:
-            found = [member for child in children for member in _members(root, child)]
-    return found
+            value = [member for child in children for member in _members(root, child)]
+    return value
 
 
 def _members(root: JsonSchema, schema: JsonSchema) -> list[JsonSchema]:
@@ -243,7 +247,7 @@ def _children(schema: JsonSchema, key: int | str) -> list[JsonSchema]:
     ]  # fmt: skip
 
 
-def _known_keys(schemas: list[JsonSchema]) -> list[str]:
+def _schema_keys(schemas: list[JsonSchema]) -> list[str]:
     return sorted({name for schema in schemas for name in schema.get("properties", {})})
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
-from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, closest, shown, text_blocks
+from pkmcal.files.documents import LARGEST_WRITTEN_NUMBER, closest, quoted, text_blocks
 from pkmcal.files.limits import MOST_COLUMNS, MOST_ROWS, check_count
 from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
@@ -54,12 +54,12 @@ class CsvTable:
         """Raise `InputError` where a column's head names a unit that is not of its kind, "m", "rad"
         or "" for numbers without one.
         """
-        for name, found, kind in zip(self.columns, self.units, kinds, strict=False):
-            if found is not None and found.kind != kind:
+        for name, names, kind in zip(self.columns, self.units, kinds, strict=False):
+            if names is not None and names.kind != kind:
                 raise InputError(
                     "this column is in another kind of unit than what it holds",
                     where=f"{self.label}, line 1, column {name}",
-                    found=_KINDS[found.kind],
+                    found=_KINDS[names.kind],
                     expected=_KINDS[kind],
                 )
 
@@ -119,8 +119,8 @@ def read_csv(
     if not lines:
         raise InputError("there are no rows under the header", where=label)
     each = np.array(values).reshape(len(lines), len(header) - 1)
-    units = tuple(found for _, found in heads)
-    each *= [found.factor if found else 1.0 for found in units]
+    units = tuple(results for _, results in heads)
+    each *= [results.factor if results else 1.0 for results in units]
     return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()), units)
 
 
@@ -151,8 +151,8 @@ def read_pairs(
     header_line, header = next(rows, (0, None))
     if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {example}")
-    found = [split_head(head) for head in header[2:]]
-    header[2:] = [name for name, _ in found]
+    results = [split_head(head) for head in header[2:]]
+    header[2:] = [name for name, _ in results]
     _check_header(
         header, [*columns, *(c for c in optional if c in header)], f"{label}, line {header_line}",
         heads,
@@ -162,7 +162,7 @@ def read_pairs(
         where = f"{label}, line {line}"
         numbers = _numbers(cells, header, where, len(heads))
         _check_length(cells[:2], where)
-        factors = (unit.factor if unit else 1.0 for _, unit in found)
+        factors = (unit.factor if unit else 1.0 for _, unit in results)
         values.append([x * factor for x, factor in zip(numbers, factors, strict=True)])
         pairs.append((cells[0], cells[1]))
         lines.append(line)
@@ -170,7 +170,7 @@ def read_pairs(
     if not lines:
         raise InputError("there are no rows under the header", where=label)
     names = tuple(f"{a} to {b}" for a, b in pairs)
-    units = tuple(unit for _, unit in found)
+    units = tuple(unit for _, unit in results)
     numbers = np.array(values)
     return PairTable(label, tuple(header[2:]), names, numbers, tuple(lines), units, tuple(pairs))
 
@@ -212,7 +212,7 @@ def _check_header(
             raise InputError(
                 f"the columns are separated by {name}",
                 where=where,
-                found=shown(header[0]),
+                found=quoted(header[0]),
                 expected="commas between columns and points in numbers",
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
@@ -223,7 +223,7 @@ def _check_header(
         raise InputError(
             f"the header's first {other}" if len(header) > 1 else "no header",
             where=where,
-            found=shown(",".join(header[: len(first)])),
+            found=quoted(",".join(header[: len(first)])),
             expected=",".join(first),
             next_step=f"Begin the file with the line {','.join(first)},"
             + (",".join(columns or ()) if several else "<one column a number>"),
@@ -241,18 +241,18 @@ def _check_header(
         _check_columns(header[len(first) :], columns, where)
 
 
-def _check_columns(found: Sequence[str], known: Sequence[str], where: str) -> None:
-    missing = [name for name in known if name not in found]
-    for name in found:
-        if name not in known:
+def _check_columns(actual_names: Sequence[str], names: Sequence[str], where: str) -> None:
+    missing = [name for name in names if name not in actual_names]
+    for name in actual_names:
+        if name not in names:
             guess = closest(name, missing)
             raise InputError(
                 "this column is not known", where=where, found=name,
-                expected=guess or listed(known, 12),
+                expected=guess or listed(names, 12),
             )  # fmt: skip
     if missing:
         raise InputError(
-            f"column {listed(missing)} is missing", where=where, found=listed(found, 12)
+            f"column {listed(missing)} is missing", where=where, found=listed(actual_names, 12)
         )
 
 
@@ -310,7 +310,7 @@ def _number(cell: str, where: str) -> float:
         what, expected = "this number has a decimal comma", cell.replace(",", ".")
     else:
         what, expected = "this is not a number", "a number, such as 0.3476 or 1.2e-3"
-    raise InputError(what, where=where, found=shown(cell), expected=expected)
+    raise InputError(what, where=where, found=quoted(cell), expected=expected)
 
 
 def _check_length(names: Sequence[str], where: str) -> None:
@@ -319,6 +319,6 @@ def _check_length(names: Sequence[str], where: str) -> None:
             raise InputError(
                 "this name is too long",
                 where=where,
-                found=f"{shown(name)} of {len(name)} characters",
+                found=f"{quoted(name)} of {len(name)} characters",
                 expected=f"at most {LONGEST_NAME}, as file systems take",
             )

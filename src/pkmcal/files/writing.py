@@ -31,7 +31,7 @@ from pkmcal.wording import listed
 WRITING_STAGE_NAME, WRITING_PROBE_NAME = "stage", "probe"
 _COMPLETE = "complete"
 """In a stage: what becomes COMMITTED_FOLDER."""
-_LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
+_TEMPORARY_NAME = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
 """Names of `_beside`."""
 
 
@@ -117,7 +117,7 @@ def entries(folder: Path) -> list[str]:
     return sorted(
         entry.name
         for entry in folder.iterdir()
-        if entry.name != COMMITTED_FOLDER and not _LEFT_OVER.fullmatch(entry.name)
+        if entry.name != COMMITTED_FOLDER and not _TEMPORARY_NAME.fullmatch(entry.name)
     )
 
 
@@ -303,10 +303,10 @@ def _clear_abandoned(place: Path) -> None:
     for: an hour's photographs may lie in one. Those of which that is not certain stay.
     """
     try:
-        found = [entry for entry in os.scandir(place) if _LEFT_OVER.fullmatch(entry.name)]
+        match = [entry for entry in os.scandir(place) if _TEMPORARY_NAME.fullmatch(entry.name)]
     except OSError:  # no such folder yet, or one whose names may not be listed
         return
-    for stage in (Path(entry.path) for entry in found if entry.is_dir(follow_symlinks=False)):
+    for stage in (Path(entry.path) for entry in match if entry.is_dir(follow_symlinks=False)):
         with suppress(OSError):
             stage.rmdir()  # with nothing in it, as a probe
         with suppress(OSError):  # no stage, or one that another process removes

@@ -50,7 +50,7 @@ def line_through(a: Array, b: Array) -> tuple[Array, Array]:
     return u, cross(a, u)
 
 
-def leg_is_seen(m: Array, radius: Array) -> Booleans:
+def has_silhouette(m: Array, radius: Array) -> Booleans:
     """False where the camera's centre lies in the cylinder: it has no silhouette there.
 
     m : (..., 3) moment of its axis.
@@ -71,7 +71,7 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
     return cosine * m_unit - sine * cross(u, m_unit)
 
 
-class SeenLines(NamedTuple):
+class LineSilhouettes(NamedTuple):
     """Lines from a to b before a camera at the origin, and how the edges around them move.
 
     u : (..., 3) direction from a to b. m : unit moment, along ``a x u``. w : ``u x m``, towards the
@@ -88,7 +88,7 @@ class SeenLines(NamedTuple):
     behind: Array
 
     @classmethod
-    def between(cls, a: Array, b: Array) -> SeenLines:
+    def between(cls, a: Array, b: Array) -> LineSilhouettes:
         """Those of points (..., 3)."""
         line = b - a
         length = np.sqrt(dot(line, line))
@@ -107,8 +107,8 @@ class SeenLines(NamedTuple):
         square to u and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) /
         length + v ((before n.db - behind n.da) / length - dR) / distance``.
         """
-        found = edge_planes(self.distance, radius, SIDE_SIGNS[side])
-        sine, cosine = (x[..., None] for x in found)
+        value = edge_planes(self.distance, radius, SIDE_SIGNS[side])
+        sine, cosine = (x[..., None] for x in value)
         turn = (self.w + (sine / cosine) * self.m) / self.distance[..., None]
         shift = self.u / self.length[..., None]
         by_a = shift - (self.behind / self.length)[..., None] * turn
@@ -130,9 +130,9 @@ def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> 
 
     a, b : (..., 3) points of the axis in the camera frame, a towards the base (m).
     radius, side : (...,) m, and 0 or 1. Where the centre of projection is inside the cylinder the
-    values are NaN: the caller leaves such edges out with :func:`leg_is_seen`.
+    values are NaN: the caller leaves such edges out with :func:`has_silhouette`.
     """
-    return SeenLines.between(a, b).edges(radius, side)
+    return LineSilhouettes.between(a, b).edges(radius, side)
 
 
 def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:

@@ -144,8 +144,8 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
 
 def pose(rot: Array, t: Array) -> Array:
     """4x4 poses from rotations (..., 3, 3) and translations (..., 3)."""
-    alike = rot.shape[:-2] == t.shape[:-1]
-    shape = t.shape[:-1] if alike else np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
+    same = rot.shape[:-2] == t.shape[:-1]
+    shape = t.shape[:-1] if same else np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
     out = np.zeros((*shape, 4, 4))
     out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rot, t, 1.0
     return out

@@ -14,7 +14,7 @@ from pkmcal.identify.link_rows import LinkBlocks, LinkData
 from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBES_ALIKE, Measurements
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBE_CORRELATION, Measurements
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.measurements.poses import PoseBlocks, PoseData
@@ -31,14 +31,14 @@ LEVEL_SIGMA = 1e-6
 class Assembled:
     """A problem and where its rows come from.
 
-    seen : (K,) configurations with at least one edge, link, or pose of a board on the platform, or
-    all without a station; only they are in the problem. places : where each kind's measurements
+    observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
+    or all without a station; only they are in the problem. places : where each kind's measurements
     stand among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
     shading, breathing, size, mount, level or gauge.
     """
 
     problem: Problem
-    seen: Booleans
+    observed: Booleans
     places: Kinds[Places]
     priors: tuple[str, ...]
 
@@ -66,13 +66,13 @@ def assemble(
     where these are candidates, for the edges that share their shading.
     """
     _check(machine, measurements)
-    seen, (keys, line) = seen_configurations(measurements), lines(measurements)
+    observed, (keys, line) = observed_configurations(measurements), lines(measurements)
     side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
-    edges = _places(measurements.edges.configuration, seen, measurements.edges.leg)
+    edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
-    poses = _places(measurements.poses.configuration, seen, one)
-    link_blocks, link_data = _links(measurements, seen)
+    poses = _places(measurements.poses.configuration, observed, one)
+    link_blocks, link_data = _links(measurements, observed)
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
@@ -97,7 +97,7 @@ def assemble(
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     target[[kind == "breathing" for kind in kinds]] = -measurements.breathing_at
-    blocks, data = _edges(machine, measurements, edges, line, side, seen, share)
+    blocks, data = _edges(machine, measurements, edges, line, side, observed, share)
     data = replace(data, shading=np.atleast_2d(shading).astype(float))
     pose_blocks, pose_data = _poses(measurements, poses)
     problem = Problem(
@@ -116,10 +116,10 @@ def assemble(
         link_blocks=link_blocks,
         link_data=link_data,
     )
-    return Assembled(problem, seen, Kinds(edges, poses, link_blocks.at), kinds)
+    return Assembled(problem, observed, Kinds(edges, poses, link_blocks.at), kinds)
 
 
-def seen_configurations(measurements: Measurements) -> Booleans:
+def observed_configurations(measurements: Measurements) -> Booleans:
     """(K,) configurations of which something was seen that depends on the platform's pose; all
     where nothing but readings was measured, which then stand against each other.
     """
@@ -135,8 +135,8 @@ def seen_configurations(measurements: Measurements) -> Booleans:
 
 def _check(machine: Machine, measurements: Measurements) -> None:
     edges, joints = measurements.edges, measurements.joints
-    seen = len(edges) + len(measurements.poses) + measurements.n_links
-    if measurements.n_stations and not seen:
+    in_view = len(edges) + len(measurements.poses) + measurements.n_links
+    if measurements.n_stations and not in_view:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
             next_step="check the photographs, the stations' poses and the tubes of the drawing",
@@ -165,11 +165,11 @@ def _check(machine: Machine, measurements: Measurements) -> None:
             )
 
 
-def _places(configuration: Integers, seen: Booleans, kind: Integers) -> Places:
+def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Places:
     """Measurements of one configuration after the other in a row of its own, where each kind (N,)
     of them has as many places as every other, side by side.
     """
-    row = np.maximum(np.cumsum(seen) - 1, 0)[configuration]
+    row = np.maximum(np.cumsum(visible) - 1, 0)[configuration]
     kinds, number = np.unique(kind, return_inverse=True)
     key = len(kinds) * row + number
     order = np.argsort(key, kind="stable")
@@ -177,7 +177,7 @@ def _places(configuration: Integers, seen: Booleans, kind: Integers) -> Places:
     place = np.empty(len(row), dtype=int)
     place[order] = np.arange(len(row)) - first
     each = int(place.max(initial=-1)) + 1
-    return Places(row, each * number + place, (int(seen.sum()), each * len(kinds)))
+    return Places(row, each * number + place, (int(visible.sum()), each * len(kinds)))
 
 
 def lines(measurements: Measurements) -> tuple[Integers, Integers]:
@@ -211,7 +211,7 @@ def _edges(
     at: Places,
     line: Integers,
     side: Integers,
-    seen: Booleans,
+    visible: Booleans,
     share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
     """The edges at their places, and the readings of the seen configurations."""
@@ -228,7 +228,7 @@ def _edges(
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
         alone = np.where(line < 0, SHADING_SIGMA, 0.0)
-        crowded = 1 + share * (cells.crowd - 1)
+        crowded = 1 + share * (cells.n_effective - 1)
         own = np.hypot(edges.shading * np.sqrt(crowded), alone)
     legs = np.unique(edges.leg)
     leg = np.repeat(legs, at.shape[1] // max(len(legs), 1))
@@ -243,7 +243,7 @@ def _edges(
         present=at.present,
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
         tube=at.filled(edges.tube),
-        crowd=at.filled(crowded),
+        n_effective=at.filled(crowded),
         cell=np.where(at.present, at.filled(cells.cell), -1),
         cells=cells,
     )
@@ -251,7 +251,7 @@ def _edges(
         basis=at.filled(edges.basis)[None, :, :, None],
         white=at.filled(np.linalg.inv(np.linalg.cholesky(edges.covariance)))[None],
         optics=at.filled(optics)[None],
-        joints=measurements.joints[None, seen],
+        joints=measurements.joints[None, visible],
         weight=at.present[None].astype(float),
     )
     if len(measurements.breathing_at):
@@ -285,20 +285,20 @@ def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData
     )
 
 
-def _links(measurements: Measurements, seen: Booleans) -> tuple[LinkBlocks, LinkData]:
+def _links(measurements: Measurements, visible: Booleans) -> tuple[LinkBlocks, LinkData]:
     """The links, each among the rows of its second configuration."""
-    rows = np.cumsum(seen) - 1  # of each configuration among the seen ones
+    rows = np.cumsum(visible) - 1  # of each configuration among the seen ones
     ends = [np.zeros((0, 2), dtype=int), *(one.configuration for one in measurements.links)]
     ends = np.concatenate(ends)
     linked = np.unique(ends)
-    number = np.full(len(seen), -1)
+    number = np.full(len(visible), -1)
     number[linked] = np.arange(len(linked))
     sets = tuple(
         replace(one, configuration=number[one.configuration]) for one in measurements.links
     )
-    at = _places(ends[:, 1], seen, np.zeros(len(ends), dtype=int))
+    at = _places(ends[:, 1], visible, np.zeros(len(ends), dtype=int))
     sigma = np.concatenate([np.zeros(0), *(one.sigma for one in measurements.links)])
-    blocks = LinkBlocks(sets, rows[linked], number[seen], at)
+    blocks = LinkBlocks(sets, rows[linked], number[visible], at)
     whiten = at.filled(1 / sigma)[None, ..., None, None]
     return blocks, LinkData(at.present[None].astype(float), whiten)
 
@@ -319,7 +319,7 @@ def prior_rows(
     can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading,
     breathing and sizes stand in units of their prior. on_platform : (M,) mounts. level : (S,)
     stations that do not tilt against the base. side : (n,) number of the leg's side at a station
-    that each line is on: what shades two tubes there is alike by TUBES_ALIKE.
+    that each line is on: what shades two tubes there is alike by TUBE_CORRELATION.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -330,14 +330,14 @@ def prior_rows(
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = np.flatnonzero(radius | use_drawing)
     optics = np.tile([SHIFT_SIGMA] + [1.0] * (u.n_optics - 1), u.n_cameras)
-    shaded = np.where(side[:, None] == side, TUBES_ALIKE, 0.0) + (1 - TUBES_ALIKE) * np.eye(
-        len(side)
-    )
+    shaded = np.where(side[:, None] == side, TUBE_CORRELATION, 0.0) + (
+        1 - TUBE_CORRELATION
+    ) * np.eye(len(side))
     moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
     upright = np.flatnonzero(level)
     tilts = (u.stations.start + 6 * upright[:, None] + [0, 1]).ravel()
-    known = (
+    reference_values = (
         ("drawing", held, tolerance[held]),
         ("camera", u.columns("optics"), optics),
         ("shading", u.columns("shading"), np.linalg.cholesky(shaded)),
@@ -348,7 +348,7 @@ def prior_rows(
     )
     rows: list[Array] = []
     kinds: list[str] = []
-    for kind, columns, sigma in known:
+    for kind, columns, sigma in reference_values:
         part = np.zeros((len(columns), u.count))
         part[:, columns] = np.diag(1 / sigma) if sigma.ndim == 1 else np.linalg.inv(sigma)
         rows.append(part)
@@ -385,10 +385,10 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
     return BatchState(
         machine.parameters.to_free(state.theta)[None],
         state.T_camera_base[None],
-        state.T_base_platform[assembled.seen][None],
+        state.T_base_platform[assembled.observed][None],
         optics[None],
         state.T_mount[None],
-        internal[assembled.seen][None],
+        internal[assembled.observed][None],
         np.zeros((1, u.n_lines)),
         breathing[None],
         sizes[None],
@@ -398,11 +398,11 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
 def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
     """The first run of a batch as a state; unseen configurations keep the start's pose."""
     poses = start.T_base_platform.copy()
-    poses[assembled.seen] = batch.T_base_platform[0]
+    poses[assembled.observed] = batch.T_base_platform[0]
     internal = np.zeros((len(poses), batch.internal.shape[-1]))
     if start.internal.shape == internal.shape:
         internal[:] = start.internal
-    internal[assembled.seen] = batch.internal[0]
+    internal[assembled.observed] = batch.internal[0]
     return State(
         assembled.problem.theta(batch)[0],
         batch.T_camera_base[0],

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside
@@ -129,9 +129,9 @@ def _over_the_disc(probed: Array) -> Array:
     return out
 
 
-def _less(rows: Array, known: Array) -> Array:
-    """Rows (n, P) without what the columns of ``known`` (n, m) can make of them."""
-    return rows - known @ np.linalg.lstsq(known, rows, rcond=None)[0]
+def _less(rows: Array, reference_values: Array) -> Array:
+    """Rows (n, P) without what the columns of ``reference_values`` (n, m) can make of them."""
+    return rows - reference_values @ np.linalg.lstsq(reference_values, rows, rcond=None)[0]
 
 
 def _drawing_root(machine: Machine, by: Array) -> Array:
@@ -147,10 +147,10 @@ def _drawing_root(machine: Machine, by: Array) -> Array:
     by = by.reshape(-1, by.shape[-1])
     u, s, _ = np.linalg.svd(by @ free, full_matrices=False)
     u = u[:, s > BED_ROUNDING_SHARE * s[0]]
-    moved = by @ wide
-    own = np.linalg.norm(moved - u @ (u.T @ moved), axis=0)
+    shifted = by @ wide
+    own = np.linalg.norm(shifted - u @ (u.T @ shifted), axis=0)
     return np.column_stack(
-        [free, wide[:, own > BED_ROUNDING_SHARE * np.linalg.norm(moved, axis=0)]]
+        [free, wide[:, own > BED_ROUNDING_SHARE * np.linalg.norm(shifted, axis=0)]]
     )
 
 
@@ -161,7 +161,7 @@ def _wider(
     bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P, m) of
     their covariance.
     """
-    rows, left = _rows_beside(measurements, estimate, uneven)
+    rows, remainder = _rows_beside(measurements, estimate, uneven)
     table = estimate.machine.parameters
     n, m = drawing.shape
     at = np.zeros(m + rows.shape[1] - n)  # the estimate, in the drawing's deviations; a flat bed
@@ -172,7 +172,7 @@ def _wider(
     )
     _, s, vt = np.linalg.svd(both, full_matrices=False)
     half = vt.T / s
-    best = -half @ (half.T @ (both.T @ np.concatenate([left, at])))
+    best = -half @ (half.T @ (both.T @ np.concatenate([remainder, at])))
     return drawing @ best[:m], drawing @ half[:m]
 
 
@@ -183,7 +183,7 @@ def _rows_beside(
     deviations: rows (r, P + l) and residuals (r,). Poses, the bed's place and all other unknowns
     are eliminated; nothing that is known beforehand of the parameters is in them.
     """
-    assembled, info = as_ended(measurements, estimate)
+    assembled, info = linearize_at_solution(measurements, estimate)
     problem, state = info.problem.opened(info.state)
     columns = columns_of(replace(assembled, problem=problem), state, uneven.effects)
     machine, count = problem.unknowns.columns("machine"), problem.unknowns.count
@@ -194,20 +194,20 @@ def _rows_beside(
         linear = piece.linear
         own, value = eliminated_beside(linear, columns(cut, linear) @ uneven.root)
         parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))
-        known = ~linear.shared_by[:, machine].any(axis=1)
+        reference = ~linear.shared_by[:, machine].any(axis=1)
         if not cut.start:
-            prior = np.pad(linear.shared_by[known], ((0, 0), (0, uneven.root.shape[1])))
-            parts.append((prior, linear.shared_value[0][known]))
-    rows, left = (np.concatenate(part) for part in zip(*parts, strict=True))
+            prior = np.pad(linear.shared_by[reference], ((0, 0), (0, uneven.root.shape[1])))
+            parts.append((prior, linear.shared_value[0][reference]))
+    rows, remaining = (np.concatenate(part) for part in zip(*parts, strict=True))
     used = np.append(machine, np.arange(count, rows.shape[1]))
     q = column_space(np.delete(rows, used, axis=1))
     rows = rows[:, used]
-    return rows - q @ (q.T @ rows), left - q @ (q.T @ left)
+    return rows - q @ (q.T @ rows), remaining - q @ (q.T @ remaining)
 
 
 def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) -> float | None:
     """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
-    _, info = as_ended(measurements, estimate)
+    _, info = linearize_at_solution(measurements, estimate)
     problem, state = info.problem, info.state
     rows = rows_on_shared(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
@@ -221,11 +221,13 @@ def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) ->
     _, s, vt = np.linalg.svd(own.reshape(state.T_base_platform.shape[1], -1, own.shape[1]))
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
-    left = 1 - np.sum(gain * felt, axis=1)
-    if left.min() < BED_ROUNDING_SHARE:
+    remainder = 1 - np.sum(gain * felt, axis=1)
+    if remainder.min() < BED_ROUNDING_SHARE:
         return None
-    moved = height @ problem.free @ gain[:, problem.unknowns.machine].T
-    return float(np.max(NOTICED_TOUCH_DEVIATIONS * np.sqrt(np.mean(moved**2, axis=0) / left)))
+    shifted = height @ problem.free @ gain[:, problem.unknowns.machine].T
+    return float(
+        np.max(NOTICED_TOUCH_DEVIATIONS * np.sqrt(np.mean(shifted**2, axis=0) / remainder))
+    )
 
 
 def _deviation(rows: Array, off: Array, root: Array, places: int) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
-from pkmcal.identify.alike import covariance_of_alike
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Information,
@@ -23,8 +22,11 @@ from pkmcal.identify.covariance import (
     reduced_rows,
 )
 from pkmcal.identify.edge_noise import edge_noise
+from pkmcal.identify.error_correlation import covariance_of_correlated
 from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.external_reliability import covariance_of_undetected
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
+from pkmcal.identify.innovation_test import innovations
 from pkmcal.identify.kinds import (
     EDGE_ROWS_KIND,
     LINK_ROWS_KIND,
@@ -42,11 +44,9 @@ from pkmcal.identify.noise import (
     noise_shares,
 )
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.reinstated import innovations
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
-from pkmcal.identify.unnoticed import covariance_of_unnoticed
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
@@ -84,8 +84,8 @@ class BatchResult:
     robust weights 0..1 of each kind of measurement. scale : (B,) factors on the stated noise of
     each kind; the edges' is the annealing's, and one as soon as their noise was looked for. info :
     the problem as it was solved, weights and noise included, and what it says at the solution.
-    edges : their noise, as stated where it was not looked for; trust : (B, K, G) by how much more
-    or less each counts for it. stated : (B or 1,) the readings' noise before.
+    edges : their noise, as stated where it was not looked for; robust_weight : (B, K, G) by how
+    much more or less each counts for it. stated : (B or 1,) the readings' noise before.
     """
 
     solution: Solution
@@ -93,7 +93,7 @@ class BatchResult:
     scale: Kinds[Array]
     info: Information
     edges: EdgeScatter
-    trust: Array
+    robust_weight: Array
     stated: Array
 
     @cached_property
@@ -111,8 +111,8 @@ class BatchResult:
         """Covariance (B, na, na) of the shared unknowns, with what edges have in common and what
         wrong ones do unnoticed.
         """
-        unnoticed = covariance_of_unnoticed(self.info, self.weight.edges)
-        return covariance_of_alike(self.info) + unnoticed
+        unnoticed = covariance_of_undetected(self.info, self.weight.edges)
+        return covariance_of_correlated(self.info) + unnoticed
 
     @property
     def noise_scale(self) -> Array:
@@ -155,12 +155,12 @@ def solve_batch(
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
-        found = robust_start(problem, start, scaled=scale_noise)
-        state, weight, steps = found.state, found.weight, steps + found.steps
-        scale = found.scale if scale_noise else ones
+        value = robust_start(problem, start, scaled=scale_noise)
+        state, weight, steps = value.state, value.weight, steps + value.steps
+        scale = value.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
-    trust, stated = np.ones_like(every.edges), problem.joint_noise
-    fit = _solved(problem, state, weight, scale, steps, begin, trust, stated, STEP_TOLERANCE)
+    irls_weight, stated = np.ones_like(every.edges), problem.joint_noise
+    fit = _solved(problem, state, weight, scale, steps, begin, irls_weight, stated, STEP_TOLERANCE)
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -186,12 +186,12 @@ def _settle(
     the lines' shading.
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
-    by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
-    asked = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
+    by_tube = scale_noise and robust and bool(fit.info.problem.blocks.n_effective.any())
+    previous_factor = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     nearly = False
     for number in range(MOST_BUNDLE_ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, edges, trust = fit.scale, fit.edges, fit.trust
+        scale, edges, irls_weight = fit.scale, fit.edges, fit.robust_weight
         if scale_noise:
             scale = Kinds(
                 np.ones_like(scale.edges),
@@ -202,7 +202,7 @@ def _settle(
                 return replace(fit, scale=scale)
             edges = _edges(fit, by_tube, number)
             problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
-            asked, made = _readings_step(fit, by_data, asked, made)
+            previous_factor, made = _readings_step(fit, by_data, previous_factor, made)
         shading = problem.data.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
@@ -216,16 +216,16 @@ def _settle(
             poses = innovations(fit.info, distance.poses, weight.poses, scale.poses)
             weight = settled_weights(distance._replace(poses=poses), scale)
             if by_tube:
-                trust = edges.trust(problem.blocks, np.sum(rows.edges**2, axis=-1))
+                irls_weight = edges.irls_weight(problem.blocks, np.sum(rows.edges**2, axis=-1))
         change = (shading - problem.data.shading) / np.maximum(problem.data.shading, SHADING_SIGMA)
-        found_shading = np.abs(change).max() < SHADING_CHANGE
+        shading_free = np.abs(change).max() < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():
             readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
-        found_readings = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
-        found_edges = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
-        found_all = found_shading and found_readings and found_edges
-        if found_all and _settled(scale, fit.scale, weight, fit.weight):
+        readings_free = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
+        edges_free = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
+        all_free = shading_free and readings_free and edges_free
+        if all_free and _settled(scale, fit.scale, weight, fit.weight):
             break
         if estimates_shading:
             units = problem.data.shading / shading  # the same shifts in other units
@@ -234,7 +234,15 @@ def _settle(
         problem = replace(problem, joint_noise=readings)
         steps = fit.solution.steps
         fit = _solved(
-            problem, state, weight, scale, steps, edges, trust, fit.stated, NEARLY_SOLVED_DISTANCE
+            problem,
+            state,
+            weight,
+            scale,
+            steps,
+            edges,
+            irls_weight,
+            fit.stated,
+            NEARLY_SOLVED_DISTANCE,
         )
         nearly = True
     return _to_the_end(fit) if nearly else fit
@@ -249,24 +257,24 @@ def _readings_step(
     """
     if not by_data.any():
         return before, made
-    asked = np.log(fit.reading_noise.factor())
+    log_factor = np.log(fit.reading_noise.factor())
     # what is asked for at most is not all that is missing
     shrinks = (
-        (asked * before > 0)
-        & (np.abs(asked) < np.abs(before))
+        (log_factor * before > 0)
+        & (np.abs(log_factor) < np.abs(before))
         & (np.abs(before) < UNCUT_NOISE_LOG_STEP)
     )
-    pace = np.where(shrinks, made / np.where(shrinks, before - asked, 1.0), 1.0)
-    return asked, asked * np.clip(pace, 1.0, FURTHEST_NOISE_PACE)
+    pace = np.where(shrinks, made / np.where(shrinks, before - log_factor, 1.0), 1.0)
+    return log_factor, log_factor * np.clip(pace, 1.0, FURTHEST_NOISE_PACE)
 
 
 def _readings_speak(fit: BatchResult) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
-    found = fit.reading_noise
+    noise = fit.reading_noise
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
-    return found.contradicts() | (alone & (found.freedom(found.best) > LEAST_NOISE_FREEDOM))
+    return noise.contradicts() | (alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM))
 
 
 def _settled(
@@ -288,32 +296,32 @@ def _solved(
     scale: Kinds[Array],
     steps: Integers,
     edges: EdgeScatter,
-    trust: Array,
+    irls_weight: Array,
     stated: Array,
     tolerance: float,
 ) -> BatchResult:
     """The problem solved with these weights up to a tolerance, from a state that ``steps`` (B,)
     have led to.
     """
-    parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
+    parts = zip(weight._replace(edges=weight.edges * irls_weight), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    found, info = _searched(used, state, steps, tolerance)
-    return BatchResult(found, weight, scale, info, edges, trust, stated)
+    solution, info = _searched(used, state, steps, tolerance)
+    return BatchResult(solution, weight, scale, info, edges, irls_weight, stated)
 
 
 def _to_the_end(fit: BatchResult) -> BatchResult:
     """The same with what a round's search has left to go."""
-    found, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
-    return replace(fit, solution=found, info=info)
+    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
+    return replace(fit, solution=solution, info=info)
 
 
 def _searched(
     problem: Problem, state: BatchState, steps: Integers, tolerance: float
 ) -> tuple[Solution, Information]:
     """The solution up to a tolerance, from a state that ``steps`` (B,) have led to."""
-    found = minimise(problem.as_noisy_as_at(state), state, tolerance=tolerance)
-    found = replace(found, steps=steps + found.steps)
-    return found, Information(problem, found.state, found.normal)
+    solution = minimise(problem.as_noisy_as_at(state), state, tolerance=tolerance)
+    solution = replace(solution, steps=steps + solution.steps)
+    return solution, Information(problem, solution.state, solution.normal)
 
 
 def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
@@ -326,8 +334,11 @@ def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
         late = number >= FREE_ROUNDS
         edges = edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
         return edges.beyond(fit.edges, SCATTER_PACE) if number >= FIRST_PACED_ROUND else edges
-    scale, found = fit.scale.edges[:, None] * fit.edges.scale, fit.components
-    chi2, freedom = found.chi2[:, EDGE_ROWS_KIND, None], found.freedom[:, EDGE_ROWS_KIND, None]
+    scale, components = fit.scale.edges[:, None] * fit.edges.scale, fit.components
+    chi2, freedom = (
+        components.chi2[:, EDGE_ROWS_KIND, None],
+        components.freedom[:, EDGE_ROWS_KIND, None],
+    )
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     scale = np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
     return replace(fit.edges, scale=scale)
@@ -340,8 +351,8 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
     kinds = fit.info.problem.kinds
     if not (kinds.poses if kind == POSE_ROWS_KIND else kinds.links).present.any():
         return scale
-    found = fit.components
-    chi2, freedom = found.chi2[:, kind], found.freedom[:, kind]
+    components = fit.components
+    chi2, freedom = components.chi2[:, kind], components.freedom[:, kind]
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
@@ -353,12 +364,12 @@ def _shading_of(fit: BatchResult, least: Array) -> Array:
     half = unit[..., None] * fit.info.root[:, lines]
     covariance = half @ half.mT
     prior = problem.prior[:, lines]
-    alike = np.linalg.inv(prior.T @ prior)
-    return common_shading(unit * fit.info.state.shading, covariance, alike, unit, least)
+    correlation = np.linalg.inv(prior.T @ prior)
+    return common_shading(unit * fit.info.state.shading, covariance, correlation, unit, least)
 
 
 @dataclass(frozen=True)
-class MachineTold:
+class MarginalPrior:
     """What measurements and the drawing told of a machine.
 
     free : (n,) its free unknowns; root : (n, n) of their information, ``root^T root`` the inverse
@@ -368,7 +379,7 @@ class MachineTold:
     free: Array
     root: Array
 
-    def like(self, before: MachineTold) -> bool:
+    def like(self, before: MarginalPrior) -> bool:
         """Whether the machine has changed since by less than half its deviations, as it does until
         a quarter as much again is told of it.
         """
@@ -382,7 +393,7 @@ def bundle(
     start: State,
     *,
     use_drawing: bool = True,
-    told: MachineTold | None = None,
+    marginal_prior: MarginalPrior | None = None,
     robust: bool = True,
     scale_noise: bool = True,
     scale_readings: bool = True,
@@ -393,8 +404,8 @@ def bundle(
 
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
-        and edge shifts keep theirs in any case. told : what other measurements told of the
-        machine, with the drawing in it, in the drawing's place, whether that is taken or not.
+        and edge shifts keep theirs in any case. marginal_prior : what other measurements told of
+        the machine, with the drawing in it, in the drawing's place, whether that is taken or not.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
         scale_readings : and that of the readings, which may become less.
@@ -403,16 +414,21 @@ def bundle(
     Raises ResultError where the search cannot start, is given up, or ends without an answer.
     """
     gauge = gauge or default_gauge(machine)
-    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing or told is not None)
+    assembled = assemble(
+        machine, measurements, gauge, use_drawing=use_drawing or marginal_prior is not None
+    )
     batch = batch_of(machine, assembled, start)
     problem = assembled.problem
     # mounts are known to be near their start, as far as nothing else tells
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
-    if told is not None:
+    if marginal_prior is not None:
         drawn, u = np.array(assembled.priors) == "drawing", problem.unknowns
         prior, target = problem.prior.copy(), problem.prior_target.copy()
-        prior[drawn, u.machine], target[drawn] = told.root, told.root @ told.free
+        prior[drawn, u.machine], target[drawn] = (
+            marginal_prior.root,
+            marginal_prior.root @ marginal_prior.free,
+        )
         problem = replace(problem, prior=prior, prior_target=target)
     result = solve_batch(
         problem,
@@ -433,12 +449,14 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
-def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled, Information]:
+def linearize_at_solution(
+    measurements: Measurements, estimate: Estimate
+) -> tuple[Assembled, Information]:
     """The problem of an estimate at its end, with its weights, noise scales and the lines' shading
     as it found them, and what it says at its state there, but for the shading: as far as anything
     is from its best value a linear step tells.
     """
-    machine, measurements = estimate.machine, estimate.as_found(measurements)
+    machine, measurements = estimate.machine, estimate.stated_edge_noise(measurements)
     shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
     assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     statistics = estimate.statistics
@@ -451,15 +469,15 @@ def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled,
     return assembled, Information(assembled.problem, batch_of(machine, assembled, estimate.state))
 
 
-def machine_told(measurements: Measurements, estimate: Estimate) -> MachineTold:
+def marginalize_to_machine(measurements: Measurements, estimate: Estimate) -> MarginalPrior:
     """What an estimate knows of the machine, for the estimate of other measurements.
 
     The frames are as little known as by the drawing, about where the estimate has them.
     """
-    _, info = as_ended(measurements, estimate)
+    _, info = linearize_at_solution(measurements, estimate)
     rows, _ = reduced_rows(info, ("machine",), silent=())
     root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
-    return MachineTold(info.state.z[0], root)
+    return MarginalPrior(info.state.z[0], root)
 
 
 def _estimate(
@@ -471,18 +489,18 @@ def _estimate(
     gauge: Gauge,
 ) -> Estimate:
     """The result in the gauge, with everything that a report asks for."""
-    found, problem = result.solution.state, result.info.problem
+    solution, problem = result.solution.state, result.info.problem
     shared, u = result.covariance[0], problem.unknowns
-    if measurements.look_variance:
-        shared = shared + measurements.look_variance * covariance_by_noise(result.info)[0]
-    solved = state_of(assembled, found, start)
+    if measurements.imputation_covariance:
+        shared = shared + measurements.imputation_covariance * covariance_by_noise(result.info)[0]
+    solved = state_of(assembled, solution, start)
     full = machine_covariance(problem, machine, solved, shared, gauge)
     state = in_gauge(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
     optics, variance = own_blocks(shared, u.optics, u.n_optics), np.diagonal(shared)
     factor = measurements.intrinsics_factor
-    edges, poses, links = problem.unweighted(found)
+    edges, poses, links = problem.unweighted(solution)
     residuals = Kinds(
         assembled.places.edges.taken(edges[0]),
         assembled.places.poses.taken(poses[0] / result.scale.poses[0]),
@@ -493,7 +511,7 @@ def _estimate(
     value = result.info.by_kind.value
     closures = value[..., problem.closure_rows]
     joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
-    joints[assembled.seen] = problem.joint_rows(closures, found)[0]
+    joints[assembled.observed] = problem.joint_rows(closures, solution)[0]
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
@@ -502,11 +520,11 @@ def _estimate(
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         edge_noise=result.edges.of_run(0),
-        edge_trust=assembled.places.edges.taken(result.trust[0]),
+        edge_trust=assembled.places.edges.taken(result.robust_weight[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
-        configurations=assembled.seen,
-        statistics=_statistics(result, assembled, value, measurements.look_variance),
+        configurations=assembled.observed,
+        statistics=_statistics(result, assembled, value, measurements.imputation_covariance),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
@@ -514,7 +532,7 @@ def _estimate(
         link_residuals=residuals.links[:, 0],
         link_weights=weights.links,
         line_shading=problem.data.shading[0],
-        line_shift=(problem.data.shading * found.shading)[0],
+        line_shift=(problem.data.shading * solution.shading)[0],
         line_shift_sigma=problem.data.shading[0] * np.sqrt(variance[u.shading]),
         breathing_sigma=np.sqrt(variance[u.breathing]),
         size_sigma=np.sqrt(variance[u.sizes]),
@@ -525,17 +543,17 @@ def _with_unseen_poses(
     machine: Machine, measurements: Measurements, assembled: Assembled, state: State
 ) -> State:
     """Poses of the configurations that no photograph shows: by the readings alone."""
-    unseen = ~assembled.seen
+    unseen = ~assembled.observed
     if not unseen.any():
         return state
     poses, internal = state.T_base_platform.copy(), state.internal.copy()
-    found = machine.forward_result(measurements.joints[unseen], poses[unseen])
-    poses[unseen], internal[unseen] = found.T_base_platform, found.internal
+    fk = machine.forward_result(measurements.joints[unseen], poses[unseen])
+    poses[unseen], internal[unseen] = fk.T_base_platform, fk.internal
     return replace(state, T_base_platform=poses, internal=internal)
 
 
 def _statistics(
-    result: BatchResult, assembled: Assembled, value: Array, look_variance: float
+    result: BatchResult, assembled: Assembled, value: Array, imputation_covariance: float
 ) -> Statistics:
     """What the residuals (1, K, r) and their number say of the fit."""
     problem, state = result.info.problem, result.info.state
@@ -556,8 +574,8 @@ def _statistics(
     normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
     own = value.shape[1] * problem.layout.own_motion.shape[1] - problem.unknowns.n_linked
     unknowns = rank_of_normal(normal) + own
-    found = result.components
-    freedom = found.freedom[0].tolist()
+    components = result.components
+    freedom = components.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
         dof=n_edges + n_joints + n_poses + n_links + n_drawing - unknowns,
@@ -585,11 +603,11 @@ def _statistics(
         dof_links=freedom[LINK_ROWS_KIND],
         link_range=_range(noise_shares(result.info, LINK_ROWS_KIND), result.scale.links),
         shading=float(np.median(problem.data.shading[0])),
-        look_scatter=float(np.sqrt(look_variance)),
+        imputation_scatter=float(np.sqrt(imputation_covariance)),
     )
 
 
-def _range(found: NoiseShares, scale: Array) -> tuple[float, float | None]:
+def _range(shares: NoiseShares, scale: Array) -> tuple[float, float | None]:
     """Factors on a stated noise that the data allow, where ``scale`` (1,) is in use."""
-    low, high = (float((scale * end)[0]) for end in found.interval())
+    low, high = (float((scale * end)[0]) for end in shares.interval())
     return low, high if np.isfinite(high) else None

@@ -61,12 +61,14 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
         ("base", before.a, after.a, after.a_by, drawing.layout.a_index),
         ("platform", before.b, after.b, after.b_by, drawing.layout.b_index),
     )
-    found: list[Centres] = []
+    results: list[Centres] = []
     for side, old, new, by, index in sides:
         over = laid_over(np.array(old), np.array(new))
-        known = _spread(by, index, covariance)
-        found.append(Centres(side, np.array(new), apply(over, np.array(old)), over, known))
-    return tuple(found)
+        reference_values = _spread(by, index, covariance)
+        results.append(
+            Centres(side, np.array(new), apply(over, np.array(old)), over, reference_values)
+        )
+    return tuple(results)
 
 
 def free_of_gauge(machine: Machine, covariance: Array) -> Array:

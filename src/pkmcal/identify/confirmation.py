@@ -29,7 +29,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.identify.assembly import Assembled
-from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
@@ -138,7 +138,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     units = rejected_units(measurements, estimate)
     if not units:
         return Rejections()
-    assembled, info = as_ended(measurements, estimate)
+    assembled, info = linearize_at_solution(measurements, estimate)
     drawn = np.array(assembled.priors) == "drawing"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem, state = info.problem, info.state
@@ -152,9 +152,9 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
 
     def add(case: _Normal, loss: Array, of: Integers) -> None:
         """Hypotheses with the change of what is lost (n,), and of which unit each is."""
-        found, to = case.solution()
+        solution, to = case.solution()
         away = (to - step)[:, problem.unknowns.machine] @ rows.T
-        cost.append(found - least + loss)
+        cost.append(solution - least + loss)
         shift.append(np.sqrt(np.sum(away**2, axis=1)))
         member.append(of)
 
@@ -177,8 +177,8 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     out: list[RejectedUnit] = []
     for k in each:
         mine = (of == k) | (of < 0)
-        moved = float(np.sqrt(np.sum(share[mine] * shifts[mine] ** 2)))
-        out.append(replace(units[k], right=float(share[mine].sum()), shift=moved))
+        shifted = float(np.sqrt(np.sum(share[mine] * shifts[mine] ** 2)))
+        out.append(replace(units[k], right=float(share[mine].sum()), shift=shifted))
     elsewhere = float(np.sqrt(np.sum(share * shifts**2)))
     return Rejections((*out, *units[len(out) :]), elsewhere)
 

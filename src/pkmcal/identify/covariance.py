@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.identify.estimate import State, told_unknowns
+from pkmcal.identify.estimate import State, estimated_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
@@ -151,8 +151,8 @@ def covariance_by_noise(info: Information) -> Array:
     """The part of the shared unknowns' covariance (B, na, na) that the noise of what was measured
     makes; the rest is how little is known beforehand.
     """
-    known = info.problem.prior @ info.covariance
-    return info.covariance - known.mT @ known
+    in_prior = info.problem.prior @ info.covariance
+    return info.covariance - in_prior.mT @ in_prior
 
 
 def reduced_rows(
@@ -174,12 +174,16 @@ def reduced_rows(
     Frames stay in: their rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
     """
     problem, (rows, value) = info.problem, (part[0] for part in info.rows)
-    kept = problem.unknowns.columns(*keep)
-    told = problem.prior[:, kept if silent is None else problem.unknowns.columns(*silent)]
-    used = np.append(np.ones(len(rows) - len(told), dtype=bool), ~told.any(axis=1))
+    retained = problem.unknowns.columns(*keep)
+    prior_columns = problem.prior[
+        :, retained if silent is None else problem.unknowns.columns(*silent)
+    ]
+    used = np.append(
+        np.ones(len(rows) - len(prior_columns), dtype=bool), ~prior_columns.any(axis=1)
+    )
     rows, value = rows[used], value[used]
-    q = column_space(np.delete(rows, kept, axis=1))
-    rows = rows[:, kept]
+    q = column_space(np.delete(rows, retained, axis=1))
+    rows = rows[:, retained]
     return rows - q @ (q.T @ rows), value - q @ (q.T @ value)
 
 
@@ -187,19 +191,19 @@ def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
     """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
-    in the order of :func:`~pkmcal.identify.estimate.told_unknowns`.
+    in the order of :func:`~pkmcal.identify.estimate.estimated_unknowns`.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """
-    solved, told = problem.unknowns, told_unknowns(before)
-    spread = np.zeros((told.count, solved.count))
-    spread[told.machine, solved.machine] = problem.free
-    spread[told.stations, solved.stations] = np.eye(6 * solved.n_stations)
-    spread[told.mounts, solved.mounts] = np.eye(6 * solved.n_mounts)
-    return told_in_gauge(machine, before, spread, shared, gauge)
+    solved, estimated = problem.unknowns, estimated_unknowns(before)
+    spread = np.zeros((estimated.count, solved.count))
+    spread[estimated.machine, solved.machine] = problem.free
+    spread[estimated.stations, solved.stations] = np.eye(6 * solved.n_stations)
+    spread[estimated.mounts, solved.mounts] = np.eye(6 * solved.n_mounts)
+    return prior_in_gauge(machine, before, spread, shared, gauge)
 
 
-def told_in_gauge(
+def prior_in_gauge(
     machine: Machine, before: State, spread: Array, shared: Array, gauge: Gauge
 ) -> Array:
     """The covariance ``spread shared spread^T`` (n, n) of parameters, stations and mounts in the
@@ -207,7 +211,7 @@ def told_in_gauge(
 
     spread : (n, m) how they change with what has the covariance shared (m, m).
     """
-    told = told_unknowns(before)
+    estimated = estimated_unknowns(before)
     e, f = alignment(machine, before, gauge)
     after = changed_frames(machine.layout, before, e, f)
     spread = carried_errors(machine.layout, before, e, f) @ spread
@@ -217,9 +221,9 @@ def told_in_gauge(
         spread[index] -= np.outer(axis, axis @ spread[index])
     out = spread @ shared @ spread.T
     # constrained and fixed coordinates are exactly known; the product leaves rounding there
-    known = np.diag(out)[told.machine] < 1e-18 * machine.parameters.tolerance**2
-    known = np.flatnonzero(known)
-    out[known, :], out[:, known] = 0.0, 0.0
+    above_limit = np.diag(out)[estimated.machine] < 1e-18 * machine.parameters.tolerance**2
+    above_limit = np.flatnonzero(above_limit)
+    out[above_limit, :], out[:, above_limit] = 0.0, 0.0
     return 0.5 * (out + out.T)
 
 
@@ -229,9 +233,9 @@ def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) 
     change = projector(machine, theta, gauge)
     spread = free - generators(machine.layout, theta) @ (change @ free)
     drawing = np.sum((spread * table.tolerances_free()) ** 2, axis=1)
-    known = drawing > 1e-12 * table.tolerance**2
-    share = 1 - np.diag(covariance)[: len(table)] / np.where(known, drawing, 1.0)
-    return np.where(known, share, 0.0)
+    above_limit = drawing > 1e-12 * table.tolerance**2
+    share = 1 - np.diag(covariance)[: len(table)] / np.where(above_limit, drawing, 1.0)
+    return np.where(above_limit, share, 0.0)
 
 
 @dataclass(frozen=True)
@@ -286,13 +290,13 @@ def identifiability(info: Information, machine: Machine) -> Identifiability:
     tolerance = table.tolerances_free()
     # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
     # line by itself would hide the tubes' radii
-    left = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
+    remainder = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)
-    moved = move_generators(machine.layout, theta) @ moves
-    moved = np.linalg.lstsq(problem.free, moved, rcond=None)[0]
-    basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]
+    shifted = move_generators(machine.layout, theta) @ moves
+    shifted = np.linalg.lstsq(problem.free, shifted, rcond=None)[0]
+    basis = np.linalg.qr(shifted / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]
     # a square R has all right vectors, however few rows there are
-    _, s, vt = np.linalg.svd(np.linalg.qr(left @ basis, mode="r"), full_matrices=True)
+    _, s, vt = np.linalg.svd(np.linalg.qr(remainder @ basis, mode="r"), full_matrices=True)
     s = np.pad(s, (0, len(vt) - len(s)))
     directions = vt @ basis.T
     lost = s < RANK_TOLERANCE * s[0]

@@ -212,12 +212,12 @@ def discrepancy_of(
     )
     beyond = options.least_ratio(len(every))
     named_ratios = [one.ratio for one in best.scales if one.code.startswith(NAMED)]
-    evidence = 2 * (best.likelihood - noise_alone.likelihood) - sum(named_ratios)
+    log_likelihood_ratio = 2 * (best.likelihood - noise_alone.likelihood) - sum(named_ratios)
     if heights:
         needless = 2 * (best.likelihood - smooth.likelihood) <= beyond
         best, against = (smooth, noise_alone) if needless else (best, named_only)
-        evidence = 2 * (best.likelihood - against.likelihood)
-    sure = evidence > beyond
+        log_likelihood_ratio = 2 * (best.likelihood - against.likelihood)
+    sure = log_likelihood_ratio > beyond
     scales = tuple(one for one in best.scales if not one.code.startswith(NAMED))
     if not scales or (heights and inflated is None and not sure):
         return no_discrepancy(info)
@@ -255,7 +255,7 @@ class _Search:
         beyond = self.options.least_ratio(len(self.components))
         named = sum(one.code.startswith(NAMED) for one in self.components)
         while len(self.scales) < self.options.most + named:
-            squared, value = self._left()
+            squared, value = self._remainder()
             codes = {one.code for one in self.scales}
             best: ComponentScale | None = None
             for one, part in zip(self.components, self.parts, strict=True):
@@ -280,7 +280,7 @@ class _Search:
             more[self.parts[k]] = best.scale * best.root
             self.root = np.concatenate([self.root, more], axis=1)
 
-    def _left(self) -> tuple[Array, Array]:
+    def _remainder(self) -> tuple[Array, Array]:
         """M and h of all columns beside the noise that the taken ones are."""
         n = len(self.root)
         squared, value = self.products.squared[:n, :n], self.products.value[:n]
@@ -358,7 +358,7 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
     columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
     n, count = sum(effect.count for effect in effects), problem.unknowns.count
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
-    in_basis, left, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
+    in_basis, remainder, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
     for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
         piece = Information(problem.among(cut), problem.state_among(info.state, cut))
@@ -374,7 +374,7 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
         by_basis += extra.T @ own
         value += extra.T @ residuals
         in_basis += own.T @ residuals
-        left += float(residuals @ residuals)
+        remainder += float(residuals @ residuals)
         diagonal = np.einsum("bkii->bki", piece.reduced.r)
         own_scale += float(np.sum(np.log(np.maximum(np.abs(diagonal), 1e-300))))
     # of the restricted likelihood: the noise's own scale, then the unknowns', then the residuals
@@ -384,7 +384,7 @@ def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]
         value - by_basis @ in_basis,
         basis @ by_basis.T,
         squared,
-        -scale - (left - float(in_basis @ in_basis)) / 2,
+        -scale - (remainder - float(in_basis @ in_basis)) / 2,
     )
 
 
@@ -413,6 +413,6 @@ def _as_motion(assembled: Assembled, effect: Effect) -> Effect:
     if effect.station is None:
         return effect
     unknowns = assembled.problem.unknowns
-    motion = np.zeros((unknowns.n_stations, len(assembled.seen), 6, 6))
+    motion = np.zeros((unknowns.n_stations, len(assembled.observed), 6, 6))
     motion[effect.station, effect.since :] = np.eye(6)
     return Effect(motion=motion)

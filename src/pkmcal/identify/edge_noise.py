@@ -13,7 +13,7 @@ edge then counts by its weight (Lange, Little, Taylor 1989), and the information
 distribution is what the covariance of the result is made of.
 
 What one edge alone is shaded by is not its own: edges of a line whose normals are near are moved
-alike (:mod:`pkmcal.identify.alike`), so its variance counts times their number.
+alike (:mod:`pkmcal.identify.error_correlation`), so its variance counts times their number.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pkmcal.identify.scatter import (
     NUMBERS_AN_EDGE,
     EdgeScatter,
     shift_squares,
-    worth,
+    t_variance,
 )
 
 TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
@@ -37,7 +37,7 @@ TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 STATED_NOISE_WORTH = 5.0
 """Edges that the stated noise is worth when their own is found."""
 MOST_EDGE_NOISE_ROUNDS = 60
-VARIANCE_FOUND_CHANGE = 1e-4
+VARIANCE_CHANGE = 1e-4
 """Relative change of a variance below which it counts as found."""
 LARGEST_VARIANCE_FACTOR = 4.0
 """Largest factor on a variance in one round."""
@@ -53,19 +53,19 @@ def edge_noise(
     tube of which no edge was seen keeps all.
     """
     along, rest, size = _squares(info)
-    tube, found = info.problem.blocks.tube, list[tuple[Array, ...]]()
+    tube, results = info.problem.blocks.tube, list[tuple[Array, ...]]()
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
         if not own.any():
-            found.append(
-                (before.scale[:, number], before.shading[:, number], before.tails[:, number])
+            results.append(
+                (before.scale[:, number], before.shading[:, number], before.dof[:, number])
             )
             continue
         begin = before.scale[:, number], before.shading[:, number]
-        tails = before.tails[None, :, number] if same_tails else TAILS_TRIED[:, None]
+        tails = before.dof[None, :, number] if same_tails else TAILS_TRIED[:, None]
         squares = along[:, own], rest[:, own], size[:, own]
-        found.append(_student(*squares, weight[:, own], *begin, tails))
-    scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
+        results.append(_student(*squares, weight[:, own], *begin, tails))
+    scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*results, strict=True))
     return EdgeScatter(scale, shading, tails)
 
 
@@ -106,7 +106,7 @@ def _student(
     """
     from scipy.special import gammaln
 
-    tails, norm = tried[..., None], worth(tried)
+    tails, norm = tried[..., None], t_variance(tried)
     least, count = LEAST_OWN_SHADING**2 / norm, np.sum(weight, axis=-1)
     of_rest, square = weight * rest, size**2
 
@@ -117,13 +117,13 @@ def _student(
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
         """One step of the two variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
-        trust = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)
+        irls_weight = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)
         of_s = weight / s**2
-        left = (trust * along - s) * of_s
+        remainder = (irls_weight * along - s) * of_s
         # the stated noise counts as some edges more
-        by_a = np.sum(left, axis=-1) + (total(trust, of_rest) - count * a) / a**2
+        by_a = np.sum(remainder, axis=-1) + (total(irls_weight, of_rest) - count * a) / a**2
         by_a += STATED_NOISE_WORTH * (1 - a) / a**2
-        by_b = total(left, size)
+        by_b = total(remainder, size)
         aa, ab = np.sum(of_s, axis=-1) + (count + STATED_NOISE_WORTH) / a**2, total(of_s, size)
         bb = total(of_s, square) + EDGE_SCATTER_FLOOR
         det = aa * bb - ab**2
@@ -141,7 +141,7 @@ def _student(
     for _ in range(MOST_EDGE_NOISE_ROUNDS):
         before, (a, b) = (a, b), scored(a, b)
         change = max(np.abs(new / old - 1).max() for new, old in zip((a, b), before, strict=True))
-        if change < VARIANCE_FOUND_CHANGE:
+        if change < VARIANCE_CHANGE:
             break
     s, t = a[..., None] + b[..., None] * size, a[..., None]
     distance = along / s + rest / t
@@ -157,5 +157,5 @@ def _student(
     cost = cost - constant * count
     best, run = np.argmin(cost, axis=0), np.arange(len(scale))
     factor = (norm * np.ones_like(a))[best, run]
-    found = np.broadcast_to(tried, a.shape)[best, run]
-    return np.sqrt(factor * a[best, run]), np.sqrt(factor * b[best, run]), found
+    values = np.broadcast_to(tried, a.shape)[best, run]
+    return np.sqrt(factor * a[best, run]), np.sqrt(factor * b[best, run]), values

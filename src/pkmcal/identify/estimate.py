@@ -41,7 +41,7 @@ class State:
     __repr__ = short_repr
 
 
-def told_unknowns(state: State) -> Unknowns:
+def estimated_unknowns(state: State) -> Unknowns:
     """The unknowns that results are told of: all parameters, stations and mounts."""
     return Unknowns(
         state.theta.size, len(state.T_camera_base), n_cameras=0, n_mounts=len(state.T_mount)
@@ -62,10 +62,10 @@ class Statistics:
     standard deviation of what the edges of one side of a tube at one station have in common.
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
     reading_range, pose_range : factors on the stated noise that the data allow, smallest and
-    largest, None for no end (:mod:`pkmcal.identify.noise`). look_scatter : what the result scatters
-    by with where edges were looked for, in the deviations that noise gives it; they contain it.
-    chi2_links, n_links, dof_links, link_scale, link_range : of measurements that link two
-    configurations, as those of poses.
+    largest, None for no end (:mod:`pkmcal.identify.noise`). imputation_scatter : what the result
+    scatters by with where edges were looked for, in the deviations that noise gives it; they
+    contain it. chi2_links, n_links, dof_links, link_scale, link_range : of measurements that link
+    two configurations, as those of poses.
     """
 
     chi2: float
@@ -89,7 +89,7 @@ class Statistics:
     reading_scale: float = 1.0
     reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
-    look_scatter: float = 0.0
+    imputation_scatter: float = 0.0
     chi2_links: float = field(default=0.0, repr=False)
     n_links: float = field(default=0.0, repr=False)
     dof_links: float = field(default=0.0, repr=False)
@@ -163,33 +163,33 @@ class Estimate:
 
     __repr__ = short_repr
 
-    def as_found(self, measurements: Measurements) -> Measurements:
+    def stated_edge_noise(self, measurements: Measurements) -> Measurements:
         """Measurements of the estimate, all or some, with the noise of readings and edges as the
         data show it; what each edge counts besides is ``edge_trust``.
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
-        found = self.edge_noise
-        covariance = edges.covariance * found.scale[edges.tube, None, None] ** 2
-        edges = replace(edges, covariance=covariance, shading=found.shading[edges.tube])
+        value = self.edge_noise
+        covariance = edges.covariance * value.scale[edges.tube, None, None] ** 2
+        edges = replace(edges, covariance=covariance, shading=value.shading[edges.tube])
         noise = measurements.joint_noise * scale
         return replace(measurements, edges=edges, joint_noise=noise)
 
     @property
     def covariance(self) -> Array:
         """(P, P) of the machine's parameters."""
-        at = self._told.machine
+        at = self._estimated_unknowns.machine
         return self.joint_covariance[at, at]
 
     @property
     def station_covariance(self) -> Array:
         """(S, 6, 6) of each station's own place, left perturbation of T_camera_base."""
-        return own_blocks(self.joint_covariance, self._told.stations, 6)
+        return own_blocks(self.joint_covariance, self._estimated_unknowns.stations, 6)
 
     @property
     def mount_covariance(self) -> Array:
         """(M, 6, 6) of each mount's own place, left perturbation of T_mount."""
-        return own_blocks(self.joint_covariance, self._told.mounts, 6)
+        return own_blocks(self.joint_covariance, self._estimated_unknowns.mounts, 6)
 
     @property
-    def _told(self) -> Unknowns:
-        return told_unknowns(self.state)
+    def _estimated_unknowns(self) -> Unknowns:
+        return estimated_unknowns(self.state)

@@ -28,7 +28,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
-from pkmcal.identify.estimate import State, told_unknowns
+from pkmcal.identify.estimate import State, estimated_unknowns
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.layout import LimbLayout
 
@@ -225,8 +225,8 @@ def slid(layout: LimbLayout, theta: Array, y: Array) -> Array:
     for group in layout.platform:
         if group.carrier.turns:
             own = 2 * layout.internal[group.legs]
-            moved = group.carrier.slid(group.of(out), y[..., own], y[..., own + 1])
-            out[..., group.index] = moved
+            shifted = group.carrier.slid(group.of(out), y[..., own], y[..., own + 1])
+            out[..., group.index] = shifted
     return out
 
 
@@ -241,8 +241,8 @@ def freedoms(machine: Machine) -> Array:
     All twelve for a spatial machine without fixed parameters. Fixed or tied parameters take
     some away; a machine that moves in fewer directions keeps those that respect its motion.
     """
-    moved = generators(machine.layout, machine.parameters.drawing)
-    return _allowed(machine, moved, respecting_motion(machine.layout.motion))
+    shifted = generators(machine.layout, machine.parameters.drawing)
+    return _allowed(machine, shifted, respecting_motion(machine.layout.motion))
 
 
 def conventions(machine: Machine) -> Array:
@@ -261,17 +261,17 @@ def exact_moves(machine: Machine) -> Array:
 
 def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
     """What the model allows of frame changes (12, g) and of the first n other changes."""
-    moved = move_generators(machine.layout, machine.parameters.drawing)
-    candidates = np.zeros((moved.shape[1], frames.shape[1] + n))
+    shifted = move_generators(machine.layout, machine.parameters.drawing)
+    candidates = np.zeros((shifted.shape[1], frames.shape[1] + n))
     candidates[:12, : frames.shape[1]] = frames
     candidates[12 : 12 + n, frames.shape[1] :] = np.eye(n)
-    return _allowed(machine, moved, candidates)
+    return _allowed(machine, shifted, candidates)
 
 
-def _allowed(machine: Machine, moved: Array, candidates: Array) -> Array:
-    """Combinations of candidates (c, k) that move free parameters only; moved : (P, c)."""
-    free, moved = machine.parameters.free_matrix(), moved @ candidates
-    outside = moved - free @ np.linalg.lstsq(free, moved, rcond=None)[0]
+def _allowed(machine: Machine, shifted: Array, candidates: Array) -> Array:
+    """Combinations of candidates (c, k) that move free parameters only; shifted : (P, c)."""
+    free, shifted = machine.parameters.free_matrix(), shifted @ candidates
+    outside = shifted - free @ np.linalg.lstsq(free, shifted, rcond=None)[0]
     _, s, vt = np.linalg.svd(outside)
     size = np.zeros(candidates.shape[1])
     size[: s.size] = s
@@ -357,11 +357,11 @@ def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
 
     What the frames make zero is zero, not the rounding of their change.
     """
-    moved = changed_frames(machine.layout, state, *alignment(machine, state, gauge))
+    shifted = changed_frames(machine.layout, state, *alignment(machine, state, gauge))
     lengths = np.array([unit == "m" for unit in machine.parameters.units])
-    size = np.where(lengths, np.abs(moved.theta[..., lengths]).max(initial=0.0), 1.0)
-    rounding = np.abs(moved.theta) < FRAME_CHANGE_ROUNDING * size
-    return replace(moved, theta=np.where(rounding, 0.0, moved.theta))
+    size = np.where(lengths, np.abs(shifted.theta[..., lengths]).max(initial=0.0), 1.0)
+    rounding = np.abs(shifted.theta) < FRAME_CHANGE_ROUNDING * size
+    return replace(shifted, theta=np.where(rounding, 0.0, shifted.theta))
 
 
 def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> State:
@@ -391,7 +391,7 @@ def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array
     e, f = e[..., None, :, :], f[..., None, :, :]
     out = np.concatenate([theta, np.zeros((*theta.shape[:-1], 1))], axis=-1)
     for group in (*layout.base, *layout.platform):
-        out[..., group.index] = group.carrier.moved(group.of(theta), e, f)
+        out[..., group.index] = group.carrier.reframed(group.of(theta), e, f)
     out = out[..., :-1]
     for transform, axes in zip((e, f), layout.turning, strict=True):
         out[..., axes] = (transform[..., :3, :3] @ theta[..., axes, None])[..., 0]
@@ -406,21 +406,21 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
     (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes. A mount's
     are turned with its body.
     """
-    told = told_unknowns(before)
-    out = np.eye(told.count)
+    estimated = estimated_unknowns(before)
+    out = np.eye(estimated.count)
     for transform, axes in zip((e, f), layout.turning, strict=True):
         out[axes[:, :, None], axes[:, None, :]] = transform[:3, :3]
     # the carriers' own; the last takes what the file is silent about
-    own = np.pad(out[told.machine, told.machine], ((0, 1), (0, 1)))
+    own = np.pad(out[estimated.machine, estimated.machine], ((0, 1), (0, 1)))
     for group in (*layout.base, *layout.platform):
         by = group.carrier.carried(group.of(before.theta), e[None], f[None])
         own[group.index[:, :, None], group.index[:, None, :]] = by
-    out[told.machine, told.machine] = own[:-1, :-1]
+    out[estimated.machine, estimated.machine] = own[:-1, :-1]
     for s, station in enumerate(before.T_camera_base):
-        at = told.stations.start + 6 * s
+        at = estimated.stations.start + 6 * s
         out[at + 3 : at + 6, at : at + 3] = skew(station[:3, :3] @ e[:3, :3].T @ e[:3, 3])
     for m, moving in enumerate(before.on_platform):
-        at, frame = told.mounts.start + 6 * m, f if moving else e
+        at, frame = estimated.mounts.start + 6 * m, f if moving else e
         out[at : at + 3, at : at + 3] = out[at + 3 : at + 6, at + 3 : at + 6] = frame[:3, :3]
     return out
 
@@ -433,13 +433,13 @@ def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:
     out of all alike. Constrained coordinates get zero variance exactly.
     """
     change = projector(machine, state.theta, gauge)
-    moved = np.concatenate(
+    shifted = np.concatenate(
         [
             generators(machine.layout, state.theta),
             station_generators(state.T_camera_base).reshape(-1, 12),
             mount_generators(state.T_mount, state.on_platform).reshape(-1, 12),
         ]
     )
-    out = np.eye(len(moved))
-    out[:, : change.shape[1]] -= moved @ change
+    out = np.eye(len(shifted))
+    out[:, : change.shape[1]] -= shifted @ change
     return out

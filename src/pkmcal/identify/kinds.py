@@ -58,14 +58,14 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
-        found = eliminated(rows, np.zeros(n_runs))
+        eliminated_part = eliminated(rows, np.zeros(n_runs))
         values.append(rows.value)
-        every += found.strips_normal + found.rows_normal
+        every += eliminated_part.strips_normal + eliminated_part.rows_normal
         if part.kinds.edges.present.any():
-            trace[:, EDGE_ROWS_KIND] += np.einsum("bcii->b", found.own)
-            normal[:, EDGE_ROWS_KIND] += found.strips_normal
+            trace[:, EDGE_ROWS_KIND] += np.einsum("bcii->b", eliminated_part.own)
+            normal[:, EDGE_ROWS_KIND] += eliminated_part.strips_normal
         for kind in (POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND):
-            own, shared, _ = _rows_of_kind(part, rows, found, by_reading, kind)
+            own, shared, _ = _rows_of_kind(part, rows, eliminated_part, by_reading, kind)
             if shared.size:
                 trace[:, kind] += np.sum(own**2, axis=(1, 2, 3))
                 normal[:, kind] += flat(shared).mT @ flat(shared)
@@ -79,17 +79,17 @@ def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
-        found = eliminated(rows, np.zeros(len(state.z)))
-        parts.append(_rows_of_kind(part, rows, found, by_reading, kind))
+        eliminated_part = eliminated(rows, np.zeros(len(state.z)))
+        parts.append(_rows_of_kind(part, rows, eliminated_part, by_reading, kind))
     return KindRows(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
 def _rows_of_kind(
-    problem: Problem, rows: Compact, found: Eliminated, by_reading: Array, kind: int
+    problem: Problem, rows: Compact, eliminated_part: Eliminated, by_reading: Array, kind: int
 ) -> KindRows:
     """The rows of poses, readings or links in some configurations; by_reading (B, K, E)."""
     equations, start = problem.layout.n_equations, problem.closure_rows.start
-    parts = found.q, found.rows, rows.value[:, :, start:, None]
+    parts = eliminated_part.q, eliminated_part.rows, rows.value[:, :, start:, None]
     if kind in (POSE_ROWS_KIND, LINK_ROWS_KIND):
         last = problem.kinds.links.rows.start - start
         cut = slice(equations, last) if kind == POSE_ROWS_KIND else slice(last, None)

@@ -24,7 +24,7 @@ SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
 
 
 def common_shading(
-    shift: Array, covariance: Array, alike: Array, sigma: Array, least: Array | float
+    shift: Array, covariance: Array, correlation: Array, sigma: Array, least: Array | float
 ) -> Array:
     """Standard deviation (B, n) px of each line's shading, as the data have it.
 
@@ -42,10 +42,12 @@ def common_shading(
     with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little, Taylor
     1989), x^2 the square expected of its shift.
     """
-    known = np.linalg.inv(covariance)
-    slope = (known @ shift[..., None])[..., 0]
-    told = known - np.linalg.inv(alike) / (sigma[..., None] * sigma[:, None])
-    root = np.linalg.cholesky(alike)
+    total_information = np.linalg.inv(covariance)
+    slope = (total_information @ shift[..., None])[..., 0]
+    information = total_information - np.linalg.inv(correlation) / (
+        sigma[..., None] * sigma[:, None]
+    )
+    root = np.linalg.cholesky(correlation)
     expected = shift**2 + np.diagonal(covariance, axis1=-2, axis2=-1)
     tried = SHADINGS_TRIED * least
     common = np.median(sigma, axis=1, keepdims=True) ** 2
@@ -53,20 +55,20 @@ def common_shading(
     for _ in range(SHADING_WEIGHINGS):
         weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
         unit = root / np.sqrt(weight)[..., None]
-        common = _mean_variance(unit.mT @ told @ unit, unit.mT @ slope[..., None], tried)
+        common = _mean_variance(unit.mT @ information @ unit, unit.mT @ slope[..., None], tried)
     return np.maximum(np.sqrt(common / weight), least)
 
 
-def _mean_variance(told: Array, slope: Array, tried: Array) -> Array:
+def _mean_variance(information: Array, slope: Array, tried: Array) -> Array:
     """The mean (B, 1) of s^2 over the deviations tried (B or 1, T), where the data tell D (B, n, n)
     and have the slope h (B, n, 1) of unknowns with the deviation s each.
     """
-    value, vectors = np.linalg.eigh(told)
+    value, vectors = np.linalg.eigh(information)
     along = (vectors.mT @ slope)[..., 0]
     each = 1 + tried[..., None] ** 2 * np.maximum(value, 0.0)[:, None]  # (B, T, n)
     gain = tried[..., None] ** 2 * along[:, None] ** 2 / each
-    told_by = np.sum(gain - np.log(each), axis=-1) / 2
+    log_likelihood = np.sum(gain - np.log(each), axis=-1) / 2
     prior = tried / (1 + (tried / SHIFT_SIGMA) ** 2)  # a step of the tried ones is s wide
-    share = prior * np.exp(told_by - told_by.max(axis=-1, keepdims=True))
+    share = prior * np.exp(log_likelihood - log_likelihood.max(axis=-1, keepdims=True))
     mean = np.sum(share * tried**2, axis=-1) / np.sum(share, axis=-1)
     return mean[:, None]

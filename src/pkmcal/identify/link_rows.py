@@ -87,7 +87,7 @@ def link_rows(blocks: LinkBlocks, data: LinkData, linked: Array, T_mount: Array)
     if not len(blocks.ends):
         none = np.zeros((n_runs, 0, 6))
         return LinkRows(value, none, none, none)
-    found = [
+    results = [
         one.rows(
             linked[:, one.configuration[:, 0]],
             linked[:, one.configuration[:, 1]],
@@ -95,7 +95,7 @@ def link_rows(blocks: LinkBlocks, data: LinkData, linked: Array, T_mount: Array)
         )
         for one in blocks.sets
     ]
-    parts = [np.concatenate(part, axis=1) for part in zip(*found, strict=True)]
+    parts = [np.concatenate(part, axis=1) for part in zip(*results, strict=True)]
     weigh = np.sqrt(data.weight[:, blocks.at.row, blocks.at.place])
     value[:, blocks.at.row, blocks.at.place] = weigh * parts[0]
     return LinkRows(value, *(weigh[..., None] * part for part in parts[1:]))

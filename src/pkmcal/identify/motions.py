@@ -25,7 +25,7 @@ from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
-from pkmcal.wording import SHOWN_UNITS, decimals, joined, named, number, split_name, with_unit
+from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split_name, with_unit
 
 AXIS_LETTERS = "xyz"
 MOST_GROUPS = 120
@@ -40,7 +40,7 @@ NEGLIGIBLE_CHANGE_SHARE = 1e-3
 """Part of its greatest number below which a number of a change is nothing."""
 UNTOLD_SIZE_CHANGE = 0.01
 """mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
-MOST_TOLD = 5
+MOST_VALUES_LISTED = 5
 """Numbers of a change that are told, the last of them for all smaller ones."""
 
 Advice = Literal[
@@ -53,14 +53,14 @@ Advice = Literal[
 class Situation:
     """What the candidates are made from.
 
-    machine : with the present values. seen : (S, L) legs that each station sees.
+    machine : with the present values. observed : (S, L) legs that each station sees.
     T_base_platform : (K, 4, 4) poses of the session. photographed : whether legs are in
     photographs; otherwise only boards or poses were seen. heights : whether it was nothing but
     heights.
     """
 
     machine: Machine
-    seen: Booleans
+    observed: Booleans
     T_base_platform: Array
     photographed: bool = True
     heights: bool = False
@@ -85,8 +85,8 @@ class Situation:
 
     def rows(self, leg: int, *starts: str) -> Integers:
         """Positions of a leg's parameters in fields that start so."""
-        found = [rows for field, rows in self.fields[leg].items() if field.startswith(starts)]
-        return np.concatenate([np.zeros(0, dtype=int), *found])
+        results = [rows for field, rows in self.fields[leg].items() if field.startswith(starts)]
+        return np.concatenate([np.zeros(0, dtype=int), *results])
 
     def label(self, rows: Integers) -> str:
         """What a field is called."""
@@ -153,19 +153,19 @@ class NamedChanges:
 
 def candidates(s: Situation) -> Iterator[NamedChanges]:
     """Every motion, the most particular first; the last is anything at all."""
-    yield from (_unseen(s, j) for j in s.legs if not s.seen[:, j].any())
+    yield from (_unseen(s, j) for j in s.legs if not s.observed[:, j].any())
     yield from _conventions(s)
     carried = [m for j in s.legs for m in _carriers(s, j)]
     own = [motion for j in s.legs for motion in _of_one_leg(s, j)]
     shared = [*(motion for motion, _ in carried), *_sizes(s)]
     # photographs tell legs one by one; poses leave open what is the same of all
     yield from (*own, *shared) if s.photographed else (*shared, *own)
-    for group in movable_leg_groups(s.seen):
+    for group in movable_leg_groups(s.observed):
         yield from _group(s, group)
     for j in s.legs:
         yield from _whole_leg(s, j)
     if s.photographed and any("tubes" in fields for fields in s.fields):
-        yield from (_spread(s, group) for group in (*movable_leg_groups(s.seen), s.legs))
+        yield from (_spread(s, group) for group in (*movable_leg_groups(s.observed), s.legs))
     yield _everything(s)
     yield from _all_together(s, carried)
     rest = "of the machine's numbers, {combinations}{mostly}"
@@ -231,8 +231,8 @@ def _difference(s: Situation, coefficients: Array) -> str:
     )
     one_body = not any(g.carrier.floats or g.carrier.turns for g in layout.platform)
     size = one_body and {"x", "y"} <= set(axes)
-    seen = ", as the difference of base and platform radius" if size else ""
-    return f"{joined(axes)} of {base} and of {platform}, only the difference is seen{seen}"
+    visible = ", as the difference of base and platform radius" if size else ""
+    return f"{joined(axes)} of {base} and of {platform}, only the difference is seen{visible}"
 
 
 # ------------------------------------------------------------------ of one leg
@@ -338,8 +338,8 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
                 # what the file is silent about lands in the last row
                 columns = np.zeros((len(s.machine.parameters) + 1, motion.columns.shape[1]))
                 columns[group.index[i]] = motion.columns
-                found = NamedChanges((leg,), columns[:-1], motion.one, motion.several)
-                yield found, motion.together
+                names = NamedChanges((leg,), columns[:-1], motion.one, motion.several)
+                yield names, motion.together
 
 
 def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
@@ -377,7 +377,7 @@ def sizes(s: Situation) -> tuple[Size, ...]:
     for j in s.legs:
         radius[places[j], j] = outwards[j]
         height[places[j, 2], j] = 1.0
-    found = [Size("base radius", "m", radius), Size("base height", "m", height)]
+    results = [Size("base radius", "m", radius), Size("base height", "m", height)]
     free = np.any(table.free_matrix(), axis=1)
     for field in dict.fromkeys(field for leg in s.fields for field in leg if field != "tubes"):
         having = [j for j in s.legs if len(s.fields[j].get(field, ())) == 1]
@@ -385,33 +385,33 @@ def sizes(s: Situation) -> tuple[Size, ...]:
         if len(rows) > 1 and free[rows].any():
             columns = np.zeros((len(table), n))
             columns[rows, having] = 1.0
-            found.append(Size(table.labels[rows[0]], table.units[rows[0]], columns))
-    return tuple(found)
+            results.append(Size(table.labels[rows[0]], table.units[rows[0]], columns))
+    return tuple(results)
 
 
 def _sizes(s: Situation) -> Iterator[NamedChanges]:
     """Few of them first: of all legs alike, then of single legs."""
-    known = sizes(s)
-    numbers = [*range(1, min(MOST_SIZES, len(known)) + 1)]
-    numbers += [len(known)] if len(known) > MOST_SIZES else []
+    reference_values = sizes(s)
+    numbers = [*range(1, min(MOST_SIZES, len(reference_values)) + 1)]
+    numbers += [len(reference_values)] if len(reference_values) > MOST_SIZES else []
     apart = "cannot be told apart" + (" by heights" if s.heights else "") + "{better}"
     single: list[NamedChanges] = []
-    for group in (group for n in numbers for group in combinations(known, n)):
+    for group in (group for n in numbers for group in combinations(reference_values, n)):
         columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
         labels = tuple((f"the {g.label}", g.unit) for g in group)
         having = np.any(columns, axis=0)  # (L, sizes)
         legs = tuple(j for j in s.legs if having[j].any())
         whose = "all legs" if len(legs) == len(s.legs) else named(legs)
-        what, alike = joined([label for label, _ in labels]), columns.sum(axis=1)
+        what, similar = joined([label for label, _ in labels]), columns.sum(axis=1)
         text = f"{what}, of {whose} alike, "
         if len(group) == 1:
-            yield NamedChanges(legs, alike, text + "{is}")
+            yield NamedChanges(legs, similar, text + "{is}")
             continue
         if s.heights:
-            how = _as_flat(labels, alike)
-            yield NamedChanges(legs, alike, text + apart + "{how}", how=how, labels=labels)
+            how = _as_flat(labels, similar)
+            yield NamedChanges(legs, similar, text + apart + "{how}", how=how, labels=labels)
         else:
-            yield NamedChanges(legs, alike, text + apart + "{mostly}", labels=labels)
+            yield NamedChanges(legs, similar, text + apart + "{mostly}", labels=labels)
         text = f"{what} of {{each}}{{legs}} {apart}{{mostly}}"
         single += [
             NamedChanges((j,), columns[:, j], text, labels=labels) for j in legs if having[j].all()
@@ -425,15 +425,16 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
     def how(s: Situation, coefficients: Array) -> str:
         if len(coefficients) > 1:
             return ""
-        said, unit = changes(coefficients[0], labels)
+        what, unit = changes(coefficients[0], labels)
         poses = s.T_base_platform
-        moved = pose_by_parameters(s.machine, s.readings, poses)
-        moved = moved @ columns @ coefficients[0] * unit
+        shifted = pose_by_parameters(s.machine, s.readings, poses)
+        shifted = shifted @ columns @ coefficients[0] * unit
         xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
-        stretch = float(np.sum(moved[:, 3:5] * xy) / np.sum(xy**2))
-        way = "stretch" if stretch > 0 else "shrink"
+        stretch = float(np.sum(shifted[:, 3:5] * xy) / np.sum(xy**2))
+        does = "stretch" if stretch > 0 else "shrink"
         return (
-            f": with {joined(said)}, the bed looks as flat, and x and y {way} by {abs(stretch):.2%}"
+            f": with {joined(what)}, the bed looks as flat, and x and y {does} by"
+            f" {abs(stretch):.2%}"
         )
 
     return how
@@ -446,51 +447,57 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
     none, the largest angle a tenth of a degree, or scale a tenth of a per cent; also returns the
     factor by which.
     """
-    told = [{**SHOWN_UNITS, "": (100.0, "%")}.get(unit, SHOWN_UNITS["rad"]) for _, unit in labels]
-    scale = np.array([factor for factor, _ in told])
+    units = [
+        {**DISPLAY_UNITS, "": (100.0, "%")}.get(unit, DISPLAY_UNITS["rad"]) for _, unit in labels
+    ]
+    scale = np.array([factor for factor, _ in units])
     length = np.array([unit == "m" for _, unit in labels]) & (np.abs(values) > 0)
     first = int(np.argmax(np.where(length, np.abs(values), 0 if length.any() else np.abs(values))))
     one = 1.0 if length.any() else 0.1
     factor = one / (scale[first] * values[first])
-    shown = values * factor * scale
-    order = [first, *(k for k in np.argsort(-np.abs(shown), kind="stable") if k != first)]
-    order = [k for k in order if abs(shown[k]) > UNTOLD_SIZE_CHANGE]
-    said: list[str] = []
+    values_out = values * factor * scale
+    order = [first, *(k for k in np.argsort(-np.abs(values_out), kind="stable") if k != first)]
+    order = [k for k in order if abs(values_out[k]) > UNTOLD_SIZE_CHANGE]
+    texts: list[str] = []
     for k in order:
-        places = decimals(abs(shown[k])) if k != first else int(one < 1)
-        said.append(
-            f"{with_unit(number(shown[k], places, signed=True), told[k][1])} of {labels[k][0]}"
+        places = decimals(abs(values_out[k])) if k != first else int(one < 1)
+        texts.append(
+            f"{with_unit(number(values_out[k], places, signed=True), units[k][1])} of"
+            f" {labels[k][0]}"
         )
-    if len(said) > MOST_TOLD:
-        said = [*said[: MOST_TOLD - 1], f"{len(said) - MOST_TOLD + 1} smaller changes"]
-    return said, factor
+    if len(texts) > MOST_VALUES_LISTED:
+        texts = [
+            *texts[: MOST_VALUES_LISTED - 1],
+            f"{len(texts) - MOST_VALUES_LISTED + 1} smaller changes",
+        ]
+    return texts, factor
 
 
 # ------------------------------------------------------------------ groups of legs
 
 
-def movable_leg_groups(seen: Booleans) -> tuple[tuple[int, ...], ...]:
+def movable_leg_groups(visible: Booleans) -> tuple[tuple[int, ...], ...]:
     """Groups of legs that might move against the others, by which stations (S, L) see them.
 
     What one station sees, what it sees and another does not, and what hangs together through
     shared legs; of a group and its complement the smaller.
     """
-    found: dict[tuple[int, ...], None] = {}
-    rows = np.unique(seen, axis=0)
-    parts = [*hanging_together(seen), *rows]
+    results: dict[tuple[int, ...], None] = {}
+    rows = np.unique(visible, axis=0)
+    parts = [*hanging_together(visible), *rows]
     parts += [a & ~b for a, b in combinations(rows, 2)] + [b & ~a for a, b in combinations(rows, 2)]
     for part in parts:
         count = int(part.sum())
         other = 2 * count > part.size or (2 * count == part.size and bool(part[0]))
         group = np.flatnonzero(~part if other else part)
         if 0 < group.size < part.size:
-            found[tuple(group.tolist())] = None
-    return tuple(list(found)[:MOST_GROUPS])
+            results[tuple(group.tolist())] = None
+    return tuple(list(results)[:MOST_GROUPS])
 
 
-def hanging_together(seen: Booleans) -> tuple[Booleans, ...]:
+def hanging_together(visible: Booleans) -> tuple[Booleans, ...]:
     """Sets of legs (L,) that stations (S, L) connect, one station sharing a leg with the next."""
-    joint = seen.T.astype(int) @ seen.astype(int) > 0
+    joint = visible.T.astype(int) @ visible.astype(int) > 0
     reach = np.linalg.matrix_power(np.eye(len(joint)) + joint.astype(float), len(joint))
     return tuple(np.unique(reach > 0, axis=0))
 
@@ -501,11 +508,13 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
     ends: list[Array] = []
     for body, side in enumerate(("base", "platform")):
         rows = np.concatenate([s.rows(j, side) for j in legs])
-        moved = np.zeros((len(frames), 6))
-        moved[rows] = frames[rows, 6 * body : 6 * body + 6]
+        shifted = np.zeros((len(frames), 6))
+        shifted[rows] = frames[rows, 6 * body : 6 * body + 6]
         middle = s.machine.values[centre_index(s.machine.layout)[body][list(legs)]].mean(axis=0)
-        moved[:, :3] += moved[:, 3:] @ skew(middle)  # turns about the middle of these legs' joints
-        ends.append(moved)
+        shifted[:, :3] += shifted[:, 3:] @ skew(
+            middle
+        )  # turns about the middle of these legs' joints
+        ends.append(shifted)
     who, relation = named(legs), _relation(s, legs)
     joints = f"joint{'s' if len(legs) > 1 else ''} of {who}"
     text = f"{relation}: {{}} can {{{{how}}}} against the others{{{{limited}}}}"
@@ -520,7 +529,7 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
 def _relation(s: Situation, legs: tuple[int, ...]) -> str:
     """How the group is seen with the other legs."""
     others = [j for j in s.legs if j not in legs]
-    with_group = np.any(s.seen[s.seen[:, list(legs)].any(axis=1)], axis=0)
+    with_group = np.any(s.observed[s.observed[:, list(legs)].any(axis=1)], axis=0)
     bridging = [j for j in others if with_group[j]]
     verb = "are" if len(legs) > 1 else "is"
     if not bridging:
@@ -559,10 +568,10 @@ def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
     if turns == 1 and not len(shifts):
         k = int(np.argmax(np.linalg.norm(omega, axis=1)))
         return f"turn about {_line(twists[k, :3], tau[k], middle, points, legs, spread)}"
-    said = [f"shift {directions_in_words(shifts)}"] if len(shifts) else []
+    text = [f"shift {directions_in_words(shifts)}"] if len(shifts) else []
     axis = _axis_name(vt[0])
     about = (f"about {axis or 'one axis'}", "about two axes", "freely")
-    return joined(said + ([f"turn {about[turns - 1]}"] if turns else []))
+    return joined(text + ([f"turn {about[turns - 1]}"] if turns else []))
 
 
 def _line(

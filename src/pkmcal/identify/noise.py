@@ -243,8 +243,10 @@ class NoiseShares:
             a, b = value(centre - step), value(centre + step)
             # the vertex of the parabola through the three, no further than a step
             bend = a + b - 2 * middle
-            way = np.where(bend > 0, (a - b) / np.where(bend > 0, bend, 1.0) / 2, np.sign(a - b))
-            there = centre + step * np.clip(way, -1, 1)
+            direction = np.where(
+                bend > 0, (a - b) / np.where(bend > 0, bend, 1.0) / 2, np.sign(a - b)
+            )
+            there = centre + step * np.clip(direction, -1, 1)
             here = value(there)
             for new, place in ((a, centre - step), (b, centre + step), (here, there)):
                 log, best = np.where(new < best, place, log), np.minimum(new, best)
@@ -254,8 +256,8 @@ class NoiseShares:
 def noise_shares(info: Information, kind: int) -> NoiseShares:
     """Those of the readings, or of the poses, at a solution."""
     rows, half = kind_rows(info.problem, info.state, kind), info.root
-    known = info.problem.prior @ half
-    fixed = known.mT @ known
+    in_prior = info.problem.prior @ half
+    fixed = in_prior.mT @ in_prior
     runs = [
         _of_run(KindRows(*(part[run] for part in rows)), half[run], fixed[run])
         for run in range(len(half))
@@ -303,17 +305,19 @@ def _independent(
     blocks[each, :, each] = np.eye(n) - own @ own.mT
     d = blocks.reshape((n_configurations * n,) * 2)[np.ix_(flat_used, flat_used)]
     s, r = shared.reshape(-1, shared.shape[-1])[flat_used], value.ravel()[flat_used]
-    left = d - s @ s.T
+    residual = d - s @ s.T
     ds = d @ s
     by_own = d @ d - ds @ s.T - s @ ds.T + s @ across @ s.T
-    size, turn = np.linalg.eigh(left)
+    size, turn = np.linalg.eigh(residual)
     some = size > LEAST_RESIDUAL_SHARE
     unit = turn[:, some] / np.sqrt(size[some])
     of_own, turn = np.linalg.eigh(unit.T @ by_own @ unit)
     unit = unit @ turn
     of_own = np.clip(of_own, 0.0, 1.0)
-    known = s.T @ unit
-    of_fixed = np.clip(np.sum(known * (fixed @ known), axis=0), 0.0, 1.0 - of_own)
+    reference_values = s.T @ unit
+    of_fixed = np.clip(
+        np.sum(reference_values * (fixed @ reference_values), axis=0), 0.0, 1.0 - of_own
+    )
     return unit.T @ r, of_own, 1.0 - of_own - of_fixed, of_fixed
 
 

@@ -93,7 +93,8 @@ class Problem:
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
     pose_blocks, pose_data : of boards. link_blocks, link_data : of links. slopes : (B, K, E)
     closures by their readings, which tell their noise, where they are held; None where they are the
-    state's own. kept : the :attr:`structure`, which problems of the same measurements share.
+    state's own. structure_cache : the :attr:`structure`, which problems of the same measurements
+    share.
     """
 
     layout: LimbLayout
@@ -111,7 +112,7 @@ class Problem:
     link_blocks: LinkBlocks
     link_data: LinkData
     slopes: Array | None = None
-    kept: Structure | None = None
+    structure_cache: Structure | None = None
 
     def __post_init__(self) -> None:
         """The structure of a problem of the same measurements stays."""
@@ -119,13 +120,13 @@ class Problem:
             self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
         )  # fmt: skip
-        if self.kept is None or not self.kept.made_of(*parts):
-            object.__setattr__(self, "kept", Structure(*parts))
+        if self.structure_cache is None or not self.structure_cache.made_of(*parts):
+            object.__setattr__(self, "structure_cache", Structure(*parts))
 
     @property
     def structure(self) -> Structure:
         """Where everything stands."""
-        return cast(Structure, self.kept)
+        return cast(Structure, self.structure_cache)
 
     @cached_property
     def kinds(self) -> Kinds[RowsOfKind]:
@@ -166,7 +167,7 @@ class Problem:
         return replace(
             self,
             blocks=structure.blocks,
-            kept=structure,
+            structure_cache=structure,
             data=self.data.among(configurations),
             pose_blocks=self.pose_blocks.among(configurations),
             pose_data=self.pose_data.among(configurations),
@@ -241,8 +242,8 @@ class Problem:
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
-        found = self._evaluated(state)
-        return Values(found.value, found.shared_value, partial(self._rows, found))
+        evaluated = self._evaluated(state)
+        return Values(evaluated.value, evaluated.shared_value, partial(self._rows, evaluated))
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
@@ -266,12 +267,12 @@ class Problem:
         shared_value = self.prior_values(state) - self.prior_target
         return _Evaluated(value, of_edges, shared_value, c, edges, poses, links)
 
-    def _rows(self, found: _Evaluated) -> Compact:
+    def _rows(self, evaluated: _Evaluated) -> Compact:
         """The rows at a point, from what was needed of it for its residuals."""
-        usable = np.isfinite(found.value) & self._in_use
-        by_closures, by_pose = self._of_closures(found.closure)
-        by_boards, by_board = self._of_boards(found.poses)
-        by_links = self._of_links(found.links)
+        usable = np.isfinite(evaluated.value) & self._in_use
+        by_closures, by_pose = self._of_closures(evaluated.closure)
+        by_boards, by_board = self._of_boards(evaluated.poses)
+        by_links = self._of_links(evaluated.links)
         no_own = np.zeros((*by_links.shape[:3], by_pose.shape[-1]))
         by_own = np.concatenate([by_pose, by_board, no_own], axis=2)
         by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
@@ -280,11 +281,11 @@ class Problem:
             rest[:, k, :, columns] += np.moveaxis(by_own[:, k], -1, 0)
             by_own[:, k] = 0.0
         return Compact(
-            np.where(usable, found.value, 0.0),
+            np.where(usable, evaluated.value, 0.0),
             usable,
-            found.shared_value,
+            evaluated.shared_value,
             self.prior,
-            Strips(self.structure.strips, self._of_edges(found.edges, found.of_edges)),
+            Strips(self.structure.strips, self._of_edges(evaluated.edges, evaluated.of_edges)),
             rest,
             by_own,
         )
@@ -416,8 +417,8 @@ class Problem:
             parts = (self.among(cut).unweighted(self.state_among(state, cut)) for cut in cuts)
             return Kinds(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
-        crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
-        plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
+        n_effective = np.where(self.blocks.n_effective > 0, self.blocks.n_effective, 1.0)
+        plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(n_effective)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
         rows = edges.value(state.optics, state.shading, state.breathing)
         rows = rows_at_blocks(self.blocks, rows)
@@ -484,7 +485,7 @@ class Problem:
         parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)
 
-    def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
+    def retract(self, state: BatchState, shared: Array, own: Array) -> BatchState:
         """The state after a step (B, na) and (B, K, d), taken along what bends.
 
         The part of the step that only turns or shifts the frames is made as an exact frame
@@ -590,9 +591,9 @@ class Problem:
             return np.ones(after.shape[:2], dtype=bool)
         change = (after - before)[..., :3, :]
         turned = np.linalg.norm(change[..., :3], axis=(-2, -1)) / np.sqrt(2)
-        way = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
+        direction = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
         length = rod_lengths(layout, self.drawing, self.data.joints)
-        bent = way**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
+        bent = direction**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
         if bent.any():
             bent &= singularity_of(layout, scaled_rows(self.closure(state))) > NEAR_SINGULAR
         return bent

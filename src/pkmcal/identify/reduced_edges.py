@@ -38,7 +38,7 @@ class ReducedEdges:
     own: Array
     numbers: Array
     by_linked: Array
-    found: Eliminated
+    eliminated: Eliminated
 
     @property
     def at(self) -> tuple[Integers, Integers]:
@@ -59,7 +59,7 @@ class ReducedEdges:
         N', na, r); half : (B, na, na) F.
         """
         at = self.layout.configuration
-        of_own = (self.found.along @ half[:, None]).mT
+        of_own = (self.eliminated.along @ half[:, None]).mT
         by_shared = np.pad(half, ((0, 0), (0, 1), (0, 0)))  # nothing for columns that are none
         linked = self.layout.linked
         for cut, columns in zip(self.layout.groups, self.layout.columns, strict=True):
@@ -75,20 +75,27 @@ def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
     for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         rows = part.compact(state)
-        found, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
+        eliminated_part, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
         v = part.data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
         numbers = _turned(rows.strips.numbers, unit[:, *_edges_at(layout)])
         d = layout.n_own
         by_own = numbers[:, :d].swapaxes(1, 2)
-        own = found.inverse.mT[:, layout.configuration] @ by_own
+        own = eliminated_part.inverse.mT[:, layout.configuration] @ by_own
         by_linked = by_own[:, :, :0]
         if layout.linked is not None:
             shares = (layout.linked[:, 0] >= 0)[layout.configuration, None, None]
             own, by_linked = np.where(shares, 0.0, own), np.where(shares, by_own, 0.0)
         yield ReducedEdges(
-            part, cut.start, layout, numbers[:, -1], own, numbers[:, d:-1], by_linked, found
+            part,
+            cut.start,
+            layout,
+            numbers[:, -1],
+            own,
+            numbers[:, d:-1],
+            by_linked,
+            eliminated_part,
         )
 
 

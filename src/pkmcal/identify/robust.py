@@ -113,8 +113,8 @@ def robust_scale(d: Array, usual: Array) -> Array:
 def noise_scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
     """Each kind's factor, (B,), not below the least."""
     parts = zip(problem.kinds, d, strict=True)
-    found = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
-    return Kinds(*(np.maximum(scale, least) for scale in found))
+    values = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
+    return Kinds(*(np.maximum(scale, least) for scale in values))
 
 
 def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]:
@@ -171,9 +171,9 @@ def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple
     for number in range(len(SCALES_TRIED) + SCALE_STEPS if scaled else 1):
         step = number >= len(SCALES_TRIED)
         scale = next_scale if step else np.full(len(d), LEAST_SCALE * SCALES_TRIED[number])
-        found, expected = cost_at(scale)
-        better = found < best
-        best, at = np.where(better, found, best), np.where(better, scale, at)
+        value, expected = cost_at(scale)
+        better = value < best
+        best, at = np.where(better, value, best), np.where(better, scale, at)
         next_scale = expected if step else np.where(better, expected, next_scale)
     return best, at
 
@@ -204,9 +204,9 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
         parts = zip(other.weight, other.scale, strict=True)
         weight = Kinds(*(own / each[:, None, None] ** 2 for own, each in parts))
         searched = part.weighted(weight).as_noisy_as_at(other.state)
-        found = minimise(searched, other.state, tolerance=ROUGHLY_SOLVED_DISTANCE)
-        cost, weight, scale = robust_cost(part, found.state, scaled=scaled)
-        other = RobustStart(found.state, weight, scale, other.steps + int(found.steps.max()))
+        solution = minimise(searched, other.state, tolerance=ROUGHLY_SOLVED_DISTANCE)
+        cost, weight, scale = robust_cost(part, solution.state, scaled=scaled)
+        other = RobustStart(solution.state, weight, scale, other.steps + int(solution.steps.max()))
         # a few wrong ones among thousands of edges always draw least squares aside: where these do
         # not cost less at once, they are not followed
         if np.all(cost > before - LOSS_CHANGE) or not (poses or np.any(cost < usual)):
@@ -235,8 +235,8 @@ def anneal(problem: Problem, start: BatchState) -> RobustStart:
         cut = new
         weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
         searched = problem.weighted(weight).as_noisy_as_at(state)
-        found = minimise(searched, state, max_steps=most)
-        state, steps = found.state, steps + int(found.steps.max())
+        solution = minimise(searched, state, max_steps=most)
+        state, steps = solution.state, steps + int(solution.steps.max())
         d = norms(problem, problem.unweighted(state))
         if settled:
             break

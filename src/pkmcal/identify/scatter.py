@@ -25,14 +25,14 @@ class EdgeScatter:
     """The noise of the edges of a leg's T tubes (first, second, ... of all legs) in B runs.
 
     scale : (B, T) factor on the stated standard deviations. shading : (B, T) px, of each edge
-    beside its line's; it counts where something is shaded. tails : (B, T) degrees of freedom of
+    beside its line's; it counts where something is shaded. dof : (B, T) degrees of freedom of
     their distribution. The standard deviations are such that normal errors with them would be worth
     as much as these are. An estimate holds those of its one run, (T,) each (:meth:`of_run`).
     """
 
     scale: Array
     shading: Array
-    tails: Array
+    dof: Array
 
     __repr__ = short_repr
 
@@ -44,21 +44,21 @@ class EdgeScatter:
 
     def of_run(self, run: int) -> EdgeScatter:
         """One run's alone."""
-        return EdgeScatter(self.scale[run], self.shading[run], self.tails[run])
+        return EdgeScatter(self.scale[run], self.shading[run], self.dof[run])
 
-    def trust(self, blocks: EdgeBlocks, square: Array) -> Array:
+    def irls_weight(self, blocks: EdgeBlocks, square: Array) -> Array:
         """By how much more or less each edge counts than on average, (B, K, G), where the squares
         of its whitened residuals are (B, K, G).
         """
-        tails = self.tails[:, blocks.tube]  # infinite of normal ones
-        return (1 + NUMBERS_AN_EDGE / tails) / (1 + square * worth(tails) / tails)
+        tails = self.dof[:, blocks.tube]  # infinite of normal ones
+        return (1 + NUMBERS_AN_EDGE / tails) / (1 + square * t_variance(tails) / tails)
 
     def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
         """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
         of normal errors.
         """
         pairs = rows.reshape(*rows.shape[:2], -1, NUMBERS_AN_EDGE)
-        return np.sum(pairs**2, axis=-1) * worth(self.tails)[:, blocks.tube]
+        return np.sum(pairs**2, axis=-1) * t_variance(self.dof)[:, blocks.tube]
 
     def factor(self, blocks: EdgeBlocks, data: EdgeData, weight: Array) -> Array:
         """What edges with weights (B, K, G) scatter by on average, in times of what they are stated
@@ -78,7 +78,7 @@ class EdgeScatter:
         scale = np.abs(self.scale / other.scale - 1).max(initial=0.0)
         usual = np.maximum(other.shading, OWN_SHADING)
         shading = (np.abs(self.shading - other.shading) / usual).max(initial=0.0)
-        return max(scale, shading) < share and bool(np.all(self.tails == other.tails))
+        return max(scale, shading) < share and bool(np.all(self.dof == other.dof))
 
     def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
         """Deviations as many times as far from another's, with these tails."""
@@ -89,7 +89,7 @@ class EdgeScatter:
     def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
         """The edges with this noise."""
         alone = np.where(blocks.line < 0, SHADING_SIGMA, 0.0) if blocks.line.size else 0.0
-        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.crowd), alone)
+        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.n_effective), alone)
         return replace(data, scale=self.scale[:, blocks.tube], own=own)
 
 
@@ -97,10 +97,10 @@ def shift_squares(blocks: EdgeBlocks, data: EdgeData) -> Array:
     """Squares of what a pixel outward does to the edges, in the noise as it was stated, (B or 1,
     K, G); none where nothing is shaded.
     """
-    return np.where(blocks.crowd > 0, np.sum(data.by_shift**2, axis=-1), 0.0)
+    return np.where(blocks.n_effective > 0, np.sum(data.by_shift**2, axis=-1), 0.0)
 
 
-def worth(tails: Array) -> Array:
+def t_variance(tails: Array) -> Array:
     """The variance of normal errors that tell as much as those of Student's distribution of pairs,
     over the square of its scale.
     """

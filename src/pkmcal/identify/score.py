@@ -24,8 +24,8 @@ named, and not of single readings, which are one configuration's.
 The rows are gone through twice, some configurations at a time: for an orthonormal basis of what the
 shared unknowns can do, then for the products of all columns with each other, with the basis and
 with r. These few numbers are all that is kept, however many configurations there are, and
-``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which SEEN_SQUARE_SHARE asks for
-ten.
+``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which OBSERVABLE_SQUARE_SHARE
+asks for ten.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pkmcal.measurements.readings import by_noise
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 
-SEEN_SQUARE_SHARE = 1e-10
+OBSERVABLE_SQUARE_SHARE = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
 it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
 a ten-thousandth is left."""
@@ -54,7 +54,7 @@ ROUNDING_LENGTH_SHARE = 1e-9
 tracker that feels heights is shifted by along the bed, say."""
 UNTOLD_HIDDEN_SHARE = 0.01
 """Part of a number that lies in directions which the data do not see, from which it is not told."""
-MOST_DEPARTURES_SOUGHT = 4
+MOST_VIOLATIONS_SOUGHT = 4
 """Departures that are looked for one after the other; more are a session with other troubles."""
 
 
@@ -72,14 +72,14 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Freed:
+class OneStepUpdate:
     """A departure as the data tell it: value, sigma (k,), and moved (P,), what taking it up does to
     the machine's parameters, m and rad. What the data do not see is NaN, its sigma infinite.
     """
 
     value: Array
     sigma: Array
-    moved: Array
+    by_data: Array
 
 
 class RandomEffects(NamedTuple):
@@ -92,7 +92,7 @@ class RandomEffects(NamedTuple):
 NO_RANDOM_EFFECTS = RandomEffects((), np.zeros((0, 0)))
 
 
-class Departures:
+class ScoreTests:
     """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run), of
     which ``info`` tells.
 
@@ -134,16 +134,16 @@ class Departures:
         from scipy.special import chdtrc
 
         made, chi2, dof = self._made, np.zeros(len(self._family)), np.zeros(len(self._family))
-        free = _Left.of(made, freed)
+        free = _ProjectedColumns.of(made, freed)
         for k in range(len(made.listed)):
-            alone = _Left.of(made, [k])
-            across = made.left(k, freed)
-            found = _Left(
+            alone = _ProjectedColumns.of(made, [k])
+            across = made.across(k, freed)
+            value = _ProjectedColumns(
                 alone.scale,
                 alone.squared - across @ free.inverse @ across.T,
                 alone.value - across @ free.inverse @ free.value,
             )
-            chi2[k], dof[k] = found.gain
+            chi2[k], dof[k] = value.gain
         chi2[len(made.listed) :], dof[len(made.listed) :] = made.gains_of_singles(freed, free)
         chi2 /= self._variance
         for k, factor in self._scatter.items():
@@ -156,13 +156,13 @@ class Departures:
         every = zip(*(x.tolist() for x in (chi2, dof.astype(int), chance, adjusted)), strict=True)
         return [Score(*one) for one in every]
 
-    def found(self, alpha: float, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
+    def tests_beyond(self, alpha: float, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
         """Those that the data show at a level ``alpha`` of all tests together (Bonferroni), one
         after the other, the least by chance first, by their numbers; each beside those before it,
         and beside those that are free already.
         """
         out: list[tuple[int, Score]] = []
-        while len(out) < min(MOST_DEPARTURES_SOUGHT, len(self._family)):
+        while len(out) < min(MOST_VIOLATIONS_SOUGHT, len(self._family)):
             scores = self.scores([*freed, *(k for k, _ in out)])
             # chances below the smallest number are all zero
             best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
@@ -174,16 +174,18 @@ class Departures:
             out.append((best, scores[best]))
         return out
 
-    def fitted(self, freed: Sequence[int]) -> list[Freed]:
+    def fitted(self, freed: Sequence[int]) -> list[OneStepUpdate]:
         """What some departures come to, all free together."""
-        made, free = self._made, _Left.of(self._made, freed)
+        made, free = self._made, _ProjectedColumns.of(self._made, freed)
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
         factors = [self._variance * self._scatter.get(k, 1.0) for k in freed]
         sigma = sigma * np.sqrt(np.repeat(factors, [made.count(k) for k in freed]))
         sigma[free.hidden > UNTOLD_HIDDEN_SHARE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
-            Freed(np.where(np.isfinite(s), v, np.nan), s, self._moves @ (made.with_basis(k).T @ v))
+            OneStepUpdate(
+                np.where(np.isfinite(s), v, np.nan), s, self._moves @ (made.with_basis(k).T @ v)
+            )
             for k, v, s in zip(freed, np.split(value, cuts), np.split(sigma, cuts), strict=True)
         ]
 
@@ -194,7 +196,7 @@ class Departures:
         beside = [f for f in freed if f < len(made.listed)]  # single readings stay as they are
         every = [*beside, k]
         of_basis = np.concatenate([made.with_basis(f) for f in every]).T
-        free = _Left.of(made, every)
+        free = _ProjectedColumns.of(made, every)
         value, n = -free.inverse @ free.value, made.count(k)
         # what is left of the departure's columns beside those of the others
         rest, own = slice(0, len(value) - n), slice(len(value) - n, None)
@@ -207,7 +209,7 @@ class Departures:
         for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
             linear = piece.linear
             further = [random(cut, linear) @ effects.root, columns(cut, linear)]
-            rows, left = eliminated_beside(linear, np.concatenate(further, axis=-1))
+            rows, remainder = eliminated_beside(linear, np.concatenate(further, axis=-1))
             count = taken = problem.unknowns.count + effects.root.shape[1]
             wide: list[Array] = []
             for f in every:
@@ -222,19 +224,19 @@ class Departures:
                 wide.append(np.where(later[:, None, None], by, 0.0))
             by_basis = rows[..., :count] @ basis
             h = np.concatenate(wide, axis=-1) - by_basis @ of_basis
-            left = left - by_basis @ made.known + h @ value
-            products = ((h @ part).mT @ left[..., None])[..., 0]
+            remainder = remainder - by_basis @ made.by_basis + h @ value
+            products = ((h @ part).mT @ remainder[..., None])[..., 0]
             scatter += products.T @ products
             clusters += int(np.count_nonzero(products.any(axis=-1)))
         if clusters < 2:
             return 1.0
         scale = free.scale[own]
         size, ways = np.linalg.eigh(part.T @ free.squared @ part / scale / scale[:, None])
-        shown = size > SEEN_SQUARE_SHARE
-        if not shown.any():
+        display = size > OBSERVABLE_SQUARE_SHARE
+        if not display.any():
             return 1.0
-        ways = ways[:, shown] / scale[:, None]
-        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[shown])
+        ways = ways[:, display] / scale[:, None]
+        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[display])
         return max(1.0, float(usual) / self._variance * clusters / (clusters - 1))
 
 
@@ -252,7 +254,7 @@ class _Products:
     n : columns of the stations and of the listed departures, which come first; then the basis, then
     the residuals, w in all. after : by first configuration, products (n, w) of these columns with
     all from it on. single : (K', m, w) of the single readings' columns with all, among : (K', m, m)
-    with each other. known : (nb,) of the basis with the residuals, rows of the prior included.
+    with each other. by_basis : (nb,) of the basis with the residuals, rows of the prior included.
     """
 
     listed: tuple[_Listed, ...]
@@ -260,7 +262,7 @@ class _Products:
     after: dict[int, Array]
     single: Array
     among: Array
-    known: Array
+    by_basis: Array
 
     def count(self, k: int) -> int:
         """Numbers of a departure."""
@@ -281,7 +283,7 @@ class _Products:
     def with_residuals(self, freed: Sequence[int]) -> Array:
         """Of the columns of some, as the basis leaves them, with the residuals."""
         parts = [np.zeros(0)]
-        parts += [self.with_all(k)[:, -1] - self.with_basis(k) @ self.known for k in freed]
+        parts += [self.with_all(k)[:, -1] - self.with_basis(k) @ self.by_basis for k in freed]
         return np.concatenate(parts)
 
     def between(self, k: int, other: int) -> Array:
@@ -294,7 +296,7 @@ class _Products:
         one, two = self.listed[k], self.listed[other]
         return self.after[max(one.since, two.since)][np.ix_(one.columns, two.columns)]
 
-    def left(self, k: int, freed: Sequence[int]) -> Array:
+    def across(self, k: int, freed: Sequence[int]) -> Array:
         """The same with all of some, of what the basis leaves of both."""
         parts = [np.zeros((self.count(k), 0))]
         parts += [self.between(k, f) - self.with_basis(k) @ self.with_basis(f).T for f in freed]
@@ -312,24 +314,28 @@ class _Products:
         out[row, :, 0] = self.among[row, :, motor]
         return out
 
-    def gains_of_singles(self, freed: Sequence[int], free: _Left) -> tuple[Array, Array]:
+    def gains_of_singles(
+        self, freed: Sequence[int], free: _ProjectedColumns
+    ) -> tuple[Array, Array]:
         """What each single reading gains beside those that are free, and whether it is seen,
         (K' m,) each.
         """
         basis, squared = self.single[..., self.n : -1], np.einsum("kmm->km", self.among)
-        left = squared - np.sum(basis**2, axis=-1)
-        value = self.single[..., -1] - basis @ self.known
+        residual = squared - np.sum(basis**2, axis=-1)
+        value = self.single[..., -1] - basis @ self.by_basis
         parts = [np.zeros((*squared.shape, 0))]
         parts += [self.singles_with(f) - basis @ self.with_basis(f).T for f in freed]
         across = np.concatenate(parts, axis=-1)
-        left = left - np.einsum("kmf,fg,kmg->km", across, free.inverse, across)
+        residual = residual - np.einsum("kmf,fg,kmg->km", across, free.inverse, across)
         value = value - across @ (free.inverse @ free.value)
-        seen = left > SEEN_SQUARE_SHARE * squared
-        return np.where(seen, value**2 / np.where(seen, left, 1.0), 0.0).ravel(), seen.ravel()
+        observable = residual > OBSERVABLE_SQUARE_SHARE * squared
+        return np.where(
+            observable, value**2 / np.where(observable, residual, 1.0), 0.0
+        ).ravel(), observable.ravel()
 
 
 @dataclass(frozen=True)
-class _Left:
+class _ProjectedColumns:
     """What all else leaves of some columns: scale (c,) their lengths before, infinite where they
     are rounding, squared (c, c) products with each other, value (c,) with the residuals.
     """
@@ -339,14 +345,14 @@ class _Left:
     value: Array
 
     @classmethod
-    def of(cls, made: _Products, freed: Sequence[int]) -> _Left:
+    def of(cls, made: _Products, freed: Sequence[int]) -> _ProjectedColumns:
         """What the basis leaves of some departures."""
         lengths = [np.zeros(0)]
         for k in freed:
             length = np.sqrt(np.maximum(np.diag(made.between(k, k)), 0.0))
             least = ROUNDING_LENGTH_SHARE * length.max(initial=0.0)
             lengths.append(np.where(length > least, length, np.inf))
-        squared = [np.zeros((0, 0)), *(made.left(k, freed) for k in freed)][len(freed) > 0 :]
+        squared = [np.zeros((0, 0)), *(made.across(k, freed) for k in freed)][len(freed) > 0 :]
         return cls(np.concatenate(lengths), np.concatenate(squared), made.with_residuals(freed))
 
     def _directions(self) -> tuple[Array, Array]:
@@ -357,21 +363,21 @@ class _Left:
     def inverse(self) -> Array:
         """Of the products (c, c), in the directions that are seen."""
         part, ways = self._directions()
-        seen = part > SEEN_SQUARE_SHARE
-        back = ways[:, seen] / np.sqrt(part[seen]) / self.scale[:, None]
+        observable = part > OBSERVABLE_SQUARE_SHARE
+        back = ways[:, observable] / np.sqrt(part[observable]) / self.scale[:, None]
         return back @ back.T
 
     @property
     def gain(self) -> tuple[float, int]:
         """chi2 that they gain together, and by how many numbers."""
-        seen = self._directions()[0] > SEEN_SQUARE_SHARE
-        return float(self.value @ self.inverse @ self.value), int(seen.sum())
+        observable = self._directions()[0] > OBSERVABLE_SQUARE_SHARE
+        return float(self.value @ self.inverse @ self.value), int(observable.sum())
 
     @property
     def hidden(self) -> Array:
         """(c,) part of each that lies in directions which are not seen."""
         part, ways = self._directions()
-        return np.sum(ways[:, part <= SEEN_SQUARE_SHARE] ** 2, axis=1)
+        return np.sum(ways[:, part <= OBSERVABLE_SQUARE_SHARE] ** 2, axis=1)
 
 
 def shared_basis(info: Information) -> Array:
@@ -413,7 +419,7 @@ def _products(
     beside: RandomEffects,
 ) -> _Products:
     """Of the departures' columns; basis : of the unknowns and the random effects beside them."""
-    problem, seen = assembled.problem, assembled.seen
+    problem, observed = assembled.problem, assembled.observed
     stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
     parts: list[_Listed] = []
     n = 6 * problem.unknowns.n_stations
@@ -422,12 +428,16 @@ def _products(
             parts.append(_Listed(n + np.arange(effect.count), 0))
             n += effect.count
         else:
-            since = int(np.count_nonzero(seen[: effect.since]))
+            since = int(np.count_nonzero(observed[: effect.since]))
             parts.append(_Listed(6 * effect.station + np.arange(6), since))
     begins = sorted({0, *(part.since for part in parts)})
     width = n + basis.shape[1] + 1
     sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
-    single, among, known = [np.zeros((0, motors, width))], [np.zeros((0, motors, motors))], 0.0
+    single, among, reference_values = (
+        [np.zeros((0, motors, width))],
+        [np.zeros((0, motors, motors))],
+        0.0,
+    )
     throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, info.state, throughout, singles=singles)
     random, n_random = columns_of(assembled, info.state, beside.effects), beside.root.shape[1]
@@ -437,20 +447,25 @@ def _products(
         rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
-            known = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
+            reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
         first, split = count + n_random, rows.shape[-1] - motors
         own = [rows[..., stations], rows[..., first:split], rows[..., :first] @ basis]
         wide = np.concatenate([*own, value[..., None]], axis=-1)
         for begin in begins:
             flat = wide[max(begin - cut.start, 0) :].reshape(-1, width)
             sums[begin] += flat[:, :n].T @ flat
-        known = known + np.einsum("kri,kr->i", own[-1], value)
+        reference_values = reference_values + np.einsum("kri,kr->i", own[-1], value)
         if singles:
             by_single = rows[..., split:]
             single.append(by_single.mT @ wide)
             among.append(by_single.mT @ by_single)
     return _Products(
-        tuple(parts), n, sums, np.concatenate(single), np.concatenate(among), np.asarray(known)
+        tuple(parts),
+        n,
+        sums,
+        np.concatenate(single),
+        np.concatenate(among),
+        np.asarray(reference_values),
     )
 
 
@@ -484,12 +499,12 @@ def columns_of(
     for effect, end in zip(listed, np.cumsum(counts).tolist(), strict=True):
         where = slice(end - effect.count, end)
         if effect.readings is not None:
-            readings[..., where] = effect.readings[assembled.seen]
+            readings[..., where] = effect.readings[assembled.observed]
         edges = None if effect.edges is None else places.edges.filled(effect.edges)
         poses = None if effect.poses is None else places.poses.filled(effect.poses)
         placed.append((where, edges, poses))
         if effect.motion is not None:
-            moving.append((where, effect.motion[:, assembled.seen]))
+            moving.append((where, effect.motion[:, assembled.observed]))
 
     def columns(cut: slice, linear: Linear) -> Array:
         part = problem.among(cut)

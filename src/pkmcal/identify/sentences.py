@@ -81,61 +81,64 @@ class OpenMotion:
 
 
 def sentence(
-    around: Situation, found: OpenMotion, unit: Array, moved: float, weak: bool
+    around: Situation, open_motion: OpenMotion, unit: Array, shifted: float, weak: bool
 ) -> Sentence:
     """The sentence of a motion; unit (P,) of the drawing's deviations, moved (m) the platform's
     joints, weak : whether the data know it, yet less than the drawing does.
     """
     table = around.machine.parameters
-    matters = moved > LEAST_PLATFORM_MOVE * float(table.tolerance[table.of_kind("center")].mean())
-    size = np.linalg.norm(found.own, axis=0)
+    matters = shifted > LEAST_PLATFORM_MOVE * float(table.tolerance[table.of_kind("center")].mean())
+    size = np.linalg.norm(open_motion.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")
     rows = order[: int(np.sum(size > NAMED_CHANGE_SHARE * size.max()))]
     names = tuple(table.names[k] for k in rows)
-    several = len(found.legs) > 1
-    known, n = "known from the drawing only" if weak else "free", len(found.numbers)
-    open_ = f"{'is' if n == 1 else 'are'} {known}"
+    several = len(open_motion.legs) > 1
+    reference_values, n = (
+        "known from the drawing only" if weak else "free",
+        len(open_motion.numbers),
+    )
+    open_ = f"{'is' if n == 1 else 'are'} {reference_values}"
     places = {
-        "legs": named(found.legs),
+        "legs": named(open_motion.legs),
         "each": "each of " if several else "",
-        "is": f"is {known}",
-        "are": f"are {known}",
+        "is": f"is {reference_values}",
+        "are": f"are {reference_values}",
         "open": "to the drawing" if weak else "free",
         "better": " better than the drawing does" if weak else "",
         "limited": ", which only the drawing limits" if weak else "",
         "n": in_full(n),
         "combinations": f"{in_full(n)} combination{'' if n == 1 else 's'}"
-        f"{' each' if several and len(found.motion.legs) == 1 else ''} {open_}",
-        "ways": ways(len(found.space)),
-        "mostly": _mostly(around, found, rows, unit),
-        "how": found.how(around),
+        f"{' each' if several and len(open_motion.motion.legs) == 1 else ''} {open_}",
+        "ways": ways(len(open_motion.space)),
+        "mostly": _mostly(around, open_motion, rows, unit),
+        "how": open_motion.how(around),
     }
-    text = found.motion.words(len(found.legs)).format_map(places)
+    text = open_motion.motion.words(len(open_motion.legs)).format_map(places)
     how_far = "This does not move the platform."
     if matters:
         how_far = (
-            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm"
+            f"Within the drawing's tolerances this moves the platform by {shifted * 1e3:.2g} mm"
             " (rms of its joints over these and nearby poses; what moves all poses alike, as other"
             " frames do, is not counted)."
         )
     return Sentence(
         f"{capital(text)}. {how_far}",
-        advice_on(around, found, names, matters, weak),
+        advice_on(around, open_motion, names, matters, weak),
         names,
-        found.new,
-        moved,
+        open_motion.new,
+        shifted,
         matters,
         weak,
     )
 
 
-def _mostly(around: Situation, found: OpenMotion, rows: Integers, unit: Array) -> str:
+def _mostly(around: Situation, open_motion: OpenMotion, rows: Integers, unit: Array) -> str:
     """``: +1 mm of a goes with −0.7 mm of b`` of a single change; else what changes most."""
-    table, single = around.machine.parameters, len(found.space) == 1
-    if found.motion.labels:
+    table, single = around.machine.parameters, len(open_motion.space) == 1
+    if open_motion.motion.labels:
         if not single:
-            return f" {ways(len(found.numbers))}" if len(found.numbers) > 1 else ""
-        said, _ = changes(found.numbers[0], found.motion.labels)
+            return f" {ways(len(open_motion.numbers))}" if len(open_motion.numbers) > 1 else ""
+        text, _ = changes(open_motion.numbers[0], open_motion.motion.labels)
     else:
         if len({table.labels[k] for k in rows}) == 1 and len(rows) > 1:
             what = [f"leg {split_name(table.names[k])[0]}" for k in rows]
@@ -144,8 +147,8 @@ def _mostly(around: Situation, found: OpenMotion, rows: Integers, unit: Array) -
         if not single:
             return f", mostly of {listed(what, MOST_NAMES_IN_SENTENCE)}"
         labels = tuple((w, table.units[k]) for w, k in zip(what, rows, strict=True))
-        said, _ = changes((found.own[0] * unit)[rows], labels)
-    return f": {said[0]} goes with {joined(said[1:])}" if len(said) > 1 else ""
+        text, _ = changes((open_motion.own[0] * unit)[rows], labels)
+    return f": {text[0]} goes with {joined(text[1:])}" if len(text) > 1 else ""
 
 
 def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
@@ -153,7 +156,7 @@ def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
     if len(sentences) <= MOST_SENTENCES:
         return tuple(sentences)
     ranked = sorted(sentences, key=lambda s: -s.moves_platform)
-    kept = [s for s in sentences if s in ranked[: MOST_SENTENCES - 1]]
+    retained = [s for s in sentences if s in ranked[: MOST_SENTENCES - 1]]
     rest = ranked[MOST_SENTENCES - 1 :]
     last = replace(
         rest[0],
@@ -162,20 +165,20 @@ def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
         dimensions=sum(s.dimensions for s in rest),
         moves_platform=float(np.sqrt(sum(s.moves_platform**2 for s in rest))),
     )
-    return (*kept, last)
+    return (*retained, last)
 
 
 # ------------------------------------------------------------------ what to do
 
 
 def advice_on(
-    around: Situation, found: OpenMotion, names: tuple[str, ...], matters: bool, weak: bool
+    around: Situation, open_motion: OpenMotion, names: tuple[str, ...], matters: bool, weak: bool
 ) -> str:
     """What to do about a motion that changes these parameters."""
-    held = _fixing(around, _enough(around, found.motion, names))
+    held = _fixing(around, _enough(around, open_motion.motion, names))
     if not matters:
         return f"Nothing needs to be done; {held} silences this."
-    legs = found.legs
+    legs = open_motion.legs
     more, take = _more(around, legs), "Photograph" if around.photographed else "Measure"
     caliper = f"Measure the tubes of {named(legs)} with a caliper"
     do = {
@@ -188,7 +191,7 @@ def advice_on(
         "size": "Let a board be seen with the legs (observe: [legs, board]), whose squares tell the"
         " size, or check the readings over a long way against a measure",
         "drawing": "Legs look the same however these axes lie: leave them to the drawing",
-    }[found.motion.advice]
+    }[open_motion.motion.advice]
     decide = f"{held} if the drawing is sure of that"
     if weak:
         decide = "state smaller tolerances in the mechanism file if the drawing warrants them"
@@ -198,7 +201,7 @@ def advice_on(
 def _tying(around: Situation, legs: tuple[int, ...]) -> str:
     """How to tie a group of legs to the others."""
     others = [j for j in around.legs if j not in legs]
-    with_group = np.any(around.seen[around.seen[:, list(legs)].any(axis=1)], axis=0)
+    with_group = np.any(around.observed[around.observed[:, list(legs)].any(axis=1)], axis=0)
     apart = [j for j in others if not with_group[j]]
     return (
         f"Add a station that sees {named(legs)} together with {named(apart or others)}; or let a"
@@ -248,7 +251,7 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
         every = component in AXIS_LETTERS and all(f"{whole}.{c}" in names for c in AXIS_LETTERS)
         axis = ".axis." in name and len(names) > 1
         entries[whole if every or axis else name] = None
-    said: dict[str, None] = {}
+    texts: dict[str, None] = {}
     for entry in entries:
         rest = entry.partition("]")[2]
         legs = dict.fromkeys(n.partition("]")[0] for n in table.names)
@@ -257,9 +260,9 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
             for leg in legs
             if any(n == f"{leg}]{rest}" or n.startswith(f"{leg}]{rest}.") for n in table.names)
         ]
-        alike = len(having) > 1 and all(other in entries for other in having)
-        said[f"{EVERY_LEG}{rest}" if alike else entry] = None
-    line = ", ".join(json.dumps(entry) for entry in said)
+        same = len(having) > 1 and all(other in entries for other in having)
+        texts[f"{EVERY_LEG}{rest}" if same else entry] = None
+    line = ", ".join(json.dumps(entry) for entry in texts)
     where = "in the mechanism file"
     if around.machine.model is not None:  # the file's own entries do not hold then
         where += f"'s model {around.machine.model}"

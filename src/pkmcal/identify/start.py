@@ -24,8 +24,8 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
     Readings, not seen directions: the latter lead into local minima (errata, B).
     T_camera_base_guess : (S, 4, 4).
     """
-    found = machine.forward_result(measurements.joints)
-    poses = found.T_base_platform
+    fk = machine.forward_result(measurements.joints)
+    poses = fk.T_base_platform
     stations = np.asarray(T_camera_base_guess)
     return State(
         machine.values,
@@ -34,7 +34,7 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
         np.zeros(measurements.n_cameras),
         T_mount=start_mounts(measurements, stations, poses),
         on_platform=measurements.on_platform,
-        internal=found.internal,
+        internal=fk.internal,
     )
 
 
@@ -43,11 +43,13 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
 
     T_camera_base : (S, 4, 4). poses : T_base_platform (K, 4, 4).
     """
-    seen, on_platform = measurements.poses, measurements.on_platform
-    body = T_camera_base[seen.station]
-    body = np.where(on_platform[seen.mount][:, None, None], body @ poses[seen.configuration], body)
-    each = inverse(body) @ seen.T_station_target
-    mounts = [middle_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
+    in_view, on_platform = measurements.poses, measurements.on_platform
+    body = T_camera_base[in_view.station]
+    body = np.where(
+        on_platform[in_view.mount][:, None, None], body @ poses[in_view.configuration], body
+    )
+    each = inverse(body) @ in_view.T_station_target
+    mounts = [middle_pose(each[in_view.mount == m]) for m in range(len(measurements.mounts))]
     return np.array(mounts).reshape(-1, 4, 4)
 
 
@@ -72,5 +74,5 @@ def edge_misfit(machine: Machine, measurements: Measurements, state: State) -> f
     assembled = assemble(machine, measurements, default_gauge(machine))
     rows = assembled.problem.unweighted(batch_of(machine, assembled, state))
     distance = norms(assembled.problem, rows).edges
-    found = distance[np.isfinite(distance)]
-    return float(np.median(found)) if found.size else np.inf
+    values = distance[np.isfinite(distance)]
+    return float(np.median(values)) if values.size else np.inf

@@ -160,8 +160,8 @@ class Structure:
         for k, one in enumerate(leg):
             radii[k, : len(layout.radius[one])] = self.column[layout.radius[one]]
         lines = np.full((len(first), len(self.own_columns[1])), none)
-        for own, found in zip(lines, self._lines, strict=True):
-            own[: len(found)] = u.shading.start + found
+        for own, item in zip(lines, self._lines, strict=True):
+            own[: len(item)] = u.shading.start + item
         parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
         parts += [numbered_columns(u.stations, station, 6), radii]
         parts += [numbered_columns(u.optics, camera, u.n_optics), lines]

@@ -56,15 +56,15 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     """
     joints, poses = _around(machine, T_base_platform)
     points = limb_ends(machine.layout, machine.values, joints, poses).b_by_pose
-    moved = points @ pose_by_parameters(machine, joints, poses)[:, None]
+    shifted = points @ pose_by_parameters(machine, joints, poses)[:, None]
     # whether its parameters can follow or not: frames are conventions
     frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]
-    moved = moved.reshape(-1, moved.shape[-1])
-    frames = frames.reshape(len(moved), -1)
+    shifted = shifted.reshape(-1, shifted.shape[-1])
+    frames = frames.reshape(len(shifted), -1)
     u, s, _ = np.linalg.svd(frames, full_matrices=False)
     u = u[:, s > 1e-9 * max(float(s.max(initial=0.0)), 1e-12)]
-    moved = moved - u @ (u.T @ moved)
-    return moved / np.sqrt(len(poses) * machine.n_legs)
+    shifted = shifted - u @ (u.T @ shifted)
+    return shifted / np.sqrt(len(poses) * machine.n_legs)
 
 
 def platform_sigma(estimate: Estimate) -> float:
@@ -86,10 +86,10 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     step = rng.uniform(-1, 1, (POSES_AROUND_SESSION, 6)) * reach
     start = perturb(start, step @ layout.motion @ layout.motion.T)
     # constant legs and joints with axes leave the samples fewer ways: brought back onto them
-    found = on_manifold(layout, machine.values, start)
+    value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
-    kept = found.converged & (found.singularity >= AS_REGULAR * float(np.median(own)))
-    poses = np.concatenate([T_base_platform, found.T_base_platform[kept]])
+    retained_rows = value.converged & (value.singularity >= AS_REGULAR * float(np.median(own)))
+    poses = np.concatenate([T_base_platform, value.T_base_platform[retained_rows]])
     return machine.inverse(poses), poses
 
 
@@ -167,9 +167,9 @@ def centres_and_tool(
     """
     machine, used = estimate.machine, estimate.configurations
     covariance = free_of_gauge(machine, estimate.covariance)
-    seen = estimate.edge_weights.size > 0
+    in_view = estimate.edge_weights.size > 0
     poses = estimate.state.T_base_platform[used]
-    tool = tool_error(drawing, machine, covariance, poses, joints[used], legs_seen=seen)
+    tool = tool_error(drawing, machine, covariance, poses, joints[used], legs_observed=in_view)
     return joint_centres(drawing, machine, covariance), tool
 
 
@@ -180,7 +180,7 @@ def tool_error(
     poses: Array,
     joints: Array | None = None,
     *,
-    legs_seen: bool = True,
+    legs_observed: bool = True,
     fitted: Integers | None = None,
 ) -> ToolError:
     """How well poses T_base_platform (n, 4, 4) of the calibrated machine are known, and how wrong
@@ -190,9 +190,9 @@ def tool_error(
     (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints carry the uncertainty
     of all. joints : (n, m) readings that were taken there; without them the poses are first put
     where rods and axes allow them, and readings are the calibrated machine's.
-    legs_seen : whether legs tell where the joints are, and these the frames. A board leaves open
-    what shifts joints and moves nothing, so without legs frames are by the poses themselves, all or
-    the ``fitted`` (k,) among them.
+    legs_observed : whether legs tell where the joints are, and these the frames. A board leaves
+    open what shifts joints and moves nothing, so without legs frames are by the poses themselves,
+    all or the ``fitted`` (k,) among them.
     """
     layout, n, theta = calibrated.layout, len(poses), calibrated.values
     if joints is None:
@@ -207,7 +207,7 @@ def tool_error(
     off = np.full((n, 6, 1), np.nan)
     off[rows, :, 0] = _off(drawing, calibrated, joints[rows], poses[rows])
     by, off = (
-        without_frames(calibrated, poses, change, every=not legs_seen, fitted=fitted)
+        without_frames(calibrated, poses, change, every=not legs_observed, fitted=fitted)
         for change in (jacobian, off)
     )
     return ToolError(poses, by, covariance, off[..., 0])
@@ -233,15 +233,15 @@ def without_frames(
         followed = np.linalg.qr(freedoms(machine))[0]
         u, s, _ = np.linalg.svd(rest - followed @ (followed.T @ rest), full_matrices=False)
         rest = u[:, s > 1e-9]
-    known = np.asarray(np.isfinite(change).all(axis=(1, 2)))
-    told = np.flatnonzero(known) if fitted is None else fitted[known[fitted]]
-    if not rest.shape[1] or not told.size:
+    finite = np.asarray(np.isfinite(change).all(axis=(1, 2)))
+    values = np.flatnonzero(finite) if fitted is None else fitted[finite[fitted]]
+    if not rest.shape[1] or not values.size:
         return change
     size = float(np.linalg.norm(machine.platform_centers(), axis=-1).max())
     unit = np.array([max(size, 1e-3)] * 3 + [1.0] * 3)[:, None]
     frames = pose_generators(poses) @ rest
-    rows = (unit * frames[told]).reshape(-1, rest.shape[1])
-    flat = (unit * change[told]).reshape(len(rows), -1)
+    rows = (unit * frames[values]).reshape(-1, rest.shape[1])
+    flat = (unit * change[values]).reshape(len(rows), -1)
     return change - frames @ np.linalg.lstsq(rows, flat, rcond=1e-9)[0]
 
 
@@ -259,7 +259,7 @@ def _off(drawing: Machine, calibrated: Machine, joints: Array, poses: Array) -> 
     start = pose_difference(inverse(base) @ poses @ platform, poses) @ along
     before = drawing.forward_result(joints, perturb(poses, start))
     after = calibrated.forward_result(joints, poses)
-    moved = base @ before.T_base_platform @ inverse(platform)
-    difference = pose_difference(moved, after.T_base_platform) @ along
+    shifted = base @ before.T_base_platform @ inverse(platform)
+    difference = pose_difference(shifted, after.T_base_platform) @ along
     good = before.converged & after.converged
     return np.where(good[:, None], difference, np.nan)

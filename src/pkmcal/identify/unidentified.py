@@ -34,7 +34,7 @@ INSIDE_OPEN_SHARES = (0.999, 0.95)
 """Shares of a change (squared) that lie in the open space for it to explain part of that space:
 first what fits exactly, since much looks alike once frames are taken out, then what fits in all
 but name. The space is that of the estimate, whose poses' noise bends what would be exact."""
-HARDLY_TOLD_INFORMATION = 1 / 3
+WEAK_INFORMATION = 1 / 3
 """Information below which a direction counts as not told: the data then decide less than a tenth
 of its variance. Poses that only shift seem to turn by their noise, so directions that nothing fixes
 come out with a trace of information."""
@@ -44,7 +44,7 @@ NEW_CHANGE_SINE = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
 STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
 """Steps to the fewest numbers, and how much less a frame's costs: they are not said."""
-CONVENTION_LEFT_UNDONE = 1e-6
+CONVENTION_NULL_SHARE = 1e-6
 """Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
 a convention: both are derivatives at one machine, alike but for rounding."""
 
@@ -68,15 +68,15 @@ class Condition:
 class Findings:
     """What the data tell and do not tell: the test, its words, and the paper's conditions.
 
-    told : rank and spectrum. unidentified : what such data do not tell, of ``told.unidentified``
-    and of what they know ``HARDLY_TOLD_INFORMATION``. weak : what the drawing knows better.
-    by_drawing : how far (m, as ``Sentence.moves_platform``) the platform moves when all parameters
-    are as wrong as the drawing's tolerances let expect. conventional : held parameters for which
-    any value would do; also_conventional : combinations of the other held ones. bed : how flat it
-    will be, where nothing but heights was measured.
+    identifiability : rank and spectrum. unidentified : what such data do not tell, of
+    ``told.unidentified`` and of what they know ``WEAK_INFORMATION``. weak : what the drawing knows
+    better. by_drawing : how far (m, as ``Sentence.moves_platform``) the platform moves when all
+    parameters are as wrong as the drawing's tolerances let expect. conventional : held parameters
+    for which any value would do; also_conventional : combinations of the other held ones. bed : how
+    flat it will be, where nothing but heights was measured.
     """
 
-    told: Identifiability
+    identifiability: Identifiability
     unidentified: tuple[Sentence, ...]
     weak: tuple[Sentence, ...]
     by_drawing: float
@@ -89,35 +89,35 @@ class Findings:
 
 
 def explain(
-    told: Identifiability,
+    ranks: Identifiability,
     estimate: Estimate,
-    seen: Booleans,
+    visible: Booleans,
     conditions: tuple[Condition, ...] = (),
     bed: Bed | None = None,
 ) -> Findings:
-    """The findings of an estimate; seen : (S, L) legs that each station sees. bed : where nothing
-    but heights was measured.
+    """The findings of an estimate; visible : (S, L) legs that each station sees. bed : where
+    nothing but heights was measured.
 
-    Stations that a board on the base joins are one here, see :func:`seen_through_boards`.
+    Stations that a board on the base joins are one here, see :func:`observed_by_boards`.
     """
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
     photographed = estimate.edge_weights.size > 0
-    around = Situation(machine, seen, poses, photographed, only_heights(estimate))
+    around = Situation(machine, visible, poses, photographed, only_heights(estimate))
     effect = platform_by_parameters(machine, poses)
-    unseen = {id(d) for d in told.unidentified}
+    unseen = {id(d) for d in ranks.unidentified}
 
-    def said(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
-        known = [0.0 if id(d) in unseen else d.information for d in directions]
-        return describe(around, direction_vectors(directions, machine), np.array(known), effect)
+    def text(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
+        reference = [0.0 if id(d) in unseen else d.information for d in directions]
+        return describe(around, direction_vectors(directions, machine), np.array(reference), effect)
 
-    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY_TOLD_INFORMATION))
-    weak = tuple(d for d in told.weak if d.information >= HARDLY_TOLD_INFORMATION)
+    lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < WEAK_INFORMATION))
+    weak = tuple(d for d in ranks.weak if d.information >= WEAK_INFORMATION)
     # Poses and heights blend what they hardly see with what they do not: together it has names.
-    sentences = (*said(lost), *said(weak)) if photographed else said((*lost, *weak))
+    sentences = (*text(lost), *text(weak)) if photographed else text((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
     return Findings(
-        told,
+        ranks,
         tuple(s for s in sentences if not s.weak),
         tuple(s for s in sentences if s.weak),
         float(np.linalg.norm(effect @ (table.free_matrix() * table.tolerances_free()))),
@@ -151,17 +151,17 @@ def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machi
     return np.array([d.vector for d in directions]).reshape(-1, len(machine.parameters))
 
 
-def seen_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> Booleans:
+def observed_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> Booleans:
     """Legs that each station sees, (S, L); edges given up, of weight (N,) below a half, aside."""
-    kept = np.asarray(weights) >= 0.5
+    inliers = np.asarray(weights) >= 0.5
     out = np.zeros((n_stations, n_legs), dtype=bool)
-    out[edges.station[kept], edges.leg[kept]] = True
+    out[edges.station[inliers], edges.leg[inliers]] = True
     return out
 
 
-def seen_through_boards(seen: Booleans, measurements: Measurements) -> Booleans:
+def observed_by_boards(visible: Booleans, measurements: Measurements) -> Booleans:
     """The same (S, L), where stations that see one board on the base count as one station."""
-    out, poses = seen.copy(), measurements.poses
+    out, poses = visible.copy(), measurements.poses
     for k, mount in enumerate(measurements.mounts):
         stations = np.unique(poses.station[poses.mount == k])
         if mount.body == "base" and stations.size:
@@ -183,13 +183,13 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     free = effect @ table.free_matrix()
     q, s, _ = np.linalg.svd(free, full_matrices=False)
     q = q[:, s > 1e-9 * s.max(initial=0.0)]
-    left = held - q @ (q.T @ held)
+    residual = held - q @ (q.T @ held)
     # a metre moves joints by about a metre: without effect is without effect in metres
-    alone = np.linalg.norm(left, axis=0) < CONVENTION_LEFT_UNDONE
-    names = tuple(name for name, said in zip(table.fixed, alone, strict=True) if said)
-    others = left[:, ~alone]
-    kinds = np.unique(np.round(others / CONVENTION_LEFT_UNDONE), axis=1)  # what is tied counts once
-    rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > CONVENTION_LEFT_UNDONE))
+    alone = np.linalg.norm(residual, axis=0) < CONVENTION_NULL_SHARE
+    names = tuple(name for name, is_alone in zip(table.fixed, alone, strict=True) if is_alone)
+    others = residual[:, ~alone]
+    kinds = np.unique(np.round(others / CONVENTION_NULL_SHARE), axis=1)  # what is tied counts once
+    rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > CONVENTION_NULL_SHARE))
     return names, kinds.shape[1] - rank
 
 
@@ -214,7 +214,7 @@ def describe(
 
     null : (n, P) changes of all parameters in their units, any basis.
     information : (n,) singular values of what the data know of each after all, in units of the
-    tolerance, 0 where absent: from ``HARDLY_TOLD_INFORMATION`` on it is said that the drawing knows
+    tolerance, 0 where absent: from ``WEAK_INFORMATION`` on it is said that the drawing knows
     it better, not that it is free. effect : (r, P) as :func:`platform_by_parameters` gives it.
     """
     machine = around.machine
@@ -225,9 +225,9 @@ def describe(
         effect = platform_by_parameters(machine, around.T_base_platform)
     if not around.photographed:  # nobody asks a board how thick legs are
         space = _without(space, _within(all_radii(around).columns, space, INSIDE_OPEN_SHARES[0]))
-    found = _alike(around, _explained(around, space))
-    said = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in found]
-    return few(said)
+    results = _merged(around, _explained(around, space))
+    text = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in results]
+    return few(text)
 
 
 def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
@@ -236,8 +236,8 @@ def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
     # tied parameters share one deviation
     shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
     unit = machine.parameters.tolerance * np.sqrt(np.maximum(shared, 1.0))
-    moved = generators(machine.layout, machine.values) @ freedoms(machine)
-    frames = _orthonormal((moved / unit[:, None]).T).T
+    shifted = generators(machine.layout, machine.values) @ freedoms(machine)
+    frames = _orthonormal((shifted / unit[:, None]).T).T
     rows = null / unit
     rows = rows - (rows @ frames) @ frames.T
     size = np.linalg.norm(rows, axis=1)
@@ -262,33 +262,38 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
     """Motions that lie in the open space, each with what it says anew."""
     parts: list[OpenMotion] = []
     done = np.zeros((0, space.rows.shape[1]))
-    known, whole = list(candidates(around)), space
+    reference_values, whole = list(candidates(around)), space
     for motion, inside in [
-        *((m, share) for share in INSIDE_OPEN_SHARES for m in known[:-1]),
-        (known[-1], 0.0),
+        *((m, share) for share in INSIDE_OPEN_SHARES for m in reference_values[:-1]),
+        (reference_values[-1], 0.0),
     ]:
         if len(done) == len(whole.rows):
             break
-        found = _within(motion.columns, space, inside)
-        new = _directions(found - (found @ done.T) @ done)
+        names = _within(motion.columns, space, inside)
+        new = _directions(names - (names @ done.T) @ done)
         if len(new) == 0:
             continue
-        if motion is known[-1]:
-            found = new
+        if motion is reference_values[-1]:
+            names = new
         done = _orthonormal(np.concatenate([done, new]))
-        numbers = _coefficients(motion, space, found)
+        numbers = _coefficients(motion, space, names)
         own = numbers @ motion.columns.T / space.unit
-        parts.append(OpenMotion(motion, motion.legs, found, numbers, own, len(new)))
+        parts.append(OpenMotion(motion, motion.legs, names, numbers, own, len(new)))
         if motion.convention:
             space = _without(space, new)
     return parts
 
 
-def _without(space: _Open, said: Array) -> _Open:
+def _without(space: _Open, directions: Array) -> _Open:
     """The open space where changes (k, P) in it count for nothing, as frames do."""
-    kept = np.linalg.svd(space.rows @ said.T)[0][:, len(said) :].T
-    frames = np.concatenate([space.frames, said.T], axis=1)
-    return _Open(kept @ space.rows, kept @ space.covariance @ kept.T, frames, space.unit)
+    retained_rows = np.linalg.svd(space.rows @ directions.T)[0][:, len(directions) :].T
+    frames = np.concatenate([space.frames, directions.T], axis=1)
+    return _Open(
+        retained_rows @ space.rows,
+        retained_rows @ space.covariance @ retained_rows.T,
+        frames,
+        space.unit,
+    )
 
 
 def _directions(rows: Array) -> Array:
@@ -311,7 +316,7 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
     return u[:, s**2 > inside].T @ space.rows
 
 
-def _coefficients(motion: NamedChanges, space: _Open, found: Array) -> Array:
+def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
     """The motion's own numbers (k, m) for each direction, frames aside.
 
     Frames leave a choice: of a single change the numbers whose magnitudes have the smallest sum,
@@ -322,16 +327,16 @@ def _coefficients(motion: NamedChanges, space: _Open, found: Array) -> Array:
     scale = np.where(scale > 0, scale, 1.0)
     m, both = len(scale), np.concatenate([columns / scale, space.frames], axis=1)
     weight = np.ones(both.shape[1])
-    few = len(found) == 1 and m > 1 and not (motion.how or motion.convention)
-    solved = np.linalg.lstsq(both, found.T, rcond=1e-6)[0]
+    few = len(values) == 1 and m > 1 and not (motion.how or motion.convention)
+    solved = np.linalg.lstsq(both, values.T, rcond=1e-6)[0]
     for _ in range(STEPS_TO_FEWEST_NUMBERS if few else 0):
         weight[:m] = np.sqrt(np.abs(solved[:m, 0]) / max(np.abs(solved[:m, 0]).max(), 1e-300))
         weight[m:] = CHEAP_FRAME_WEIGHT
-        solved = np.linalg.lstsq(both * weight, found.T, rcond=1e-6)[0] * weight[:, None]
+        solved = np.linalg.lstsq(both * weight, values.T, rcond=1e-6)[0] * weight[:, None]
     return (solved[:m] / scale[:, None]).T
 
 
-def _alike(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
+def _merged(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
     """Parts with one sentence as one: the same of several legs, or the same legs' again."""
     out: dict[tuple[object, ...], OpenMotion] = {}
     for part in parts:
@@ -343,20 +348,20 @@ def _alike(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
 
 def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
     """Sizes of all legs but one, of which the common part is said too, are those of all legs."""
-    alike = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
+    same = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
     single = bool(part.motion.labels) and len(part.motion.legs) == 1
-    if single and alike and len(part.legs) == len(alike[0]) - 1:
-        return replace(part, legs=alike[0])
+    if single and same and len(part.legs) == len(same[0]) - 1:
+        return replace(part, legs=same[0])
     return part
 
 
 def _moves(part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
     """How far (m) it moves the platform, and whether the data know something of it after all."""
-    found = _directions(part.space)
-    mixed = found @ space.rows.T
-    moved = effect @ (space.unit[:, None] * found.T)
+    value = _directions(part.space)
+    mixed = value @ space.rows.T
+    shifted = effect @ (space.unit[:, None] * value.T)
     covariance = mixed @ space.covariance @ mixed.T
     # the estimate's information is the drawing's, one, and the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
-    known = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-    return float(np.sqrt(np.sum((moved @ covariance) * moved))), known >= HARDLY_TOLD_INFORMATION
+    above_limit = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
+    return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), above_limit >= WEAK_INFORMATION

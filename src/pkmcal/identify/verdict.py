@@ -13,8 +13,8 @@ from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.confirmation import FAR_FROM_NOMINAL
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.found import decided_by
 from pkmcal.identify.gauge import freedoms, generators
+from pkmcal.identify.parameter_estimates import decided_by
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
@@ -32,7 +32,7 @@ TOO_NOISY = 4.0
 """Factor on the edges' stated noise beyond which the model does not explain the photographs."""
 TOO_MANY_LOST = 0.4
 """Share of edges given up as outliers beyond which the rest may be the outliers."""
-LEFT_OPEN = 0.05
+UNIDENTIFIABLE = 0.05
 """Share of the platform's error by the drawing that may be left undecided. A calibration makes the
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
 largest error, and one that more of the same photographs do not shrink. A result whose deviation is
@@ -41,10 +41,10 @@ MOSTLY_SINGULAR_SHARE = 0.5
 """Share of configurations near a singular pose from which on nothing said here can be trusted."""
 LARGE_CAUSE_SHARE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
-WORTH_SAYING = 0.5
+WORTH_REPORTING = 0.5
 """Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
 the whole larger by an eighth."""
-NOMINAL_ERROR_LEFT = 0.5
+NOMINAL_ERROR_SHARE = 0.5
 """Part of the error that the nominal model's tolerances let expect which a result may leave: below
 a half the result is better than the nominal model almost for sure; above, new values are not worth
 their risk."""
@@ -90,11 +90,11 @@ def judge(
     others : findings of any level about the session.
     """
     bed = findings.bed
-    large, small = ((), ()) if bed else _left_open(estimate, findings)
+    large, small = ((), ()) if bed else _unidentifiable_text(estimate, findings)
     # what is a small part of the deviation that was reached is in that, and in the report
     matter = [s for s in small if s.matters]
     if matter:
-        least = WORTH_SAYING * platform_sigma(estimate)
+        least = WORTH_REPORTING * platform_sigma(estimate)
         matter = [s for s in matter if s.moves_platform > least]
     undetermined = [_undetermined(s, Level.WRONG) for s in large]
     if bed:
@@ -174,7 +174,7 @@ def no_gain(sigma: float, by_nominal: float) -> bool:
     tool's height above the bed), by_nominal : the same by the nominal model's tolerances alone, in
     the same unit.
     """
-    return not sigma <= NOMINAL_ERROR_LEFT * by_nominal
+    return not sigma <= NOMINAL_ERROR_SHARE * by_nominal
 
 
 def _platform_unknown(estimate: Estimate, by_nominal: float) -> Iterator[Finding]:
@@ -262,9 +262,9 @@ def _base_alone(estimate: Estimate) -> Finding:
         for covariance in (estimate.covariance, root @ root.T)
     )
     values, vectors = np.linalg.eigh(before)
-    known = values > EXACT_SHARE * values[-1]
-    unit = vectors[:, known] * np.sqrt(values[known])
-    inverse = vectors[:, known] / np.sqrt(values[known])
+    above_limit = values > EXACT_SHARE * values[-1]
+    unit = vectors[:, above_limit] * np.sqrt(values[above_limit])
+    inverse = vectors[:, above_limit] / np.sqrt(values[above_limit])
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
     by_edges = v / np.maximum(1 - v, EXACT_SHARE)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
@@ -302,7 +302,7 @@ def _singular(estimate: Estimate) -> Iterator[Finding]:
         yield wrong("configurations.singular", number=int(weak.sum()), of=weak.size)
 
 
-def _left_open(
+def _unidentifiable_text(
     estimate: Estimate, findings: Findings
 ) -> tuple[tuple[Sentence, ...], tuple[Sentence, ...]]:
     """What is undecided: reasons against the result, and what to know of it.
@@ -314,7 +314,7 @@ def _left_open(
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
     open_ = findings.unidentified + weak
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
-    if total <= LEFT_OPEN * findings.by_drawing:
+    if total <= UNIDENTIFIABLE * findings.by_drawing:
         return (), open_
     # where all else makes more of the deviation that was reached, that says enough
     if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
@@ -358,8 +358,8 @@ def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]
             tolerances=FAR_FROM_NOMINAL,
             most=float(change.max()),
         )
-    seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
-    for leg in np.flatnonzero(seen < 0.3 * np.median(seen)).tolist():
+    in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
+    for leg in np.flatnonzero(in_view < 0.3 * np.median(in_view)).tolist():
         yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
     if estimate.statistics.noise_scale > 1.5:
         yield doubtful("edges.scatter", scale=estimate.statistics.noise_scale)

@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.gather import by_focal, edges_by_camera
+from pkmcal.calibration.camera_refinement import by_focal, edges_by_camera
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
-from pkmcal.judge.held import USUAL_RATIO_CHANGE, USUAL_STATION_MOVE, Evidence
+from pkmcal.judge.fixed_machine import USUAL_RATIO_CHANGE, USUAL_STATION_MOVE, Evidence
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import split_name
@@ -33,7 +33,7 @@ class Cause:
     part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
     ``station``. columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or
     (P + C, k), then of the cameras' magnification; or of all columns of
-    :class:`~pkmcal.judge.held.Evidence`. sizes : (k,) usual ones: a drawing's tolerance,
+    :class:`~pkmcal.judge.fixed_machine.Evidence`. sizes : (k,) usual ones: a drawing's tolerance,
     USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
     nothing for a ratio. camera, station : numbers in the session.
     """
@@ -92,9 +92,11 @@ def magnification(machine: Machine, camera: int) -> Cause:
     return Cause("camera", (), column, np.array([USUAL_RATIO_CHANGE]), "", camera)
 
 
-def stations_moved(found: Evidence) -> tuple[Cause, ...]:
+def stations_moved(evidence: Evidence) -> tuple[Cause, ...]:
     """Each camera that is said to have been left in place turned and moved, (phi, s)."""
-    columns = np.eye(found.by.shape[1])[:, found.by.shape[1] - 6 * len(found.kept) :]
+    columns = np.eye(evidence.by.shape[1])[
+        :, evidence.by.shape[1] - 6 * len(evidence.fixed_stations) :
+    ]
     return tuple(
         Cause(
             "station",
@@ -104,11 +106,11 @@ def stations_moved(found: Evidence) -> tuple[Cause, ...]:
             "m",
             station=station,
         )
-        for k, station in enumerate(found.kept)
+        for k, station in enumerate(evidence.fixed_stations)
     )
 
 
-def single_causes(machine: Machine, found: Evidence | None = None) -> tuple[Cause, ...]:
+def single_causes(machine: Machine, evidence: Evidence | None = None) -> tuple[Cause, ...]:
     """All that one mishap may change: a part of a leg, neighbouring joints, scale; and, as far as
     the evidence has columns for them, a lens, or a camera's place.
     """
@@ -123,11 +125,11 @@ def single_causes(machine: Machine, found: Evidence | None = None) -> tuple[Caus
             one, other = (joint_of(machine, side, leg) for leg in pair)
             out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
     out.append(common_scale(machine))
-    if found is None:
+    if evidence is None:
         return tuple(out)
-    n_cameras = found.by.shape[1] - len(machine.parameters) - 6 * len(found.kept)
+    n_cameras = evidence.by.shape[1] - len(machine.parameters) - 6 * len(evidence.fixed_stations)
     out += [magnification(machine, c) for c in range(n_cameras)]
-    return (*out, *stations_moved(found))
+    return (*out, *stations_moved(evidence))
 
 
 def joined_causes(causes: Sequence[Cause]) -> Cause:

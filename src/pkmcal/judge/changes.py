@@ -1,7 +1,7 @@
 """Tests of a change of a calibrated machine, their power, and what explains a change best.
 
 For a cause with columns D the statistic is the length of w's part along X D
-(:class:`~pkmcal.judge.held.Evidence`): chi-square of as many degrees of freedom as X D has
+(:class:`~pkmcal.judge.fixed_machine.Evidence`): chi-square of as many degrees of freedom as X D has
 directions that the data see at all. Its null distribution holds whatever they are, for what is left
 out depends on X alone.
 """
@@ -29,23 +29,23 @@ from pkmcal.judge.causes import (
     whole_machine,
     zeros,
 )
-from pkmcal.judge.held import Evidence
+from pkmcal.judge.fixed_machine import Evidence
 from pkmcal.mechanisms import Machine
 
-LEAST_SEEN_DEVIATIONS = 1.0
+LEAST_OBSERVABLE_DEVIATIONS = 1.0
 """Standard deviations that a change of one tolerance must make for its direction to be tested; a
 direction that is hardly seen would only add noise to the test."""
 DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
 WATCH_NOISE_DRAWS = 20_000
 """Draws of noise: a share of 0.01 of them is then known to 7 % of itself."""
-TOLD_APART_LOG_ODDS = 2 * np.log(100.0)
+DISTINCT_LOG_ODDS = 2 * np.log(100.0)
 """Two causes are told apart where one makes the data a hundred times as likely as the other."""
 MOST_CAUSES = 4
 """Changes that are looked for one after the other; more are a machine that was taken apart."""
 
 
-class SeenCause(NamedTuple):
+class ObservableCause(NamedTuple):
     """What the data see of a cause: q (n, d) orthonormal in w, and gain (d, k) with q^T X D."""
 
     q: Array
@@ -69,35 +69,35 @@ class Change:
         return {"change": self.value, "sigma": self.sigma}
 
 
-def seen_directions(found: Evidence, cause: Cause) -> SeenCause:
+def observable_directions(evidence: Evidence, cause: Cause) -> ObservableCause:
     """The directions in w of a cause that the data see."""
-    scaled = found.along(cause.columns * cause.sizes)
+    scaled = evidence.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
-    seen = s > LEAST_SEEN_DEVIATIONS
-    return SeenCause(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
+    observable = s > LEAST_OBSERVABLE_DEVIATIONS
+    return ObservableCause(u[:, observable], s[observable, None] * vt[observable] / cause.sizes)
 
 
-def chi_square(found: Evidence, cause: Cause) -> Score:
+def chi_square(evidence: Evidence, cause: Cause) -> Score:
     """Whether the data show the cause."""
     from scipy.special import chdtrc
 
-    q = seen_directions(found, cause).q
-    chi2, dof = float(np.sum((q.T @ found.w) ** 2)), q.shape[1]
+    q = observable_directions(evidence, cause).q
+    chi2, dof = float(np.sum((q.T @ evidence.w) ** 2)), q.shape[1]
     return Score(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0)
 
 
-def twice_log_odds(found: Evidence, cause: Cause) -> float:
+def twice_log_odds(evidence: Evidence, cause: Cause) -> float:
     """Twice the log of how many times likelier the data are with the cause than with no change.
 
     The change's numbers are averaged over normal distributions of their ``sizes``: what one cause
     explains by 0.5 mm and another by 8 mm is rather the first's, and a cause of three numbers must
     explain more than one of a single number.
     """
-    q, gain = seen_directions(found, cause)
-    told, scaled = q.T @ found.w, gain * cause.sizes
-    spread = np.eye(len(told)) + scaled @ scaled.T
-    expected = float(told @ np.linalg.solve(spread, told))
-    return float(told @ told) - expected - float(np.linalg.slogdet(spread)[1])
+    q, gain = observable_directions(evidence, cause)
+    projected, scaled = q.T @ evidence.w, gain * cause.sizes
+    spread = np.eye(len(projected)) + scaled @ scaled.T
+    expected = float(projected @ np.linalg.solve(spread, projected))
+    return float(projected @ projected) - expected - float(np.linalg.slogdet(spread)[1])
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class CommonLevel:
         return max(drawn, alpha / max(self.count, 1))
 
 
-def common_level(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
+def common_level(evidence: Evidence, causes: Sequence[Cause]) -> CommonLevel:
     """The tests of several causes made at once: the same noise goes through all of them.
 
     Tests overlap (legs share what poses take up), so that the usual allowance for their number
@@ -136,38 +136,40 @@ def common_level(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
     """
     from scipy.special import chdtrc
 
-    noise = np.random.default_rng(0).standard_normal((WATCH_NOISE_DRAWS, len(found.w)))
-    parts = [q for q in (seen_directions(found, cause).q for cause in causes) if q.shape[1]]
+    noise = np.random.default_rng(0).standard_normal((WATCH_NOISE_DRAWS, len(evidence.w)))
+    parts = [
+        q for q in (observable_directions(evidence, cause).q for cause in causes) if q.shape[1]
+    ]
     least = np.ones(WATCH_NOISE_DRAWS)
     for q in parts:
         np.minimum(least, chdtrc(q.shape[1], np.sum((noise @ q) ** 2, axis=1)), out=least)
     return CommonLevel(np.sort(least), len(parts))
 
 
-def change(found: Evidence, cause: Cause) -> Change:
+def change(evidence: Evidence, cause: Cause) -> Change:
     """The change by least squares, nothing else changed."""
-    seen = seen_directions(found, cause)
-    inverse = np.linalg.pinv(seen.gain)
+    visible = observable_directions(evidence, cause)
+    inverse = np.linalg.pinv(visible.gain)
     covariance = inverse @ inverse.T
     # a number of which a part is not seen is not told
     lost = (
-        1 - np.diag(inverse @ seen.gain) > 1e-2
-        if seen.gain.size
+        1 - np.diag(inverse @ visible.gain) > 1e-2
+        if visible.gain.size
         else np.ones(len(cause.sizes), bool)
     )
     sigma = np.where(lost, np.inf, np.sqrt(np.diag(covariance)))
-    return Change(inverse @ (seen.q.T @ found.w), sigma, covariance)
+    return Change(inverse @ (visible.q.T @ evidence.w), sigma, covariance)
 
 
-def detectable(found: Evidence, tester: Cause, along: Array, level: float) -> float:
+def detectable(evidence: Evidence, tester: Cause, along: Array, level: float) -> float:
     """The smallest change along a direction that a test at a level detects with DETECTION_POWER.
 
     along : (P,) the change of the parameters by one unit (m, rad). inf where it is not seen.
     """
     from scipy.special import chdtri, chndtrinc
 
-    q = seen_directions(found, tester).q
-    size = float(np.linalg.norm(q.T @ (found.along(along[:, None]))))
+    q = observable_directions(evidence, tester).q
+    size = float(np.linalg.norm(q.T @ (evidence.along(along[:, None]))))
     if not q.shape[1] or size == 0.0:
         return float("inf")
     need = float(chndtrinc(chdtri(q.shape[1], level), q.shape[1], 1 - DETECTION_POWER))
@@ -175,15 +177,15 @@ def detectable(found: Evidence, tester: Cause, along: Array, level: float) -> fl
 
 
 def detectable_range(
-    found: Evidence, tester: Cause, part: Cause, level: float
+    evidence: Evidence, tester: Cause, part: Cause, level: float
 ) -> tuple[float, float]:
     """Smallest detectable changes of a part in the direction that is seen best, and worst."""
-    q = seen_directions(found, tester).q
+    q = observable_directions(evidence, tester).q
     if not q.shape[1] or not part.sizes.size:
         return float("inf"), float("inf")
-    gain = q.T @ found.along(part.columns)
+    gain = q.T @ evidence.along(part.columns)
     _, _, vt = np.linalg.svd(gain)
-    best, worst = (detectable(found, tester, part.columns @ v, level) for v in (vt[0], vt[-1]))
+    best, worst = (detectable(evidence, tester, part.columns @ v, level) for v in (vt[0], vt[-1]))
     return best, worst
 
 
@@ -285,7 +287,7 @@ class ChangeTests:
     stations : of each camera that is said to have been left in place.
 
     alpha : share of machines that did not change that may be flagged. level : of a single test, so
-    that all together keep alpha. left : what the findings leave unexplained of ``machine``.
+    that all together keep alpha. rest : what the findings leave unexplained of ``machine``.
     """
 
     legs: tuple[LegTest, ...]
@@ -293,7 +295,7 @@ class ChangeTests:
     scale: Score
     scale_change: Change
     findings: tuple[Explanation, ...]
-    left: Score
+    rest: Score
     alpha: float
     level: float
     stations: tuple[StationTest, ...] = ()
@@ -318,8 +320,8 @@ class ChangeTests:
     def tests(self) -> tuple[Score, ...]:
         """All tests that see anything."""
         legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
-        kept = [station.test for station in self.stations]
-        every = (self.machine, self.scale, *legs, *kept)
+        retained = [station.test for station in self.stations]
+        every = (self.machine, self.scale, *legs, *retained)
         return tuple(t for t in every if t is not None and t.dof)
 
     def document(self, machine: Machine) -> dict[str, Any]:
@@ -340,12 +342,12 @@ class ChangeTests:
                 }
                 for finding in self.findings
             ],
-            "unexplained": asdict(self.left),
+            "unexplained": asdict(self.rest),
         }
 
 
 def made_tests(
-    found: Evidence, machine: Machine
+    evidence: Evidence, machine: Machine
 ) -> tuple[tuple[Score, ...], tuple[Score | None, ...], CommonLevel]:
     """Every test on new data, chances adjusted for their number, and what they are worth together.
 
@@ -353,50 +355,50 @@ def made_tests(
     left in place; then of each arm's zero, None for one without a reading.
     """
     causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
-    causes += stations_moved(found)
+    causes += stations_moved(evidence)
     zero = zeros(machine)
-    level = common_level(found, [*causes, *(cause for cause in zero if cause)])
+    level = common_level(evidence, [*causes, *(cause for cause in zero if cause)])
 
     def test(cause: Cause) -> Score:
-        told = chi_square(found, cause)
-        return replace(told, adjusted=level.adjusted(told.chance))
+        score = chi_square(evidence, cause)
+        return replace(score, adjusted=level.adjusted(score.chance))
 
     return tuple(map(test, causes)), tuple(test(cause) if cause else None for cause in zero), level
 
 
-def look_for_changes(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
+def test_for_changes(evidence: Evidence, machine: Machine, alpha: float) -> ChangeTests:
     """Every test on new data, and what explains a change.
 
     alpha : share of machines that did not change that may be flagged.
     """
-    (every, scale, *each), own, level = made_tests(found, machine)
+    (every, scale, *each), own, level = made_tests(evidence, machine)
     single = level.single(alpha)
-    wholes, kept = each[: len(own)], each[len(own) :]
+    wholes, retained = each[: len(own)], each[len(own) :]
     rows = zip(whole_legs(machine), zeros(machine), wholes, own, strict=True)
     out = ChangeTests(
-        legs=tuple(_leg(found, machine, *row, single) for row in rows),
+        legs=tuple(_leg(evidence, machine, *row, single) for row in rows),
         machine=every,
         scale=scale,
-        scale_change=change(found, common_scale(machine)),
+        scale_change=change(evidence, common_scale(machine)),
         findings=(),
-        left=every,
+        rest=every,
         alpha=alpha,
         level=single,
         stations=tuple(
-            StationTest(cause.station, test, change(found, cause))
-            for cause, test in zip(stations_moved(found), kept, strict=True)
+            StationTest(cause.station, test, change(evidence, cause))
+            for cause, test in zip(stations_moved(evidence), retained, strict=True)
         ),
     )
     if not out.changed:
         return out
-    findings = explained(found, single_causes(machine, found), alpha)
-    left = _beside(found, [f.suspect.cause for f in findings])
-    left = chi_square(left, whole_machine(machine))
-    return replace(out, findings=findings, left=left)
+    findings = explained(evidence, single_causes(machine, evidence), alpha)
+    remainder = _beside(evidence, [f.suspect.cause for f in findings])
+    remainder = chi_square(remainder, whole_machine(machine))
+    return replace(out, findings=findings, rest=remainder)
 
 
 def _leg(
-    found: Evidence,
+    evidence: Evidence,
     machine: Machine,
     whole: Cause,
     zero: Cause | None,
@@ -406,17 +408,17 @@ def _leg(
 ) -> LegTest:
     """A leg's tests, of all of it and of its zero, and what they would have found."""
     base, platform = (
-        detectable_range(found, whole, joint_of(machine, side, whole.legs[0]), level)
+        detectable_range(evidence, whole, joint_of(machine, side, whole.legs[0]), level)
         for side in JOINT_SIDES
     )
     least = float("inf")
     if zero is not None:
-        least = min(detectable(found, t, zero.columns[:, 0], level) for t in (zero, whole))
+        least = min(detectable(evidence, t, zero.columns[:, 0], level) for t in (zero, whole))
     return LegTest(
         legs=whole.legs,
         whole=test,
         zero=test_zero,
-        change=change(found, zero) if zero else None,
+        change=change(evidence, zero) if zero else None,
         unit=zero.unit if zero else "m",
         tolerance=float(zero.sizes[0]) if zero else float("nan"),
         detects_zero=least,
@@ -425,7 +427,7 @@ def _leg(
     )
 
 
-def explained(found: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[Explanation, ...]:
+def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[Explanation, ...]:
     """Causes one after the other, each the one that is most likely beside those before.
 
     Each must explain more than chance would in the best of so many. Of two changes, the first that
@@ -434,31 +436,31 @@ def explained(found: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[E
     """
     chosen: tuple[Cause, ...] = ()
     while len(chosen) < MOST_CAUSES:
-        best = _ranked(found, chosen, causes)[0][1]
-        told = chi_square(_beside(found, chosen), best)
-        if not told.dof or len(causes) * told.chance >= alpha:
+        best = _ranked(evidence, chosen, causes)[0][1]
+        score = chi_square(_beside(evidence, chosen), best)
+        if not score.dof or len(causes) * score.chance >= alpha:
             break
         chosen = (*chosen, best)
         if len(chosen) == 2:
             pairs = [
-                (twice_log_odds(found, joined_causes(pair)), pair)
+                (twice_log_odds(evidence, joined_causes(pair)), pair)
                 for pair in combinations(causes, 2)
             ]
             chosen = max(pairs, key=lambda item: item[0])[1]
-        chosen = _exchanged(found, chosen, causes)
-    findings = [_finding(found, chosen, k, causes) for k in range(len(chosen))]
+        chosen = _exchanged(evidence, chosen, causes)
+    findings = [_finding(evidence, chosen, k, causes) for k in range(len(chosen))]
     return tuple(sorted(findings, key=lambda f: -f.suspect.chi2))
 
 
 def _exchanged(
-    found: Evidence, chosen: tuple[Cause, ...], causes: Sequence[Cause]
+    evidence: Evidence, chosen: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> tuple[Cause, ...]:
     """The causes, each replaced by what is most likely beside the others, until all agree."""
     for _ in range(MOST_CAUSES):
         before = chosen
         for k in range(len(chosen)):
             others = chosen[:k] + chosen[k + 1 :]
-            best = _ranked(found, others, causes)[0][1]
+            best = _ranked(evidence, others, causes)[0][1]
             chosen = (*chosen[:k], best, *chosen[k + 1 :])
         if all(old is new for old, new in zip(before, chosen, strict=True)):
             break
@@ -466,35 +468,37 @@ def _exchanged(
 
 
 def _ranked(
-    found: Evidence, others: tuple[Cause, ...], causes: Sequence[Cause]
+    evidence: Evidence, others: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> list[tuple[float, Cause]]:
     """Causes by how likely they make the data together with others (twice the log of the odds),
     best first.
     """
     free = [c for c in causes if all(c is not other for other in others)]
-    scored = [(twice_log_odds(found, joined_causes((*others, cause))), cause) for cause in free]
+    scored = [(twice_log_odds(evidence, joined_causes((*others, cause))), cause) for cause in free]
     return sorted(scored, key=lambda item: -item[0])
 
 
 def _finding(
-    found: Evidence, chosen: tuple[Cause, ...], place: int, causes: Sequence[Cause]
+    evidence: Evidence, chosen: tuple[Cause, ...], place: int, causes: Sequence[Cause]
 ) -> Explanation:
     """One of the chosen causes beside the others, with what cannot be told from it."""
     own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
-    left = _beside(found, others)
+    remainder = _beside(evidence, others)
     # what explains no more than nothing would is no rival, however weak the best
-    nothing = twice_log_odds(found, joined_causes(others)) if others else 0.0
-    least = max(twice_log_odds(found, joined_causes(chosen)) - TOLD_APART_LOG_ODDS, nothing)
-    near = [c for score, c in _ranked(found, others, causes) if score > least and c is not own]
-    suspects = [Suspect(c, change(left, c), chi_square(left, c).chi2) for c in (own, *near)]
-    return Explanation(suspects[0], chi_square(left, own), tuple(suspects[1:]))
+    nothing = twice_log_odds(evidence, joined_causes(others)) if others else 0.0
+    least = max(twice_log_odds(evidence, joined_causes(chosen)) - DISTINCT_LOG_ODDS, nothing)
+    near = [c for score, c in _ranked(evidence, others, causes) if score > least and c is not own]
+    suspects = [
+        Suspect(c, change(remainder, c), chi_square(remainder, c).chi2) for c in (own, *near)
+    ]
+    return Explanation(suspects[0], chi_square(remainder, own), tuple(suspects[1:]))
 
 
-def _beside(found: Evidence, chosen: Sequence[Cause]) -> Evidence:
+def _beside(evidence: Evidence, chosen: Sequence[Cause]) -> Evidence:
     """The evidence without what other causes explain: their directions taken out."""
-    left = found
+    remainder = evidence
     for cause in chosen:
-        q = seen_directions(left, cause).q
+        q = observable_directions(remainder, cause).q
         rest = np.linalg.svd(q, full_matrices=True)[0][:, q.shape[1] :]
-        left = replace(left, w=rest.T @ left.w, by=rest.T @ left.by)
-    return left
+        remainder = replace(remainder, w=rest.T @ remainder.w, by=rest.T @ remainder.by)
+    return remainder

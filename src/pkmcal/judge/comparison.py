@@ -67,7 +67,7 @@ class Promise:
     by_noise: Array
 
     @property
-    def kept(self) -> bool:
+    def holds(self) -> bool:
         """Whether the deviations may be believed."""
         return self.usual and self.steady
 
@@ -150,7 +150,7 @@ class BesideDrawing:
                 "dof": test.dof,
                 "chance": test.chance,
                 "factor": test.factor,
-                "kept": test.kept,
+                "kept": test.holds,
                 "common": test.common,
                 "common_sigma": test.common_sigma,
                 "common_chance": test.common_chance,
@@ -163,7 +163,7 @@ def compare_with_drawing(
     drawing: Machine,
     covariance: Array,
     measurements: Measurements,
-    found: Prediction,
+    prediction: Prediction,
     by_drawing: Prediction | None,
     rows: Integers,
 ) -> BesideDrawing:
@@ -173,14 +173,16 @@ def compare_with_drawing(
     without it the drawing is judged on the calibrated machine's poses, else on those that suit it
     best.
     """
-    seen = np.flatnonzero(found.seen)
+    visible = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]
-    place = np.searchsorted(seen, rows)
+    place = np.searchsorted(visible, rows)
     flat = (place[:, None] * m + np.arange(m)).reshape(-1)
-    noise, by = found.noise[np.ix_(flat, flat)], found.by_machine[flat]
+    noise, by = prediction.noise[np.ix_(flat, flat)], prediction.by_machine[flat]
     weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
-    new = found.errors.of(rows)
-    old = errors_on(drawing, measurements.joints[seen], found.T_base_platform[seen]).of(place)
+    new = prediction.errors.of(rows)
+    old = errors_on(drawing, measurements.joints[visible], prediction.T_base_platform[visible]).of(
+        place
+    )
     if by_drawing is not None:
         own = by_drawing.errors.of(rows)
         if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(old.residuals)):
@@ -247,8 +249,8 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
     shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    known = values > NULL_EIGENVALUE_SHARE * values[-1]
-    whiten = (vectors[:, known] / np.sqrt(values[known])).T / scale
+    above_limit = values > NULL_EIGENVALUE_SHARE * values[-1]
+    whiten = (vectors[:, above_limit] / np.sqrt(values[above_limit])).T / scale
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
     spread = np.linalg.pinv(design.T @ design)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
-from pkmcal.calibration.saved import SavedCalibration
-from pkmcal.calibration.source import loaded
+from pkmcal.calibration.machine_source import loaded
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.calibration.toolmap import ToolMap, map_of
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import json_value
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.change import MachineChange, machine_change
+from pkmcal.identify.machine_change import MachineChange, machine_change
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
@@ -54,7 +54,7 @@ class ComparedMachine:
 class MachineDifference:
     """Everything that differs.
 
-    found : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
+    change : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
     drawings. chances : (P,) of each parameter's change, their number allowed for; NaN of what has
     no standard deviation. centres : base and platform, a's laid over b's. tool : what the change
     does to the tool over the workspace, its ``after``, or why there is no map. shared :
@@ -63,7 +63,7 @@ class MachineDifference:
 
     a: ComparedMachine
     b: ComparedMachine
-    found: MachineChange
+    change: MachineChange
     chance: float
     chances: Array
     centres: tuple[Centres, ...]
@@ -78,10 +78,10 @@ class MachineDifference:
     @property
     def ordered(self) -> list[int]:
         """Parameters with a change to tell of, the one least like chance first."""
-        size = np.abs(self.found.change)
+        size = np.abs(self.change.change)
         some = np.flatnonzero(size > SAME_NUMBER_DIFFERENCE)
-        if self.found.dof:
-            sigma = np.maximum(self.found.sigma, SAME_NUMBER_DIFFERENCE)
+        if self.change.dof:
+            sigma = np.maximum(self.change.sigma, SAME_NUMBER_DIFFERENCE)
             size = size / sigma
         else:
             size = size / self.a.machine.parameters.tolerance
@@ -94,7 +94,7 @@ class MachineDifference:
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
-        table, found = self.a.machine.parameters, self.found
+        table, value = self.a.machine.parameters, self.change
         before = table.unit_axes(self.a.machine.values)
         sides = [
             {
@@ -111,17 +111,17 @@ class MachineDifference:
                 "changed": self.changed,
                 "a": sides[0],
                 "b": sides[1],
-                "chi2": found.chi2 if found.dof else None,
-                "dof": found.dof,
-                "chance": self.chance if found.dof else None,
+                "chi2": value.chi2 if value.dof else None,
+                "dof": value.dof,
+                "chance": self.chance if value.dof else None,
                 "parameters": [
                     {
                         "name": name,
                         "unit": table.units[k],
                         "a": before[k],
-                        "b": before[k] + found.change[k],
-                        "change": found.change[k],
-                        "sigma": found.sigma[k],
+                        "b": before[k] + value.change[k],
+                        "change": value.change[k],
+                        "sigma": value.sigma[k],
                         "chance": self.chances[k],
                     }
                     for k, name in enumerate(table.names)
@@ -133,13 +133,13 @@ class MachineDifference:
         )
 
 
-def _tool(found: ToolMap) -> dict[str, Any]:
-    told = found.document()
+def _tool(tool_map: ToolMap) -> dict[str, Any]:
+    document = tool_map.document()
     return {
-        "region": told["region"],
-        "poses": told["poses"],
-        "change": told["drawing_off"],
-        "sigma": told["sigma"],
+        "region": document["region"],
+        "poses": document["poses"],
+        "change": document["drawing_off"],
+        "sigma": document["sigma"],
     }
 
 
@@ -155,32 +155,32 @@ def difference(
     both = [side.saved for side in (one, other) if side.saved is not None]
     shared, share = _shared(both)
     one_drawing = len(both) == 2 and _one_drawing(both)
-    found = machine_change(
+    value = machine_change(
         one.machine,
         other.machine,
         (one.covariance, other.covariance),
         one_drawing=one_drawing,
         shared=share,
     )
-    seen = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
+    visible = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
     try:
         tool: ToolMap | str = map_of(
-            one.machine, found.machine, found.covariance, _region(both), legs_seen=seen
+            one.machine, value.machine, value.covariance, _region(both), legs_observed=visible
         )
     except PkmcalError as error:
         tool = f"There is no map of the workspace: {error}"
-    chance, chances = _chances(found)
+    chance, chances = _chances(value)
     least = float(np.nanmin(chances, initial=1.0))
-    held = (found.sigma <= SAME_NUMBER_DIFFERENCE) & (np.abs(found.change) > SAME_NUMBER_DIFFERENCE)
+    held = (value.sigma <= SAME_NUMBER_DIFFERENCE) & (np.abs(value.change) > SAME_NUMBER_DIFFERENCE)
     changed = bool(chance < DIFFERENCE_ALPHA / 2 or least < DIFFERENCE_ALPHA / 2 or held.any())
-    free = free_of_gauge(found.machine, found.covariance)
+    free = free_of_gauge(value.machine, value.covariance)
     out = MachineDifference(
         a=one,
         b=other,
-        found=found,
+        change=value,
         chance=chance,
         chances=chances,
-        centres=joint_centres(one.machine, found.machine, free),
+        centres=joint_centres(one.machine, value.machine, free),
         tool=tool,
         shared=shared,
         assumed=_assumed(one, other, one_drawing, shared, share),
@@ -191,12 +191,12 @@ def difference(
 
 
 def _compared(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
-    found = loaded(origin) if isinstance(origin, Path | str) else origin
-    if isinstance(found, SavedCalibration):
-        name = str(origin) if isinstance(origin, Path | str) else str(found.path.parent)
-        return ComparedMachine(name, found.machine, found)
+    calibration = loaded(origin) if isinstance(origin, Path | str) else origin
+    if isinstance(calibration, SavedCalibration):
+        name = str(origin) if isinstance(origin, Path | str) else str(calibration.path.parent)
+        return ComparedMachine(name, calibration.machine, calibration)
     return ComparedMachine(
-        str(origin) if isinstance(origin, Path | str) else found.name, found, None
+        str(origin) if isinstance(origin, Path | str) else calibration.name, calibration, None
     )
 
 
@@ -220,8 +220,8 @@ def _one_drawing(both: list[SavedCalibration]) -> bool:
     """Whether two calibrations lean on the same values with the same tolerances."""
     one, other = both
     first, second = (saved.machine.parameters.tolerance for saved in both)
-    alike = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
-    return alike and np.allclose(first, second)
+    same = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
+    return same and np.allclose(first, second)
 
 
 def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
@@ -254,16 +254,18 @@ def _region(both: list[SavedCalibration]) -> Region | None:
     return None
 
 
-def _chances(found: MachineChange) -> tuple[float, Array]:
+def _chances(machine_change: MachineChange) -> tuple[float, Array]:
     """Of the whole, and (P,) of each parameter, their number allowed for."""
     from scipy.special import chdtrc, ndtr
 
-    sigma = found.sigma
-    known = sigma > SAME_NUMBER_DIFFERENCE
+    sigma = machine_change.sigma
+    above_limit = sigma > SAME_NUMBER_DIFFERENCE
     chances = np.full(len(sigma), np.nan)
-    single = 2 * ndtr(-np.abs(found.change[known]) / sigma[known])
-    chances[known] = np.minimum(1.0, single * found.dof)
-    return float(chdtrc(found.dof, found.chi2)) if found.dof else 1.0, chances
+    single = 2 * ndtr(-np.abs(machine_change.change[above_limit]) / sigma[above_limit])
+    chances[above_limit] = np.minimum(1.0, single * machine_change.dof)
+    return float(
+        chdtrc(machine_change.dof, machine_change.chi2)
+    ) if machine_change.dof else 1.0, chances
 
 
 def _assumed(
@@ -314,25 +316,25 @@ def _judged(d: MachineDifference) -> MachineDifference:
         for side in (d.a, d.b)
         if side.saved is not None and not side.saved.verdict.usable
     ]
-    if not np.any(np.abs(d.found.change) > SAME_NUMBER_DIFFERENCE):
+    if not np.any(np.abs(d.change.change) > SAME_NUMBER_DIFFERENCE):
         headline = "The two are the same: no number differs by more than rounding."
     elif not d.changed:
         headline = (
-            f"No change beyond what chance explains (χ² {number(d.found.chi2, 0)} for"
-            f" {d.found.dof} degrees of freedom){_of_tool(d)}."
+            f"No change beyond what chance explains (χ² {number(d.change.chi2, 0)} for"
+            f" {d.change.dof} degrees of freedom){_of_tool(d)}."
         )
     elif d.a.saved and d.b.saved:
         headline = f"The calibrations differ by more than chance explains{_of_tool(d)}."
-    elif d.found.dof:
+    elif d.change.dof:
         headline = f"Drawing and calibration differ by more than chance explains{_of_tool(d)}."
     else:
         headline = f"The drawings differ{_of_tool(d)}."
     named = [_named(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
-    left = len(d.significant) - len(named)
-    if named and left > 0:
-        named.append(wrong("difference.more", number=left))
+    remainder = len(d.significant) - len(named)
+    if named and remainder > 0:
+        named.append(wrong("difference.more", number=remainder))
     if d.changed and not named:
-        named.append(wrong("difference.together", chi2=d.found.chi2, dof=d.found.dof))
+        named.append(wrong("difference.together", chi2=d.change.chi2, dof=d.change.dof))
     advice: list[Finding] = []
     if d.changed and d.a.saved and d.b.saved:
         if d.shared == int(d.a.saved.used.sum()):
@@ -353,7 +355,7 @@ def _of_tool(d: MachineDifference) -> str:
     if not off.size:
         return ""
     one_sigma = brief(float(np.median(sigma)) * 1e3)
-    by_chance = f"; chance alone makes {one_sigma} mm (1σ)" if d.found.dof else ""
+    by_chance = f"; chance alone makes {one_sigma} mm (1σ)" if d.change.dof else ""
     return (
         f": the tool differs by {brief(float(np.median(off)) * 1e3)} mm over {d.tool.region}"
         f" (median), {brief(float(off.max()) * 1e3)} mm at worst{by_chance}"
@@ -368,8 +370,8 @@ def _named(d: MachineDifference, k: int) -> Finding:
         "difference.parameter",
         name,
         parameter=table.in_words(name),
-        value=float(d.found.change[k]),
-        sigma=float(d.found.sigma[k]),
+        value=float(d.change.change[k]),
+        sigma=float(d.change.sigma[k]),
         change=change_text(d, k),
     )
 
@@ -377,7 +379,7 @@ def _named(d: MachineDifference, k: int) -> Finding:
 def change_text(d: MachineDifference, k: int) -> str:
     """``+0.54 mm (±0.07 mm)``, or the bare number of what has no unit."""
     unit = d.a.machine.parameters.units[k]
-    value, sigma = float(d.found.change[k]), float(d.found.sigma[k])
+    value, sigma = float(d.change.change[k]), float(d.change.sigma[k])
     sign = "+" if value >= 0 else "−"
     if unit in ("m", "rad"):
         text = f"{sign}{amount(abs(value), unit)}"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.calibration.aside import Neighbours, by_region, select
 from pkmcal.calibration.calibrate import Calibration
+from pkmcal.calibration.holdout import Neighbours, by_region, select
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
@@ -65,12 +65,12 @@ def judged_without(
     drawing: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
 ) -> HoldOut:
     """An estimate that did not see a region's configurations, on them and on those that it saw."""
-    measurements = estimate.as_found(measurements)
-    found = predict(estimate.machine, measurements, estimate.state)
-    out = region.rows[found.seen[region.rows]]
-    used = np.setdiff1d(np.flatnonzero(found.seen), out)
+    measurements = estimate.stated_edge_noise(measurements)
+    prediction = predict(estimate.machine, measurements, estimate.state)
+    out = region.rows[prediction.observed[region.rows]]
+    used = np.setdiff1d(np.flatnonzero(prediction.observed), out)
     both = (
-        compare_with_drawing(drawing, estimate.covariance, measurements, found, None, rows)
+        compare_with_drawing(drawing, estimate.covariance, measurements, prediction, None, rows)
         for rows in (out, used)
     )
     return HoldOut(region, estimate, *both)
@@ -80,5 +80,5 @@ def by_regions(
     drawing: Machine, measurements: Measurements, whole: Estimate, n: int
 ) -> tuple[HoldOut, ...]:
     """Each of n regions of the workspace left out once."""
-    found = by_region(drawing, whole, measurements, n)
-    return tuple(hold_out(drawing, measurements, whole, region) for region in found)
+    value = by_region(drawing, whole, measurements, n)
+    return tuple(hold_out(drawing, measurements, whole, region) for region in value)

@@ -14,14 +14,14 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
 
 
-def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
+def calibrated_rows(saved: SavedCalibration, session: Session) -> Booleans:
     """(K,) configurations of a session that the calibration used.
 
     By their photographs; without any (a tracker's), or for a calibration that lists none, by the
@@ -34,8 +34,8 @@ def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
     same = np.any(np.all(session.joints[:, None] == saved.joints[saved.used], axis=2), axis=1)
     return np.array(
         [
-            bool(old & set(new[name])) if name in new else bool(alike)
-            for name, alike in zip(session.configurations, same, strict=True)
+            bool(old & set(new[name])) if name in new else bool(similar)
+            for name, similar in zip(session.configurations, same, strict=True)
         ]
     )
 
@@ -47,10 +47,10 @@ def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
     return owner[len(used) :] < len(used)
 
 
-def check_new(known: Booleans, seen: Booleans, what: str, expected: str, next_step: str) -> None:
+def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next_step: str) -> None:
     """Raise `InputError`, in these words, where nothing that was seen is new to the calibration."""
-    if not np.any(seen & ~known):
-        used = int(np.sum(seen & known))
+    if not np.any(visible & ~valid):
+        used = int(np.sum(visible & valid))
         raise InputError(
             what,
             found=f"{used} configurations, all of them used",
@@ -60,17 +60,21 @@ def check_new(known: Booleans, seen: Booleans, what: str, expected: str, next_st
 
 
 def measured_new_data(
-    saved: SavedCalibration, session: Session, seed: int, told: CalibrationProgress, share: float
+    saved: SavedCalibration,
+    session: Session,
+    seed: int,
+    progress: CalibrationProgress,
+    share: float,
 ) -> Calibration:
     """The session measured, and a first estimate of where everything is; see the module. Its own
     session is without the photographs by hand that were not placed, and stations are numbered so.
 
-    seed : of the search for the stations. told : gets the first ``share`` of the progress.
+    seed : of the search for the stations. progress : gets the first ``share`` of the progress.
     """
     return calibrate_session(
         replace(session, machine=saved.machine, stations=_as_then(saved, session)),
         seed=seed,
-        progress=lambda text, part: told(text, share * part),
+        progress=lambda text, part: progress(text, share * part),
     )
 
 
@@ -92,13 +96,17 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
             if station.handheld
             else iter([station.name])
         )
-        found = then.get(next(names, station.name))
-        known = found is not None and not station.response_told
+        value = then.get(next(names, station.name))
+        reference_values = value is not None and not station.response_given
         camera = station.camera
         own = turned.get(station.camera_file)
         # else the file has been set right since, or is another
         if own is not None and np.allclose(camera.turned_by_half().parameters, own.parameters):
             camera = own
-        told = replace(station, camera=camera)
-        out.append(replace(told, response=found, response_told=True) if known else told)
+        station_then = replace(station, camera=camera)
+        out.append(
+            replace(station_then, response=value, response_given=True)
+            if reference_values
+            else station_then
+        )
     return tuple(out)

@@ -55,19 +55,19 @@ def paths_of(session: Session) -> dict[str, list[int]]:
 
 
 def line_path(
-    name: str, rows: list[int], drawing: Machine, session: Session, found: Prediction
+    name: str, rows: list[int], drawing: Machine, session: Session, prediction: Prediction
 ) -> LinePath:
     """How straight the tool went through the configurations ``rows``, seen and computed."""
-    seen = found.T_base_platform[rows][found.seen[rows]]
+    visible = prediction.T_base_platform[rows][prediction.observed[rows]]
     by: list[Straightness | None] = []
-    for machine in (drawing, found.machine):
+    for machine in (drawing, prediction.machine):
         result = machine.forward_result(session.joints[rows])
         closes = bool(result.converged.all())
         by.append(straightness(result.T_base_platform[:, :3, 3]) if closes else None)
     return LinePath(
         name=name,
         n=len(rows),
-        seen=straightness(seen[:, :3, 3]) if len(seen) >= SHORTEST_PATH else None,
+        seen=straightness(visible[:, :3, 3]) if len(visible) >= SHORTEST_PATH else None,
         drawing=by[0],
         calibrated=by[1],
     )

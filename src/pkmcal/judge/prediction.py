@@ -1,17 +1,17 @@
 """What a machine predicts of readings and tool points that photographs show.
 
 Stations, boards' mounts and the platform's poses are estimated from the photographs, the machine
-is held (:mod:`pkmcal.judge.held`). Where photographs leave open where stations and boards are (a
-board tells a pose in a camera that stands anywhere), readings of *other* configurations tell:
-closures stand in the estimate with the soft deviation :data:`SOFT_READING_NOISE`, which gives way
-to anything seen, and each configuration's own readings are then taken out again exactly, by their
-leverage (leave-one-out).
+is held (:mod:`pkmcal.judge.fixed_machine`). Where photographs leave open where stations and boards
+are (a board tells a pose in a camera that stands anywhere), readings of *other* configurations
+tell: closures stand in the estimate with the soft deviation :data:`SOFT_READING_NOISE`, which gives
+way to anything seen, and each configuration's own readings are then taken out again exactly, by
+their leverage (leave-one-out).
 
 With E the rows of readings and ``P = 1 - Q Q^T - q q^T`` the projector of
-:mod:`pkmcal.judge.held`, Q and q orthonormal bases of what a configuration's own unknowns and the
-shared ones can explain, their residuals are ``E P y``. Of a reading's own error that leaves the
-part ``L``, a configuration's block of ``E P E^T``: residuals of fits without their own readings are
-``L^-1 E P y``, to first order.
+:mod:`pkmcal.judge.fixed_machine`, Q and q orthonormal bases of what a configuration's own unknowns
+and the shared ones can explain, their residuals are ``E P y``. Of a reading's own error that leaves
+the part ``L``, a configuration's block of ``E P E^T``: residuals of fits without their own readings
+are ``L^-1 E P y``, to first order.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.judge.held import Held, hold, too_little
+from pkmcal.judge.fixed_machine import Held, hold, too_little
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine
@@ -38,7 +38,7 @@ from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 SOFT_READING_NOISE = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
 photograph leaves open, so a seen pose hardly knows them."""
-LEAST_RESIDUAL_LEFT = 1e-2
+LEAST_REDUNDANCY_SHARE = 1e-2
 """Part of a reading's residual that its own fit leaves, below which hardly anything but the reading
 told where the platform was: what was seen left ten times SOFT_READING_NOISE open."""
 FRAME_LAYING_STEPS = 20
@@ -69,7 +69,7 @@ class ReadingErrors:
 class Prediction:
     """What a machine predicts of a session; values of configurations that were not seen are NaN.
 
-    machine : as held, with the session's tube radii. seen : (K,) configurations whose pose was
+    machine : as held, with the session's tube radii. observed : (K,) configurations whose pose was
     seen. T_base_platform : (K, 4, 4) seen, without the configuration's own readings. errors : (K,)
     of the readings that are predicted from it, and of the tool point.
     noise : (n, n) covariance of the residuals of the n = K' m seen readings by the photographs'
@@ -77,7 +77,7 @@ class Prediction:
     """
 
     machine: Machine
-    seen: Booleans
+    observed: Booleans
     T_base_platform: Array
     errors: ReadingErrors
     noise: Array
@@ -108,24 +108,24 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     along = picks @ own
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
-    left = np.eye(m) - along - beside @ beside.mT  # L
-    if float(np.linalg.eigvalsh(left).min(initial=1.0)) < LEAST_RESIDUAL_LEFT:
+    residual = np.eye(m) - along - beside @ beside.mT  # L
+    if float(np.linalg.eigvalsh(residual).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
         raise too_little(machine, measurements)
-    alone = np.linalg.inv(left)
+    alone = np.linalg.inv(residual)
     units = _size(held)[..., None] * alone
 
-    found = _without_own(held, linear, reduced, picks.mT @ alone @ picks)
+    value = _without_own(held, linear, reduced, picks.mT @ alone @ picks)
     by = _by_machine(held, own, shared[: n * n_rows]).reshape(n, n_rows, -1)
-    joints = measurements.joints[held.seen]
-    errors = _errors(held.machine, joints, found.T_base_platform[0], found.internal[0])
+    joints = measurements.joints[held.observed]
+    errors = _errors(held.machine, joints, value.T_base_platform[0], value.internal[0])
     return Prediction(
         machine=held.machine,
-        seen=held.seen,
-        T_base_platform=_among_all(found.T_base_platform[0], held.seen),
+        observed=held.observed,
+        T_base_platform=_among_all(value.T_base_platform[0], held.observed),
         errors=ReadingErrors(
-            _among_all(errors.residuals, held.seen),
-            _among_all(errors.position, held.seen),
-            _among_all(errors.orientation, held.seen),
+            _among_all(errors.residuals, held.observed),
+            _among_all(errors.position, held.observed),
+            _among_all(errors.orientation, held.observed),
         ),
         noise=_noise(
             along, beside, units, 1 - (measurements.joint_noise / SOFT_READING_NOISE) ** 2
@@ -164,12 +164,12 @@ def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> 
     out, and N their normal matrix, in which open directions count as exact.
     """
     half = inverse_root(rows_on_shared(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
-    moved = alone @ linear.value[0, ..., None]
-    others = half @ (half.T @ (reduced.rows[0].mT @ moved))
-    own = reduced.q[0].mT @ (moved - linear.by_shared[0] @ others)
+    shifted = alone @ linear.value[0, ..., None]
+    others = half @ (half.T @ (reduced.rows[0].mT @ shifted))
+    own = reduced.q[0].mT @ (shifted - linear.by_shared[0] @ others)
     own = np.linalg.solve(reduced.r[0], own)[..., 0]
     shared = np.zeros((1, held.problem.unknowns.count))
-    return held.problem.moved(held.state, shared, own[None])
+    return held.problem.retract(held.state, shared, own[None])
 
 
 def _by_machine(held: Held, own: Array, shared: Array) -> Array:
@@ -203,10 +203,10 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
 
 def _errors(machine: Machine, joints: Array, poses: Array, internal: Array) -> ReadingErrors:
     """Of a machine on seen poses T_base_platform (n, 4, 4) in its own frames."""
-    found = forward(machine.layout, machine.values, joints, poses, internal)
+    fk = forward(machine.layout, machine.values, joints, poses, internal)
     off = np.full((len(poses), 6), np.nan)
-    ok = found.converged
-    off[ok] = pose_difference(poses[ok], found.T_base_platform[ok])
+    ok = fk.converged
+    off[ok] = pose_difference(poses[ok], fk.T_base_platform[ok])
     return ReadingErrors(
         joints - machine.inverse(poses),
         np.linalg.norm(off[:, 3:], axis=1),
@@ -214,10 +214,10 @@ def _errors(machine: Machine, joints: Array, poses: Array, internal: Array) -> R
     )
 
 
-def _among_all(values: Array, seen: Booleans) -> Array:
+def _among_all(values: Array, visible: Booleans) -> Array:
     """Values (K', ...) of the seen configurations among all, NaN elsewhere."""
-    out = np.full((len(seen), *values.shape[1:]), np.nan)
-    out[seen] = values
+    out = np.full((len(visible), *values.shape[1:]), np.nan)
+    out[visible] = values
     return out
 
 
@@ -231,10 +231,10 @@ def errors_on(machine: Machine, joints: Array, poses: Array) -> ReadingErrors:
     e, f, used = closing_frame_changes(machine, joints, poses)
     own = e @ poses @ inverse(f)
     readings, internal = inverse_result(machine.layout, machine.values, own)
-    found = forward(machine.layout, machine.values, joints, own, internal)
+    fk = forward(machine.layout, machine.values, joints, own, internal)
     off = np.full((len(poses), 6), np.nan)
-    ok = found.converged
-    off[ok] = pose_difference(inverse(e) @ found.T_base_platform[ok] @ f, poses[ok])
+    ok = fk.converged
+    off[ok] = pose_difference(inverse(e) @ fk.T_base_platform[ok] @ f, poses[ok])
     more = np.sqrt(joints.size / max(joints.size - used, 1))
     return ReadingErrors(
         (joints - readings) * more,

@@ -16,16 +16,16 @@ import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import CalibrationProgress
-from pkmcal.calibration.same_machine import read_same_machine
-from pkmcal.calibration.saved import SavedCalibration
+from pkmcal.calibration.machine_identity import read_same_machine
+from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.errors import PkmcalError
 from pkmcal.files import json_value
 from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import check_new, known_rows, measured_new_data, repeated_rows
+from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
-from pkmcal.judge.words import validation_verdict
+from pkmcal.judge.sentences import validation_verdict
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, note
@@ -46,16 +46,16 @@ class Validation:
     """Everything that a validation found.
 
     calibration : as read back. judged : on configurations that it did not see; None where there are
-    none, and only regions were held out. known : (K,) configurations that it had seen. repeated :
-    (K,) those that are new measurements of poses that it used. regions : hold-outs within the
-    session. paths : the straight ones.
+    none, and only regions were held out. calibrated : (K,) configurations that it had seen.
+    repeated : (K,) those that are new measurements of poses that it used. regions : hold-outs
+    within the session. paths : the straight ones.
     """
 
     calibration: SavedCalibration
     session: Session
     verdict: Verdict
     judged: BesideDrawing | None
-    known: Booleans
+    calibrated: Booleans
     repeated: Booleans
     regions: tuple[HoldOut, ...]
     paths: tuple[LinePath, ...]
@@ -66,11 +66,11 @@ class Validation:
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
         names = self.session.configurations
-        found = {
+        results = {
             "pkmcal_validation": VALIDATION_FORMAT,
             "verdict": self.verdict.document(),
             "new_data": self.judged.document(names) if self.judged else None,
-            "known_configurations": [*compress(names, self.known)],
+            "known_configurations": [*compress(names, self.calibrated)],
             "repeated_configurations": [*compress(names, self.repeated)],
             "regions": [item.document(names) for item in self.regions],
             "paths": [asdict(path) for path in self.paths],
@@ -80,7 +80,7 @@ class Validation:
             },
             "timings": self.timings,
         }
-        return json_value(found)
+        return json_value(results)
 
 
 def validate_calibration(
@@ -102,26 +102,26 @@ def validate_calibration(
 
     check_number("validate", "regions", regions)
     check_number("validate", "seed", seed)
-    told = progress or (lambda _text, _share: None)
+    values = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
-        lines, known = paths_of(session), known_rows(saved, session)
+        lines, reference_values = paths_of(session), calibrated_rows(saved, session)
         if not regions:
-            check_new(known, _photographed(session), *NOT_INDEPENDENT)
-        looked = measured_new_data(saved, session, seed, told, 0.8)
-        session = replace(looked.session, machine=session.machine)
-        estimate = looked.estimate
-        data = estimate.as_found(looked.measurements)
+            check_new(reference_values, _photographed(session), *NOT_INDEPENDENT)
+        remeasured = measured_new_data(saved, session, seed, values, 0.8)
+        session = replace(remeasured.session, machine=session.machine)
+        estimate = remeasured.estimate
+        data = estimate.stated_edge_noise(remeasured.measurements)
 
-        told("Predicting the readings", 0.8)
+        values("Predicting the readings", 0.8)
         drawing = drawing_of(saved)
-        found = predict(saved.machine, data, estimate.state)
+        prediction = predict(saved.machine, data, estimate.state)
         if not regions:
-            check_new(known, found.seen, *NOT_INDEPENDENT)
+            check_new(reference_values, prediction.observed, *NOT_INDEPENDENT)
         judged, failed = None, tuple[Finding, ...]()
-        repeated = ~known & repeated_rows(saved, session)
-        new = np.flatnonzero(found.seen & ~known)
+        repeated = ~reference_values & repeated_rows(saved, session)
+        new = np.flatnonzero(prediction.observed & ~reference_values)
         if new.size:
             try:
                 by_drawing = predict(drawing, data, estimate.state)
@@ -129,9 +129,11 @@ def validate_calibration(
                 by_drawing = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
-            judged = compare_with_drawing(drawing, saved.covariance, data, found, by_drawing, new)
+            judged = compare_with_drawing(
+                drawing, saved.covariance, data, prediction, by_drawing, new
+            )
 
-        told("Holding out regions", 0.9)
+        values("Holding out regions", 0.9)
         held_out = by_regions(drawing, data, estimate, regions) if regions else ()
         verdict = validation_verdict(judged, held_out, saved.machine, data, repeated)
         return Validation(
@@ -139,11 +141,11 @@ def validate_calibration(
             session=session,
             verdict=replace(verdict, findings=(*verdict.findings, *failed)),
             judged=judged,
-            known=known,
+            calibrated=reference_values,
             repeated=repeated,
             regions=held_out,
-            paths=tuple(line_path(*line, drawing, session, found) for line in lines.items()),
-            timings={**looked.timings, "all": time.perf_counter() - began},
+            paths=tuple(line_path(*line, drawing, session, prediction) for line in lines.items()),
+            timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
 

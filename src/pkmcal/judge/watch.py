@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.calibration.aside import select
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress
-from pkmcal.calibration.same_machine import read_same_machine
-from pkmcal.calibration.saved import Known, SavedCalibration
+from pkmcal.calibration.holdout import select
+from pkmcal.calibration.machine_identity import read_same_machine
+from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
-from pkmcal.identify.assembly import seen_configurations
+from pkmcal.identify.assembly import observed_configurations
 from pkmcal.judge.causes import magnified
-from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
-from pkmcal.judge.held import Held, Trust, evidence, hold
-from pkmcal.judge.new_data import check_new, known_rows, measured_new_data
-from pkmcal.judge.words import LookedAt, Names, watch_verdict
+from pkmcal.judge.changes import ChangeTests, StationTest, test_for_changes
+from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
+from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
+from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.measurements.rows import Kinds
 from pkmcal.outcome import Verdict
 from pkmcal.ranges import check_number
@@ -50,10 +50,11 @@ class Watch:
     """Everything that a look at a calibrated machine found.
 
     calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
-    configuration's residuals with the machine held, in standard deviations. known : (K,)
-    configurations that the calibration had used, left out. seen : (K,) those that were looked at.
-    noise_scale, pose_scale : factors on the stated noise that were used. same_place : stations that
-    were taken to stand where the calibration had them. moved : those that were said to, and do not.
+    configuration's residuals with the machine held, in standard deviations. calibrated : (K,)
+    configurations that the calibration had used, left out. observed : (K,) those that were looked
+    at. noise_scale, pose_scale : factors on the stated noise that were used. same_place : stations
+    that were taken to stand where the calibration had them. stations_moved : those that were said
+    to, and do not.
     """
 
     calibration: SavedCalibration
@@ -61,12 +62,12 @@ class Watch:
     verdict: Verdict
     judged: ChangeTests
     residuals: Array
-    known: Booleans
-    seen: Booleans
+    calibrated: Booleans
+    observed: Booleans
     noise_scale: float
     pose_scale: float
     same_place: tuple[str, ...] = ()
-    moved: tuple[StationTest, ...] = ()
+    stations_moved: tuple[StationTest, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
 
     __repr__ = short_repr
@@ -79,8 +80,8 @@ class Watch:
                 "pkmcal_watch": WATCH_FORMAT,
                 "verdict": self.verdict.document(),
                 **self.judged.document(self.calibration.machine),
-                "configurations": [*compress(names, self.seen)],
-                "known_configurations": [*compress(names, self.known)],
+                "configurations": [*compress(names, self.observed)],
+                "known_configurations": [*compress(names, self.calibrated)],
                 "noise_scale": self.noise_scale,
                 "pose_scale": self.pose_scale,
                 "same_place": self.same_place,
@@ -92,7 +93,7 @@ class Watch:
                         "shift": s.change.value[3:],
                         "sigma": s.change.sigma,
                     }
-                    for s in self.moved
+                    for s in self.stations_moved
                 ],
                 "timings": self.timings,
             }
@@ -120,35 +121,35 @@ def watch_machine(
 
     check_number("watch", "alpha", alpha)
     check_number("watch", "seed", seed)
-    told = progress or (lambda _text, _share: None)
+    values = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
         session = _placed(saved, session, same_place)
-        known = known_rows(saved, session)
-        check_new(known, np.ones_like(known), *NOTHING_NEW)
-        looked = measured_new_data(saved, session, seed, told, 0.9)
-        session = replace(looked.session, machine=session.machine)
-        seen = seen_configurations(looked.measurements)
-        check_new(known, seen, *NOTHING_NEW)
+        reference_values = calibrated_rows(saved, session)
+        check_new(reference_values, np.ones_like(reference_values), *NOTHING_NEW)
+        remeasured = measured_new_data(saved, session, seed, values, 0.9)
+        session = replace(remeasured.session, machine=session.machine)
+        observed = observed_configurations(remeasured.measurements)
+        check_new(reference_values, observed, *NOTHING_NEW)
 
-        told("Testing for changes", 0.9)
+        values("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
         before = Kinds(*(float(old.get(name, 1.0)) for name in factors))
-        trust = Trust.of(looked.estimate, before, _readings(saved, session))
-        noise = looked.estimate.statistics.noise_scale * trust.scale.edges
-        held = _hold_new(saved, session, looked, trust, ~known)
-        kept = saved.known(same_place, session.station_names)
-        judged, kept, moved = tests_with_kept(held, kept, alpha)
-        around = LookedAt(
+        irls_weight = Trust.of(remeasured.estimate, before, _readings(saved, session))
+        noise = remeasured.estimate.statistics.noise_scale * irls_weight.scale.edges
+        held = _hold_new(saved, session, remeasured, irls_weight, ~reference_values)
+        prior = saved.prior(same_place, session.station_names)
+        judged, prior, shifted = tests_with_fixed_stations(held, prior, alpha)
+        around = ComparedSession(
             session.configurations,
-            known,
-            seen,
+            reference_values,
+            observed,
             noise / before.edges,
             names_of(session),
-            moved,
+            shifted,
         )
         return Watch(
             calibration=saved,
@@ -156,13 +157,13 @@ def watch_machine(
             verdict=watch_verdict(judged, around),
             judged=judged,
             residuals=held.residuals(),
-            known=known,
-            seen=seen & ~known,
+            calibrated=reference_values,
+            observed=observed & ~reference_values,
             noise_scale=noise,
-            pose_scale=trust.scale.poses,
-            same_place=tuple(session.station_names[k] for k in kept.stations),
-            moved=moved,
-            timings={**looked.timings, "all": time.perf_counter() - began},
+            pose_scale=irls_weight.scale.poses,
+            same_place=tuple(session.station_names[k] for k in prior.stations),
+            stations_moved=shifted,
+            timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
 
@@ -172,8 +173,8 @@ def _readings(saved: SavedCalibration, session: Session) -> float:
     """
     joints = (saved.document.get("session") or {}).get("joints") or {}
     statistics = saved.document.get("statistics") or {}
-    alike = joints.get("noise") == session.joint_noise
-    return float(statistics.get("reading_scale", 1.0)) if alike else 1.0
+    same = joints.get("noise") == session.joint_noise
+    return float(statistics.get("reading_scale", 1.0)) if same else 1.0
 
 
 def names_of(session: Session) -> Names:
@@ -196,8 +197,8 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
                 expected=listed(session.station_names, 8),
                 next_step="A camera that was left in place has the same name in both sessions",
             )
-    kept = saved.known(same_place, session.station_names)
-    places = dict(zip(kept.stations, kept.T_camera_base, strict=True))
+    prior = saved.prior(same_place, session.station_names)
+    places = dict(zip(prior.stations, prior.T_camera_base, strict=True))
     stations = tuple(
         replace(station, T_camera_base=places.get(k, station.T_camera_base))
         for k, station in enumerate(session.stations)
@@ -205,40 +206,46 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
     return replace(session, stations=stations)
 
 
-def tests_with_kept(
-    held: Held, kept: Known, alpha: float
-) -> tuple[ChangeTests, Known, tuple[StationTest, ...]]:
+def tests_with_fixed_stations(
+    held: Held, prior: CalibrationPrior, alpha: float
+) -> tuple[ChangeTests, CalibrationPrior, tuple[StationTest, ...]]:
     """All tests, the stations that were kept for them, and those that evidently were moved.
 
     Where moved cameras explain the data better than any change of the machine, these are found anew
     and the tests made once more; so no more unchanged machines are flagged than alpha.
     """
-    moved: list[StationTest] = []
+    shifted: list[StationTest] = []
     while True:
-        judged = look_for_changes(evidence(held, kept), held.machine, alpha)
+        judged = test_for_changes(change_evidence(held, prior), held.machine, alpha)
         if not judged.moved:
-            return judged, kept, tuple(moved)
-        moved += [s for s in judged.stations if s.station in judged.moved]
-        kept = kept.only([s for s in kept.stations if s not in judged.moved])
+            return judged, prior, tuple(shifted)
+        shifted += [s for s in judged.stations if s.station in judged.moved]
+        prior = prior.only([s for s in prior.stations if s not in judged.moved])
 
 
 def _hold_new(
-    saved: SavedCalibration, session: Session, looked: Calibration, trust: Trust, keep: Booleans
+    saved: SavedCalibration,
+    session: Session,
+    remeasured: Calibration,
+    irls_weight: Trust,
+    keep: Booleans,
 ) -> Held:
     """The calibrated machine held on the configurations to keep, (K,)."""
-    data = looked.estimate.as_found(looked.measurements)
+    data = remeasured.estimate.stated_edge_noise(remeasured.measurements)
     cameras = [station.camera for station in session.stations]
-    wide = magnified(data, looked.observation, cameras) if cameras else None
-    kept = Kinds(
-        trust.robust.edges[keep[data.edges.configuration]],
-        trust.robust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
-        trust.robust.links[data.links_among(keep)],
+    wide = magnified(data, remeasured.observation, cameras) if cameras else None
+    retained = Kinds(
+        irls_weight.robust.edges[keep[data.edges.configuration]],
+        irls_weight.robust.poses[
+            keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]
+        ],
+        irls_weight.robust.links[data.links_among(keep)],
     )
     return hold(
         saved.machine,
         select(data, keep),
-        looked.estimate.state,
-        replace(trust, robust=kept),
+        remeasured.estimate.state,
+        replace(irls_weight, robust=retained),
         select(wide, keep) if wide else None,
     )
 

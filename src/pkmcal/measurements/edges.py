@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.geometry.cylinders import SIDE_SIGNS, SeenLines, edge_planes
+from pkmcal.geometry.cylinders import SIDE_SIGNS, LineSilhouettes, edge_planes
 from pkmcal.geometry.rigid import skew
 from pkmcal.measurements.contract import ImageKind
 from pkmcal.measurements.line_cells import LineCells
@@ -169,9 +169,9 @@ class EdgeBlocks:
     leg : (1, G). station, camera, radius : (K, G) station, camera, position of the tube's radius.
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
-    empty where nothing is shaded. tube : (K, G) number of the tube on its leg. crowd : (K, G) how
-    many of its line share an edge's own shading, see :mod:`~pkmcal.measurements.line_cells`, zero
-    where nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
+    empty where nothing is shaded. tube : (K, G) number of the tube on its leg. n_effective : (K, G)
+    how many of its line share an edge's own shading, see :mod:`~pkmcal.measurements.line_cells`,
+    zero where nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
     """
 
     leg: Integers
@@ -181,7 +181,7 @@ class EdgeBlocks:
     side: Integers
     present: Booleans
     tube: Integers
-    crowd: Array
+    n_effective: Array
     cell: Integers
     cells: LineCells
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
@@ -379,7 +379,7 @@ class EdgeRows:
     data: ViewData
     closure: Closure
     T_camera_base: Array
-    lines: SeenLines
+    lines: LineSilhouettes
     frame: Array
     sine: Array
     cosine: Array
@@ -415,7 +415,7 @@ class EdgeRows:
     @cached_property
     def _turns(self) -> Array:
         """Rows by a shift of the whole line towards the camera, (g, ...): as much as by the radius;
-        see :meth:`~pkmcal.geometry.cylinders.SeenLines.edges`.
+        see :meth:`~pkmcal.geometry.cylinders.LineSilhouettes.edges`.
         """
         along_m, along_w = self.by_frame[:, 1], self.by_frame[:, 2]
         turn = along_w + (self.sine / self.cosine) * along_m
@@ -504,7 +504,7 @@ def edge_rows(
     ends = both.take(views.limbs(limbs[2]), axis=-1)
     moves = T_camera_base[..., :3, :].transpose(2, 3, 0, 1).take(views.station, axis=-1)
     ends = np.einsum("ij...,je...->ie...", moves[:, :3], ends) + moves[:, 3, None]
-    lines = SeenLines.between(*ends.transpose(1, 2, 3, 0))
+    lines = LineSilhouettes.between(*ends.transpose(1, 2, 3, 0))
     frame = np.empty((*lines.distance.shape, 3, 3))
     for k, axis in enumerate(lines[:3]):
         frame[..., k, :] = axis

@@ -9,18 +9,18 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
 
-SHADING_ALIKE_ANGLE = np.radians(7.0)
+SHADING_CORRELATION_ANGLE = np.radians(7.0)
 """Angle between the normals of two edges of one side of a tube at one station over which their
-shading ceases to be the same, by exp(-angle / SHADING_ALIKE_ANGLE): what a surface mirrors, and
-where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree by
-half at 5 degrees once what all have in common is taken off."""
+shading ceases to be the same, by exp(-angle / SHADING_CORRELATION_ANGLE): what a surface mirrors,
+and where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree
+by half at 5 degrees once what all have in common is taken off."""
 
-TUBES_ALIKE = 0.4
+TUBE_CORRELATION = 0.4
 """The same between edges of two tubes of a leg on one side: they see the same light, and mirror the
 same, in part. Of path-traced legs of five finishes 0.2 to 0.6."""
 CELLS_AN_ANGLE, CELLS_AN_ANGLE_OF_MANY, MANY_EDGES = 64, 8, 10_000
-"""Cells along SHADING_ALIKE_ANGLE, and where there are so many edges that hardly one would have a
-cell of its own: those of a cell are alike to a hundredth, and to a tenth."""
+"""Cells along SHADING_CORRELATION_ANGLE, and where there are so many edges that hardly one would
+have a cell of its own: those of a cell are alike to a hundredth, and to a tenth."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LineCells:
         """
         mine = line >= 0
         fine = CELLS_AN_ANGLE if len(line) < MANY_EDGES else CELLS_AN_ANGLE_OF_MANY
-        place = np.round(fine * normal / SHADING_ALIKE_ANGLE).astype(int)
+        place = np.round(fine * normal / SHADING_CORRELATION_ANGLE).astype(int)
         keys = np.column_stack([side[line[mine]], line[mine], place[mine]])
         keys, at = np.unique(keys, axis=0, return_inverse=True)
         at = at.reshape(-1)
@@ -58,26 +58,26 @@ class LineCells:
         cell[mine] = at
         return cls(cell, first, keys[:, 1], middle, count)
 
-    def alike(self) -> Iterator[tuple[slice, Array, Array]]:
+    def correlated_groups(self) -> Iterator[tuple[slice, Array, Array]]:
         """Of side after side its cells, and how alike two of them err, (c, c): in their shift by
-        exp(-angle / SHADING_ALIKE_ANGLE), if on two tubes by TUBES_ALIKE of that; in their tilt on
-        one tube alone.
+        exp(-angle / SHADING_CORRELATION_ANGLE), if on two tubes by TUBE_CORRELATION of that; in
+        their tilt on one tube alone.
         """
         for start, end in zip(self.first[:-1], self.first[1:], strict=True):
             own = slice(int(start), int(end))
             angle = np.arccos(np.clip(self.middle[own] @ self.middle[own].T, -1, 1))
             np.fill_diagonal(angle, 0.0)  # which rounding leaves at 1e-8
-            near = np.exp(-angle / SHADING_ALIKE_ANGLE)
+            near = np.exp(-angle / SHADING_CORRELATION_ANGLE)
             same = self.line[own, None] == self.line[own]
-            yield own, near * np.where(same, 1.0, TUBES_ALIKE), np.where(same, near, 0.0)
+            yield own, near * np.where(same, 1.0, TUBE_CORRELATION), np.where(same, near, 0.0)
 
     @property
-    def crowd(self) -> Array:
+    def n_effective(self) -> Array:
         """How many edges of its line share an edge's own shading, itself among them, (N,): the sum
         over them of how alike they err. Of n edges with the same normal each counts as one n-th,
         whatever their number; an edge that is a line of its own is alone.
         """
         many = np.ones(len(self.count) + 1)
-        for own, _, alike in self.alike():
-            many[own] = alike @ self.count[own]
+        for own, _, similar in self.correlated_groups():
+            many[own] = similar @ self.count[own]
         return many[self.cell]

@@ -68,7 +68,7 @@ class PoseSet:
         """The poses that a mask or an index picks."""
         return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
 
-    def moved(self, change: Array) -> PoseSet:
+    def transform(self, change: Array) -> PoseSet:
         """The poses as cameras with other parameters see them; change : (S, n), by station.
 
         To first order: a camera's calibration is good to a thousandth, so what is left out is a

@@ -56,6 +56,6 @@ def among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
     """
     whole: Any = numbers
     cut = (slice(None),) * axis + (configurations,)
-    found = ((f.name, getattr(whole, f.name)) for f in fields(whole))
-    arrays = ((name, x) for name, x in found if isinstance(x, np.ndarray))
+    values = ((f.name, getattr(whole, f.name)) for f in fields(whole))
+    arrays = ((name, x) for name, x in values if isinstance(x, np.ndarray))
     return replace(whole, **{name: x[cut] for name, x in arrays if x.shape[axis] > 1})

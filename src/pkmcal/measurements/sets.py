@@ -100,8 +100,8 @@ class Measurements:
     gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
     they were measured, in BREATHING_SIGMA; empty where none breathes. links : measurements that
     link two configurations, one set for each kind. level : (S,) stations whose z
-    axis is the base's, exactly; empty where there is none. look_variance : by what part of its
-    variance by noise a result varies besides, with where its edges were looked for.
+    axis is the base's, exactly; empty where there is none. imputation_covariance : by what part of
+    its variance by noise a result varies besides, with where its edges were looked for.
     """
 
     edges: EdgeSet
@@ -116,7 +116,7 @@ class Measurements:
     shaded: bool = False
     breathing_at: Array = field(default_factory=lambda: np.zeros(0))
     level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    look_variance: float = 0.0
+    imputation_covariance: float = 0.0
     links: tuple[LinkSet, ...] = ()
 
     __repr__ = short_repr
@@ -193,12 +193,12 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Departure:
+class ModelViolation:
     """Something that a session takes for granted and that may be otherwise.
 
     code : of its finding. of : what departs, by name. facts : of its finding, from the estimates
     and their standard deviations (k,). effect : what it does to what was measured; empty
-    for a single reading, see :class:`pkmcal.identify.score.Departures`.
+    for a single reading, see :class:`pkmcal.identify.score.ScoreTests`.
     """
 
     code: str

@@ -171,11 +171,11 @@ def _model(document: MechanismDocument, name: str) -> DocumentModel:
     """One of a machine's models by its name."""
     if name in document.models:
         return document.models[name]
-    known = sorted(document.models)
+    names = sorted(document.models)
     raise InputError(
         what=f"mechanism {document.name!r} has no model of this name",
         found=name,
-        expected=closest(name, known) or (listed(known) if known else "no model at all"),
+        expected=closest(name, names) or (listed(names) if names else "no model at all"),
         next_step="name a model under models in the mechanism file, with what it fixes and ties",
     )
 

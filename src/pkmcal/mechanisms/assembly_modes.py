@@ -40,7 +40,8 @@ class AssemblyModes:
     """Poses (k, 4, 4) that close the machine, the nearest to home first.
 
     internal : (k, n) the hinges' turns of an articulated platform, rad.
-    found : (k,) how many starts led to each. sign : (k,) 1 where the Jacobian's determinant has
+    mode_numbers : (k,) how many starts led to each. sign : (k,) 1 where the Jacobian's determinant
+    has
         home's sign, -1 where not: such a mode cannot be reached from home without crossing a
         singular pose; with home's sign it may be. 0 where there is no determinant.
     starts, closed : how many starts were tried, and how many of them led to any pose.
@@ -52,7 +53,7 @@ class AssemblyModes:
 
     poses: Array
     internal: Array
-    found: Integers
+    mode_numbers: Integers
     sign: Integers
     starts: int
     closed: int
@@ -76,7 +77,7 @@ def assembly_modes(
     theta : (P,). most : the largest number of starts. Poses whose readings are those of two modes
     that merge, nearer than 1e-6, count as one.
     """
-    modes, found = np.zeros((0, 12 + 2 * layout.n_internal)), np.zeros(0, dtype=int)
+    modes, count = np.zeros((0, 12 + 2 * layout.n_internal)), np.zeros(0, dtype=int)
     starts = closed = 0
     complete = False
     while not complete and starts < most:
@@ -84,18 +85,18 @@ def assembly_modes(
         at = np.broadcast_to(readings, (STARTS_A_BATCH, readings.shape[-1]))
         result = close(layout, theta, at, begin, internal)
         good = _coordinates(result)[result.error < CONVERGED_CLOSURE_ERROR]
-        modes, found = _counted(modes, found, good)
+        modes, count = _counted(modes, count, good)
         starts, closed = starts + STARTS_A_BATCH, closed + len(good)
-        complete = bool(found.size) and bool(found.min() >= RAREST_MODE_FINDS)
+        complete = bool(count.size) and bool(count.min() >= RAREST_MODE_FINDS)
         if not closed and starts >= most // 10:
             break
     poses, internal = _of_coordinates(modes)
     near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
-    poses, internal, found = poses[near], internal[near], found[near]
+    poses, internal, count = poses[near], internal[near], count[near]
     own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
     sign = (own * assembly_sign(layout, theta, home)).astype(int)
     missing = 1 - MISSED_MODE_CHANCE ** (1 / closed) if closed else 1.0
-    return AssemblyModes(poses, internal, found, sign, starts, closed, missing, complete)
+    return AssemblyModes(poses, internal, count, sign, starts, closed, missing, complete)
 
 
 def _starts(
@@ -134,17 +135,17 @@ def _of_coordinates(modes: Array) -> tuple[Array, Array]:
     return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
 
 
-def _counted(modes: Array, found: Integers, more: Array) -> tuple[Array, Integers]:
+def _counted(modes: Array, value: Integers, more: Array) -> tuple[Array, Integers]:
     """Modes (k, c) and their counts (k,) with more coordinates (n, c) that close the machine."""
-    left = more
-    kept, counts = list(modes), list(found)
+    remainder = more
+    retained, counts = list(modes), list(value)
     k = 0
-    while len(left):  # a loop over modes, not over starts
-        if k == len(kept):
-            kept.append(left[0])
+    while len(remainder):  # a loop over modes, not over starts
+        if k == len(retained):
+            retained.append(remainder[0])
             counts.append(0)
-        same: Booleans = np.abs(left - kept[k]).max(axis=-1) < SAME_MODE_DISTANCE
+        same: Booleans = np.abs(remainder - retained[k]).max(axis=-1) < SAME_MODE_DISTANCE
         counts[k] += int(np.count_nonzero(same))
-        left = left[~same]
+        remainder = remainder[~same]
         k += 1
-    return np.array(kept).reshape(len(kept), modes.shape[1]), np.array(counts, dtype=int)
+    return np.array(retained).reshape(len(retained), modes.shape[1]), np.array(counts, dtype=int)

@@ -188,8 +188,8 @@ def scales(layout: LimbLayout, theta: Array) -> Array:
     """The scale of each leg's reading, (..., L), or (L,) where all are exact."""
     if not layout.some_scales_unsure:
         return layout.exact_scale
-    known = theta[..., layout.scale_or_first]
-    return np.where(layout.unsure_scales, known, layout.exact_scale)
+    reference_values = theta[..., layout.scale_or_first]
+    return np.where(layout.unsure_scales, reference_values, layout.exact_scale)
 
 
 def rod_rates(layout: LimbLayout, theta: Array) -> Array:
@@ -325,12 +325,12 @@ class Closure(LimbEnds):
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
-        layout, moved = self.layout, self.base.by_reading
-        by = -dot(self.rows.u, moved) - rod_rates(layout, self.theta)
+        layout, shifted = self.layout, self.base.by_reading
+        by = -dot(self.rows.u, shifted) - rod_rates(layout, self.theta)
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
-        angles = -dot(self.rows.w, moved[..., layout.angles.leg, :])
+        angles = -dot(self.rows.w, shifted[..., layout.angles.leg, :])
         return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property

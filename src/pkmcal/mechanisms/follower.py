@@ -118,14 +118,14 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
 
 def _chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
     """Each leg's elementary joint; None where one has none."""
-    found: dict[int, Chain] = {}
+    results: dict[int, Chain] = {}
     for group in groups:
         chain = group.carrier.chain(group.of(theta))
         if chain is None:
             return None
         for k, leg in enumerate(group.legs.tolist()):
-            found[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
-    return found
+            results[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+    return results
 
 
 class Follower:
@@ -174,15 +174,15 @@ class Follower:
 
     def _search(self, readings: Array) -> None:
         """The pose by the search for any machine, and stand there."""
-        found = forward(self._layout, self._theta, readings, self._pose)
-        if not np.isfinite(readings).all() or not found.converged:
+        fk = forward(self._layout, self._theta, readings, self._pose)
+        if not np.isfinite(readings).all() or not fk.converged:
             raise GeometryError(
                 what="the machine cannot follow: it closes at no pose near the last one",
-                found=f"closure error {float(found.error) * 1e3:.3g} mm",
+                found=f"closure error {float(fk.error) * 1e3:.3g} mm",
                 expected="readings that the machine can reach, near those before them",
                 next_step="check the readings, or begin anew with a start near the pose",
             )
-        self._put(found.T_base_platform)
+        self._put(fk.T_base_platform)
 
     def _followed(self, rods: Rods, readings: Array) -> bool:
         """Newton's steps from the last pose; False, and nothing changed, where they do not close.
@@ -196,9 +196,9 @@ class Follower:
         for _ in range(MOST_FOLLOWER_STEPS):
             b = now[:3].dot(rods.on_body)
             line = b + off
-            left = self._ones.dot(line * line)
-            left -= square
-            error = float(left.dot(left))
+            remainder = self._ones.dot(line * line)
+            remainder -= square
+            error = float(remainder.dot(remainder))
             if not error < before:
                 return False
             if factors is None or (error > REUSED_FACTORS_SHRINK * before and before < np.inf):
@@ -209,7 +209,7 @@ class Follower:
                 self._rest()
                 return True
             before = error
-            twist[self._free] = self._solved(*factors, left)[0]
+            twist[self._free] = self._solved(*factors, remainder)[0]
             now = _moved_back(now, twist)
         return False
 

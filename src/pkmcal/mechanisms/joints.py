@@ -41,14 +41,14 @@ def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
 def _equations(leg: Leg) -> list[Equation]:
     base = base_carriers()[leg.base.joint].axis_role(leg.base)
     platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
-    found: list[Equation] = []
+    results: list[Equation] = []
     if base == "square":
-        found.append("revolute base")
+        results.append("revolute base")
     if platform == "square":
-        found.append("revolute platform")
+        results.append("revolute platform")
     if base == platform == "twist":
-        found.append("torsion")
-    return found
+        results.append("torsion")
+    return results
 
 
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
@@ -93,9 +93,9 @@ class AngleRows(NamedTuple):
 
 def angle_layout(document: MechanismDocument, base: Integers, platform: Integers) -> AngleLayout:
     """The equations of a document; base, platform : (L, 3) axes' positions, -1 for none."""
-    found = equations(document)
-    leg = np.array([j for j, _ in found], dtype=int)
-    kinds = np.array([kind for _, kind in found], dtype=object)
+    values = equations(document)
+    leg = np.array([j for j, _ in values], dtype=int)
+    kinds = np.array([kind for _, kind in values], dtype=object)
     on_base = np.isin(kinds, ["revolute base", "torsion"])
     on_platform = np.isin(kinds, ["revolute platform", "torsion"])
     return AngleLayout(

@@ -137,12 +137,12 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
         done = stuck | (now.worst <= CONVERGED_CLOSURE_ERROR * 1e-2)
         if 4 * np.count_nonzero(done) >= len(done):
             _write(task, now, out)
-            left = np.flatnonzero(~done)
-            if not left.size:
+            remaining = np.flatnonzero(~done)
+            if not remaining.size:
                 return
-            if left.size < len(done):
-                task, now = _picked(task, left), _State(*(picked(x, left) for x in now))
-                damping, done = damping[left], done[left]
+            if remaining.size < len(done):
+                task, now = _picked(task, remaining), _State(*(picked(x, remaining) for x in now))
+                damping, done = damping[remaining], done[remaining]
         step = damped_step(now.jac, now.value, damping)
         trial = _at(task, *_moved(task.layout, now, step))
         better = trial.cost < now.cost
@@ -342,15 +342,15 @@ def forward(
         return whole.reshape(count, *tail)
 
     n = layout.n_internal
-    found = close(
+    fk = close(
         layout,
         theta if theta.ndim == 1 else rows(theta, theta.shape[-1]),
         rows(readings, layout.n_readings),
         rows(start, 4, 4),
         rows(np.zeros(n) if internal is None else internal, n),
     )
-    poses, inner = found.poses.reshape(*shape, 4, 4), found.internal.reshape(*shape, n)
-    error = found.error.reshape(shape)
+    poses, inner = fk.poses.reshape(*shape, 4, 4), fk.internal.reshape(*shape, n)
+    error = fk.error.reshape(shape)
     converged = error < CONVERGED_CLOSURE_ERROR
     if layout.overdetermined:
         poses, inner, error = _at_least(layout, theta, readings, poses, inner)
@@ -389,9 +389,9 @@ def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
     """
     if layout.n_equations < scaled.shape[-1]:  # fewer than its freedoms: it can always move
         return np.zeros(scaled.shape[:-2])
-    known = np.isfinite(scaled).all(axis=(-1, -2))
+    finite = np.isfinite(scaled).all(axis=(-1, -2))
     least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]
-    return np.where(known, least, np.nan)
+    return np.where(finite, least, np.nan)
 
 
 def own_scale(layout: LimbLayout, theta: Array) -> Array:
@@ -464,20 +464,20 @@ def on_manifold(
     every = theta if theta.ndim == 1 else np.broadcast_to(theta, (*shape, theta.shape[-1]))
     every = every if theta.ndim == 1 else every.reshape(-1, theta.shape[-1])
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
-    left, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
+    remaining, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
     for _ in range(steps if free else 0):
-        own = every if every.ndim == 1 else every[left]
-        c = closure_at(layout, own, current[left])
+        own = every if every.ndim == 1 else every[remaining]
+        c = closure_at(layout, own, current[remaining])
         value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
-        lost[left] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[left] + 1)
+        lost[remaining] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[remaining] + 1)
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
-        more &= lost[left] < STEPS_OUT_OF_REACH
-        left = left[more]
-        if not left.size:
+        more &= lost[remaining] < STEPS_OUT_OF_REACH
+        remaining = remaining[more]
+        if not remaining.size:
             break
         step = -np.linalg.pinv(by_pose[more]) @ value[more][..., None]
-        current[left] = perturb(current[left], (layout.motion @ step)[..., 0])
+        current[remaining] = perturb(current[remaining], (layout.motion @ step)[..., 0])
     current = current.reshape(*shape, 4, 4)
     readings, phi = inverse_result(layout, theta, current)
     c = closure(layout, theta, readings, current, phi)
@@ -498,8 +498,8 @@ def undriven(c: Closure) -> tuple[Array, Array]:
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
         drives = c.by_reading[..., None] * layout.of_motor
-        moved = np.concatenate([drives, c.rows.by_internal], axis=-1)
-        moved = np.nan_to_num(moved)
-        q = np.linalg.qr(moved, mode="complete")[0]
-        blind = q[..., moved.shape[-1] :].mT
+        shifted = np.concatenate([drives, c.rows.by_internal], axis=-1)
+        shifted = np.nan_to_num(shifted)
+        q = np.linalg.qr(shifted, mode="complete")[0]
+        blind = q[..., shifted.shape[-1] :].mT
     return (blind @ c.rows.value[..., None])[..., 0], blind

@@ -43,8 +43,8 @@ class CarrierGroup:
         """The group's parameters (..., g, n) out of all, (..., P)."""
         if self.complete:
             return theta[..., self.index]
-        known = theta[..., np.where(self.silent, 0, self.index)]
-        return np.where(self.silent, self.constants, known)
+        reference_values = theta[..., np.where(self.silent, 0, self.index)]
+        return np.where(self.silent, self.constants, reference_values)
 
 
 @dataclass(frozen=True)
@@ -331,11 +331,11 @@ def _groups(
         legs = np.flatnonzero([k is kind for k in kinds])
         names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
         index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
-        told = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
+        indices = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
         constants = np.array(
             [
                 [p.otherwise if v is None else v for p, v in zip(kind.parameters, row, strict=True)]
-                for row in told
+                for row in indices
             ]
         )
         groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))

@@ -138,7 +138,7 @@ class Machine:
         """How far the platform may turn about z to either side, rad, and what is then in the way;
         infinity for a rigid one.
         """
-        return min((g.carrier.most_turn, g.carrier.in_the_way) for g in self.layout.platform)
+        return min((g.carrier.most_turn, g.carrier.obstacle) for g in self.layout.platform)
 
     def with_values(self, values: Array) -> Machine:
         """The same machine with other parameter values (P,)."""
@@ -216,16 +216,16 @@ class Machine:
         self.check_home()
         middle = self.joint_ranges.mean(axis=1)
         starts = kinematics.home_candidates(self.layout, self.values, middle)
-        found = kinematics.forward(self.layout, self.values, middle, starts)
-        good = np.flatnonzero(found.converged)
+        fk = kinematics.forward(self.layout, self.values, middle, starts)
+        good = np.flatnonzero(fk.converged)
         if good.size == 0:
             raise GeometryError(
                 what=f"mechanism {self.name!r} cannot be assembled with its legs at mid-range",
-                found=f"closure error {float(found.error.min()) * 1e3:.3g} mm",
+                found=f"closure error {float(fk.error.min()) * 1e3:.3g} mm",
                 expected="a platform that all legs reach",
                 next_step="check the drawing's centres and ranges, or give home: {position: ...}",
             )
-        return found.T_base_platform[good[0]]
+        return fk.T_base_platform[good[0]]
 
     def inverse(self, T_base_platform: Array, near: Array | None = None) -> Array:
         """Readings (n, m) at platform poses (n, 4, 4), m or rad.
@@ -242,17 +242,17 @@ class Machine:
         start : (4, 4) or (n, 4, 4), near the wanted assembly; the home pose when absent.
         Raises GeometryError where the machine cannot be closed at the readings.
         """
-        found = self.forward_result(joints, start)
-        if not found.converged.all():
-            bad = np.flatnonzero(~np.atleast_1d(found.converged))
+        fk = self.forward_result(joints, start)
+        if not fk.converged.all():
+            bad = np.flatnonzero(~np.atleast_1d(fk.converged))
             raise GeometryError(
                 what=f"forward kinematics found no pose for {bad.size} of "
-                f"{np.size(found.converged)} configurations, first at row {bad[0]}",
-                found=f"closure error {float(np.max(found.error)) * 1e3:.3g} mm",
+                f"{np.size(fk.converged)} configurations, first at row {bad[0]}",
+                found=f"closure error {float(np.max(fk.error)) * 1e3:.3g} mm",
                 expected="readings that the machine can reach",
                 next_step="check the readings, or give a start nearer to the pose",
             )
-        return found.T_base_platform
+        return fk.T_base_platform
 
     def forward_result(self, joints: Array, start: Array | None = None) -> kinematics.ForwardResult:
         """As :meth:`forward`, with convergence and nearness to singularity, nothing raised."""
@@ -402,8 +402,8 @@ class Machine:
         """What carries each leg's end on the base at readings (..., m), for pictures; as
         :func:`~pkmcal.mechanisms.closure.skeletons`.
         """
-        moved = joint_values(self.layout, self.values, joints)
-        return skeletons(self.layout, self.values, moved)
+        shifted = joint_values(self.layout, self.values, joints)
+        return skeletons(self.layout, self.values, shifted)
 
     def _ends(self) -> tuple[Array, Array]:
         ends = limb_ends(self.layout, self.values, self.middle_readings(), np.eye(4))

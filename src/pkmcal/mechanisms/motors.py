@@ -76,9 +76,9 @@ def scale_tolerances(document: MechanismDocument) -> Array:
     """Standard deviation of each leg's reading's scale, (L,): the file's for all, or what the
     reading's unit says; 0 where it is exact, and for a leg without a reading.
     """
-    told, columns = document.tolerance.scale, motor_columns(document)
+    tolerance, columns = document.tolerance.scale, motor_columns(document)
     usual = [LEAD_TOLERANCE if unit == "m" else EXACT_TURNS for unit in motor_units(document)]
-    by_motor = np.append(usual if told is None else np.full(len(usual), told), 0.0)
+    by_motor = np.append(usual if tolerance is None else np.full(len(usual), tolerance), 0.0)
     return by_motor[columns]
 
 
@@ -91,8 +91,8 @@ def bodies(document: MechanismDocument) -> Integers:
         (field, getattr(leg.platform, field)) if field else None
         for field, leg in zip(fields, document.legs, strict=True)
     ]
-    known = sorted({body for body in own if body is not None})
-    return np.array([-1 if body is None else known.index(body) for body in own], dtype=int)
+    names = sorted({body for body in own if body is not None})
+    return np.array([-1 if body is None else names.index(body) for body in own], dtype=int)
 
 
 def middles(document: MechanismDocument) -> Array:

@@ -136,8 +136,8 @@ class ParameterTable:
         elif len({name for m in members for name, _ in m}) < sum(len(m) for m in members):
             what = "a parameter is tied to itself"
         if what:
-            found = ", ".join(group)
-            raise InputError(what, found=found, expected="entries of one kind, each once")
+            value = ", ".join(group)
+            raise InputError(what, found=value, expected="entries of one kind, each once")
         if True in axes:
             self._check_parallel(group, members)
         return [list(tie) for tie in zip(*members, strict=True)]
@@ -242,14 +242,14 @@ class ParameterTable:
 
     def free_names(self) -> tuple[str, ...]:
         """A name for each free unknown; an axis' turns are numbered."""
-        names, seen = list[str](), dict[str, int]()
+        names, names_so_far = list[str](), dict[str, int]()
         for k in self.first_of_free():
             name = self.names[k]
             if self.kinds[k] == "axis":
                 whole = self.names[self.axes[np.any(self.axes == k, axis=1)][0, 0]]
                 whole = whole.rpartition(".")[0]
-                seen[whole] = seen.get(whole, 0) + 1
-                name = f"{whole} ({seen[whole]})"
+                names_so_far[whole] = names_so_far.get(whole, 0) + 1
+                name = f"{whole} ({names_so_far[whole]})"
             names.append(name)
         return tuple(names)
 

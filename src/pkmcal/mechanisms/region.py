@@ -16,7 +16,7 @@ from pkmcal.mechanisms.workspace import (
     Limits,
     extents,
     reachable,
-    straight_way_spans,
+    straight_path_spans,
 )
 
 RegionSide = tuple[float, float]
@@ -24,7 +24,7 @@ REGION_AXES = ("x", "y", "z")
 TRIES_A_WANTED_POSE = 200
 """Poses tried for each one wanted, at most: where the machine can take fewer than one in so many,
 fewer are found."""
-CROOKED_WAY_SHARE = 0.02
+CROOKED_PATH_SHARE = 0.02
 """Of the longest way: less is no way of its own, but what crooked axes let a platform do."""
 AT_LEAST = 5000
 """Poses tried before a region counts as out of reach."""
@@ -116,9 +116,9 @@ def within_reach(limits: Limits, region: Region) -> Within:
     low = high = limits.home[:3, 3]
     moves = 0
     if len(free):
-        near, far = straight_way_spans(limits, limits.home, free, ROUGH_EFFORT)
+        near, far = straight_path_spans(limits, limits.home, free, ROUGH_EFFORT)
         low, high = low + near @ free, high + far @ free
-        moves = int(np.count_nonzero(far - near > CROOKED_WAY_SHARE * (far - near).max()))
+        moves = int(np.count_nonzero(far - near > CROOKED_PATH_SHARE * (far - near).max()))
     for k, (name, side) in enumerate(zip(REGION_AXES, region.sides, strict=True)):
         if side is not None and (
             side[1] < low[k] - ALLOWED_CONSTRAINT_ERROR
@@ -146,19 +146,19 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     Raises InputError where the machine can take none of them.
     """
     within = within_reach(limits, region)
-    kept: list[Array] = []
-    found = tried = 0
+    retained: list[Array] = []
+    value = tried = 0
     most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
-    while found < count and tried < most:
+    while value < count and tried < most:
         more = min(max(count, tried), REGION_POSES_AT_ONCE)
         poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
         closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
         poses = poses[reachable(limits, poses).inside]
-        kept.append(poses)
-        found, tried = found + len(poses), tried + more
-    if not found:
+        retained.append(poses)
+        value, tried = value + len(poses), tried + more
+    if not value:
         home = ", ".join(f"{x:.0f}" for x in np.round(1e3 * limits.home[:3, 3]) + 0.0)
         raise InputError(
             what="the machine can take no pose of the workspace that was asked for",
@@ -166,7 +166,7 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
             expected=f"a part of the machine's own, which is about home, [{home}] mm",
             next_step="widen the workspace, or check the ranges in the mechanism file",
         )
-    return np.concatenate(kept)[:count]
+    return np.concatenate(retained)[:count]
 
 
 def _turn(limits: Limits) -> float:

@@ -95,9 +95,9 @@ def _pseudo_inverse(jac: Array) -> Array:
     """Pseudo-inverse (..., d, E) of scaled rows (..., E, d); NaN where they lose a freedom."""
     if jac.shape[-2] < jac.shape[-1]:
         return np.full((*jac.shape[:-2], jac.shape[-1], jac.shape[-2]), np.nan)
-    known = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
-    u, s, vt = np.linalg.svd(np.where(known[..., None, None], jac, 0.0), full_matrices=False)
-    usable = known[..., None] & (s[..., -1:] > LEAST_GAIN_FOR_RATES)
+    finite = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
+    u, s, vt = np.linalg.svd(np.where(finite[..., None, None], jac, 0.0), full_matrices=False)
+    usable = finite[..., None] & (s[..., -1:] > LEAST_GAIN_FOR_RATES)
     weights = np.where(usable, 1 / np.where(usable, s, 1.0), np.nan)
     return vt.mT @ (weights[..., None] * u.mT)
 
@@ -165,9 +165,9 @@ def amplification(
 
 def _singular_values(jac: Array) -> Array:
     """Singular values (..., k), falling; NaN where the matrix is not known."""
-    known = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
-    values = np.linalg.svd(np.where(known[..., None, None], jac, 0.0), compute_uv=False)
-    return np.where(known[..., None], values, np.nan)
+    finite = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
+    values = np.linalg.svd(np.where(finite[..., None, None], jac, 0.0), compute_uv=False)
+    return np.where(finite[..., None], values, np.nan)
 
 
 def sign_of(scaled: Array) -> Array:
@@ -177,9 +177,9 @@ def sign_of(scaled: Array) -> Array:
     """
     if scaled.shape[-1] != scaled.shape[-2]:
         return np.zeros(scaled.shape[:-2])
-    known = np.asarray(np.isfinite(scaled).all(axis=(-1, -2)))
-    square = np.where(known[..., None, None], scaled, np.eye(scaled.shape[-1]))
-    return np.where(known, np.sign(np.linalg.det(square)), 0.0)
+    finite = np.asarray(np.isfinite(scaled).all(axis=(-1, -2)))
+    square = np.where(finite[..., None, None], scaled, np.eye(scaled.shape[-1]))
+    return np.where(finite, np.sign(np.linalg.det(square)), 0.0)
 
 
 def same_assembly(layout: LimbLayout, theta: Array, poses: Array, reference: Array) -> Booleans:

@@ -133,11 +133,11 @@ def reachable(limits: Limits, poses: Array) -> Reach:
     """What stands against poses T_base_platform (..., 4, 4)."""
     with np.errstate(divide="ignore", invalid="ignore"):  # a platform's joint on a base joint
         c = closure_at(limits.layout, limits.theta, poses)
-        left = undriven(c)[0]
+        remainder = undriven(c)[0]
     readings, scaled = c.readings, scaled_rows(c)
     singularity = singularity_of(limits.layout, scaled)
     lost = np.isnan(readings)
-    off = np.where(lost.any(axis=-1), 0.0, np.abs(left).max(axis=-1, initial=0.0))
+    off = np.where(lost.any(axis=-1), 0.0, np.abs(remainder).max(axis=-1, initial=0.0))
     sign, least = limits.at_home
     own = sign_of(scaled)
     return Reach(
@@ -159,8 +159,8 @@ def _elsewhere(limits: Limits, poses: Array) -> Booleans:
     held = ~limits.layout.free
     if not held.any():
         return np.zeros(poses.shape[:-2], dtype=bool)
-    moved = np.abs(pose_difference(poses, limits.home)[..., held])
-    return np.asarray(moved.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
+    shifted = np.abs(pose_difference(poses, limits.home)[..., held])
+    return np.asarray(shifted.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ class Effort:
 FINE_EFFORT = Effort()
 ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
 """For a box about the workspace."""
-WAY_POSES_AHEAD = 8
+PATH_POSES_AHEAD = 8
 """Poses of each way at a time."""
-KEPT_WAY_SHARE = 0.99
+PATH_DISTANCE_SHARE = 0.99
 """Share of the way asked for that must be left when constant rods and axes had their say."""
 GRID_POSES_AT_ONCE = 20_000
 """Poses of a grid at a time."""
@@ -243,21 +243,21 @@ def extents(
         )
     twists = _twists(directions)
     farthest = _farthest(limits, twists) if most is None else np.full(len(twists), most)
-    way = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
-    still = np.zeros(way.shape, dtype=bool)
-    ahead: Integers = np.arange(len(way))
+    direction = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
+    still = np.zeros(direction.shape, dtype=bool)
+    ahead: Integers = np.arange(len(direction))
     for first in range(
-        0, effort.steps + 1, WAY_POSES_AHEAD
+        0, effort.steps + 1, PATH_POSES_AHEAD
     ):  # what comes after the end is not looked at
-        at = slice(first, first + WAY_POSES_AHEAD)
-        inside = _along(limits, start, twists[ahead, None], way[ahead, at], effort)[1].inside
+        at = slice(first, first + PATH_POSES_AHEAD)
+        inside = _along(limits, start, twists[ahead, None], direction[ahead, at], effort)[1].inside
         still[ahead, at] = np.logical_and.accumulate(inside, axis=1)
         ahead = ahead[inside.all(axis=1)]
         if not ahead.size:
             break
     last = still.sum(axis=1) - 1
     rows = np.arange(len(twists))
-    low, high = way[rows, last], way[rows, np.minimum(last + 1, effort.steps)]
+    low, high = direction[rows, last], direction[rows, np.minimum(last + 1, effort.steps)]
     for _ in range(effort.halvings):
         middle = (low + high) / 2
         good = _along(limits, start, twists, middle, effort)[1].inside
@@ -295,17 +295,17 @@ def _twists(directions: Array) -> Array:
 
 
 def _along(
-    limits: Limits, start: Array, twists: Array, way: Array, effort: Effort
+    limits: Limits, start: Array, twists: Array, direction: Array, effort: Effort
 ) -> tuple[Array, Reach]:
     """Poses (..., 4, 4) after ways (...,) along twists (..., 6), and what stands against them."""
-    poses = perturb(start, twists * way[..., None])
+    poses = perturb(start, twists * direction[..., None])
     if limits.layout.row_motor.min(initial=0) < 0 or limits.layout.shares_motors:
-        poses = _settled(limits, start, twists, way, poses, effort)
+        poses = _settled(limits, start, twists, direction, poses, effort)
     return poses, reachable(limits, poses)
 
 
 def _settled(
-    limits: Limits, start: Array, twists: Array, way: Array, poses: Array, effort: Effort
+    limits: Limits, start: Array, twists: Array, direction: Array, poses: Array, effort: Effort
 ) -> Array:
     """Poses (..., 4, 4) put where rods and axes allow them, as far along the twists as they were.
 
@@ -315,14 +315,14 @@ def _settled(
     size = np.sum(twists * twists, axis=-1)
     settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
     for _ in range(effort.rounds):
-        behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-        if np.all(np.abs(behind) <= (1 - KEPT_WAY_SHARE) * 1e-2 * way):
+        behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * direction):
             break
         ahead = perturb(settled, twists * behind[..., None])
         settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
-    behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-    kept = np.abs(behind) <= (1 - KEPT_WAY_SHARE) * way
-    return np.where(kept[..., None, None], settled, poses)
+    behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+    retained_rows = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * direction
+    return np.where(retained_rows[..., None, None], settled, poses)
 
 
 def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
@@ -335,7 +335,7 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
     one of the directions without turning.
     """
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    low, high = straight_way_spans(limits, middle, unit)
+    low, high = straight_path_spans(limits, middle, unit)
     _refuse_flat(limits, unit, high - low)
     cell = float((high - low).max()) / count
     # the middle pose is one of the points
@@ -353,7 +353,7 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
     return Grid(axes, connected, singular.reshape(shape), size)
 
 
-def straight_way_spans(
+def straight_path_spans(
     limits: Limits, middle: Array, unit: Array, effort: Effort = FINE_EFFORT
 ) -> tuple[Array, Array]:
     """How far down and up (k,) along unit vectors (k, 3) straight ways from ``middle`` (4, 4) come,
@@ -382,8 +382,8 @@ def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Bool
     inside, singular = np.zeros(len(positions), dtype=bool), np.zeros(len(positions))
     for first in range(0, len(positions), GRID_POSES_AT_ONCE):
         rows = slice(first, first + GRID_POSES_AT_ONCE)
-        found = reachable(limits, pose(middle[:3, :3], positions[rows]))
-        inside[rows], singular[rows] = found.inside, found.singularity
+        reach = reachable(limits, pose(middle[:3, :3], positions[rows]))
+        inside[rows], singular[rows] = reach.inside, reach.singularity
     return inside, singular
 
 
@@ -454,18 +454,18 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
             expected="(n, 4, 4)",
         )
     places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * LOOKS_A_PATH_STEP + 1)
-    found = reachable(limits, _at(poses, places))
-    leaves, why = _leaving(limits, poses, places, found)
-    nearest = np.where(np.isfinite(found.singularity), found.singularity, np.inf)
+    reach = reachable(limits, _at(poses, places))
+    leaves, why = _leaving(limits, poses, places, reach)
+    nearest = np.where(np.isfinite(reach.singularity), reach.singularity, np.inf)
     k = int(np.argmin(nearest))
     own = slice(None, None, LOOKS_A_PATH_STEP)
     return PathCheck(
-        inside=found.inside[own],
+        inside=reach.inside[own],
         leaves=leaves,
         why=why,
-        crossings=_crossings(limits, poses, places, found),
+        crossings=_crossings(limits, poses, places, reach),
         closest=(float(places[k]), float(nearest[k])),
-        readings=found.readings[own],
+        readings=reach.readings[own],
     )
 
 
@@ -477,14 +477,14 @@ def _at(poses: Array, places: Array) -> Array:
 
 
 def _leaving(
-    limits: Limits, poses: Array, places: Array, found: Reach
+    limits: Limits, poses: Array, places: Array, reach: Reach
 ) -> tuple[float | None, tuple[str, ...]]:
     """The first place outside and the reason there."""
-    outside = np.flatnonzero(~found.inside)
+    outside = np.flatnonzero(~reach.inside)
     if not outside.size:
         return None, ()
     if outside[0] == 0:
-        return 0.0, found.why(0)
+        return 0.0, reach.why(0)
     low, high = places[outside[0] - 1], places[outside[0]]
     for _ in range(FINE_EFFORT.halvings):
         middle = (low + high) / 2
@@ -493,14 +493,14 @@ def _leaving(
     return float(high), reachable(limits, _at(poses, np.array([high]))).why(0)
 
 
-def _crossings(limits: Limits, poses: Array, places: Array, found: Reach) -> tuple[float, ...]:
+def _crossings(limits: Limits, poses: Array, places: Array, reach: Reach) -> tuple[float, ...]:
     """Places where the determinant changes its sign between two poses in reach."""
-    reached = np.asarray(~found.lost.any(axis=-1))
-    changes = np.diff(found.crossed.astype(int)) != 0
+    reached = np.asarray(~reach.lost.any(axis=-1))
+    changes = np.diff(reach.crossed.astype(int)) != 0
     at = np.flatnonzero(changes & reached[1:] & reached[:-1])
     low, high = places[at], places[at + 1]
     for _ in range(FINE_EFFORT.halvings if at.size else 0):
         middle = (low + high) / 2
-        same = reachable(limits, _at(poses, middle)).crossed == found.crossed[at]
+        same = reachable(limits, _at(poses, middle)).crossed == reach.crossed[at]
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return tuple(float(x) for x in high)

@@ -1,9 +1,9 @@
 """Photographs from disk to grey-level arrays; files that are not what they should be are named.
 
 Six thousand photographs do not fit into memory, and an ordinary session's should not be decoded at
-every look: so the first that fit into KEPT_PHOTOGRAPH_BYTES bytes are kept, and the others decoded
+every look: so the first that fit into CACHED_IMAGE_BYTES bytes are kept, and the others decoded
 when they are looked at and forgotten again. What looks at many does so in windows
-(`pkmcal.observe.photographs`).
+(`pkmcal.observe.image_batches`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import MOST_PIXELS, check_count, check_regular, read_exif, stated_size
-from pkmcal.observe.complaints import decoded_and_fault
+from pkmcal.observe.codec_stderr import decoded_and_fault
 
-KEPT_PHOTOGRAPH_BYTES = 128 * 2**20
+CACHED_IMAGE_BYTES = 128 * 2**20
 """Bytes of decoded photographs that are kept: 160 of 1024x768, 10 of a telephone's."""
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
@@ -79,8 +79,8 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         clockwise = {6: True, 8: False}.get(read_exif(data).orientation)
         if clockwise is None:
             clockwise = image.shape[1] > image.shape[0]
-        way = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
-        return np.ascontiguousarray(cv2.rotate(image, way), np.uint8)
+        direction = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
+        return np.ascontiguousarray(cv2.rotate(image, direction), np.uint8)
     if (image.shape[1], image.shape[0]) != tuple(image_size):
         raise _other_size(label, (image.shape[1], image.shape[0]), image_size)
     return image.astype(np.uint8, copy=False)  # as it was decoded
@@ -121,11 +121,11 @@ def _check_png(data: bytes, label: str) -> None:
     raise _broken(label, "a PNG file that ends early")
 
 
-def _other_size(label: str, found: tuple[int, int], image_size: tuple[int, int]) -> InputError:
+def _other_size(label: str, value: tuple[int, int], image_size: tuple[int, int]) -> InputError:
     return InputError(
         "the photograph has another size than its camera",
         where=label,
-        found=f"{found[0]}x{found[1]} pixels",
+        found=f"{value[0]}x{value[1]} pixels",
         expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
         next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
     )
@@ -143,11 +143,11 @@ def _jpeg_reaches_its_end(data: bytes) -> bool:
     return at + 4 <= len(data)  # no JPEG as we know it: the decoder judges
 
 
-def _broken(label: str, found: str) -> InputError:
+def _broken(label: str, text: str) -> InputError:
     return InputError(
         "the photograph cannot be decoded",
         where=label,
-        found=found,
+        found=text,
         expected="a whole PNG or JPEG file",
         next_step="Copy it again from the camera, or remove it: an absent photograph is allowed",
     )
@@ -159,7 +159,7 @@ class LazyPictures(Sequence[Integers], ABC):
     """
 
     @abstractmethod
-    def look(self, number: int) -> Integers:
+    def image_of(self, number: int) -> Integers:
         """One of them."""
 
     @overload
@@ -169,7 +169,7 @@ class LazyPictures(Sequence[Integers], ABC):
     def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
         """One photograph; of a slice, those that it picks."""
         numbers = range(len(self))[index]
-        return self.look(numbers) if isinstance(numbers, int) else Selected(self, numbers)
+        return self.image_of(numbers) if isinstance(numbers, int) else Selected(self, numbers)
 
 
 class Selected(LazyPictures):
@@ -181,7 +181,7 @@ class Selected(LazyPictures):
     def __len__(self) -> int:
         return len(self._numbers)
 
-    def look(self, number: int) -> Integers:
+    def image_of(self, number: int) -> Integers:
         """One of them."""
         return self._images[self._numbers[number]]
 
@@ -189,7 +189,7 @@ class Selected(LazyPictures):
 class Pictures(LazyPictures):
     """Photographs of one camera, each decoded when it is looked at.
 
-    paths, labels : of all of them. kept : those that stay decoded, by their number.
+    paths, labels : of all of them. cache : those that stay decoded, by their number.
     """
 
     def __init__(
@@ -197,10 +197,10 @@ class Pictures(LazyPictures):
         paths: Sequence[Path],
         image_size: tuple[int, int],
         labels: Sequence[str],
-        kept: dict[int, Integers] | None = None,
+        cache: dict[int, Integers] | None = None,
     ) -> None:
         self._paths, self._labels, self._size = tuple(paths), tuple(labels), image_size
-        self._kept = {} if kept is None else kept
+        self._cache = {} if cache is None else cache
 
     @classmethod
     def read(
@@ -211,22 +211,22 @@ class Pictures(LazyPictures):
         """
         out = cls(paths, image_size, labels)
 
-        def look(number: int) -> Integers | None:
+        def measure(number: int) -> Integers | None:
             image = out[number]  # a fault is told here, before any work
             return image if number < most else None
 
         with ThreadPoolExecutor(THREADS) as pool:
-            found = list(pool.map(look, range(len(out))))
-        out._kept = {number: image for number, image in enumerate(found) if image is not None}
+            results = list(pool.map(measure, range(len(out))))
+        out._cache = {number: image for number, image in enumerate(results) if image is not None}
         return out
 
     def __len__(self) -> int:
         return len(self._paths)
 
-    def look(self, number: int) -> Integers:
+    def image_of(self, number: int) -> Integers:
         """One of them. Raises InputError as :func:`decode`."""
-        if number in self._kept:
-            return self._kept[number]
+        if number in self._cache:
+            return self._cache[number]
         return decode(self._paths[number], self._size, self._labels[number])
 
 

@@ -8,8 +8,8 @@ edges are strongest. A highlight imitates one edge; four at the right distances 
 Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
 across it (:mod:`pkmcal.observe.profiles`).
 
-Both take the photographs through in windows (:mod:`pkmcal.observe.photographs`): what is worked out
-of one is forgotten with it, and a few hundred numbers of its edges remain.
+Both take the photographs through in windows (:mod:`pkmcal.observe.image_batches`): what is worked
+out of one is forgotten with it, and a few hundred numbers of its edges remain.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
-from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed, windows
+from pkmcal.observe.grey_levels import levels_at
+from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -100,7 +100,7 @@ _TOO_LITTLE = "too little of it is seen as a clear edge"
 _NOT_ONE_EDGE = "its places do not lie on one edge"
 
 
-PhotographsLookedAt = Callable[[int], None]
+ImageBatchesInUse = Callable[[int], None]
 """Called with how many photographs more were looked at."""
 
 
@@ -134,9 +134,9 @@ class LegPlaces:
     share: Array
     clear: Booleans
 
-    def outward(self, points: EdgePoints, seen: Booleans, tubes: TubeList) -> Array:
+    def outward(self, points: EdgePoints, visible: Booleans, tubes: TubeList) -> Array:
         """Outward positions (K, E, n) px of all edges' points that these places mean."""
-        along = place_on_leg(points.along, seen, tubes)
+        along = place_on_leg(points.along, visible, tubes)
         shift, tilt = (v[:, tubes.leg][..., None] for v in (self.shift, self.tilt))
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
 
@@ -155,11 +155,11 @@ def search_legs(
     steps = np.arange(-reach, reach + 0.5)
     offsets = np.arange(steps[0] - SEARCH_TILTS[-1], steps[-1] + SEARCH_TILTS[-1] + 0.5)
     strength = np.zeros((*clear.shape, len(offsets)), np.float32)
-    for k, (image, seen) in enumerate(zip(images, clear, strict=True)):
-        if not seen.any():  # no leg is in the picture
+    for k, (image, visible) in enumerate(zip(images, clear, strict=True)):
+        if not visible.any():  # no leg is in the picture
             continue
-        at = points.pixel[k][seen], points.outward[k][seen]
-        strength[k][seen] = gradient_strength(image, *at, offsets)
+        at = points.pixel[k][visible], points.outward[k][visible]
+        strength[k][visible] = gradient_strength(image, *at, offsets)
     place = place_on_leg(points.along, clear, tubes)
     scores = _by_tilt(strength, place, SEARCH_TILTS, len(steps), tubes)
     legs = range(tubes.leg.max() + 1)
@@ -228,9 +228,9 @@ def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
     for reduce, beyond in ((np.minimum, np.inf), (np.maximum, -np.inf)):
         of_edge = reduce.reduce(np.where(clear, along, beyond), axis=2)
         ends.append(reduce.reduceat(of_edge, first_edge, axis=1))
-    seen = ends[0] <= ends[1]
-    low, high = (np.where(seen, end, 0.0) for end in ends)
-    middle, half = (high + low) / 2, np.where(seen, np.maximum((high - low) / 2, 1e-3), np.inf)
+    in_view = ends[0] <= ends[1]
+    low, high = (np.where(in_view, end, 0.0) for end in ends)
+    middle, half = (high + low) / 2, np.where(in_view, np.maximum((high - low) / 2, 1e-3), np.inf)
     which = np.searchsorted(legs, tubes.leg)
     middle, half = (v[:, which, None] for v in (middle, half))
     return np.clip(np.nan_to_num((along - middle) / half), -1, 1)
@@ -253,7 +253,7 @@ class StationEdges:
     """What one look gave, at one station or, before it is taken apart, at several.
 
     points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports.
-    blur : px, of the pictures' edges; nan where not estimated. moved : median distance (px) of
+    blur : px, of the pictures' edges; nan where not estimated. shift : median distance (px) of
     the edges from where they were predicted.
     """
 
@@ -262,7 +262,7 @@ class StationEdges:
     points: Array
     point_edge: Integers
     blur: float
-    moved: float
+    shift: float
 
     def of_station(self, station: int) -> StationEdges:
         """What of a look at several is a station's; blur and moved as they are."""
@@ -303,16 +303,16 @@ def search_stations(
     placed: Sequence[Placed],
     machine: Machine,
     reach: float = LEG_SEARCH_REACH,
-    done: PhotographsLookedAt | None = None,
+    done: ImageBatchesInUse | None = None,
 ) -> list[StationEdges]:
     """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel."""
-    looks: list[StationEdges] = []
+    passes: list[StationEdges] = []
     for window in windows(placed):
-        looks.append(_searched(window, machine, reach))
+        passes.append(_searched(window, machine, reach))
         if done is not None:
             done(len(window.images))
         del window  # before the next one is decoded
-    every = joined_looks(looks, float("nan"), reach)
+    every = joined_passes(passes, float("nan"), reach)
     return [every.of_station(one.photographs.station) for one in placed]
 
 
@@ -320,9 +320,9 @@ def _searched(window: PhotographWindow, machine: Machine, reach: float) -> Stati
     """One window's part of :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear, reach)
-    found = clear & places.clear[:, tubes.leg][..., None]
+    valid = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
-    fits = fit_edges(points, position, np.full(position.shape, SEARCH_SIGMA), found)
+    fits = fit_edges(points, position, np.full(position.shape, SEARCH_SIGMA), valid)
     keep = fits.good & places.clear[:, tubes.leg]
     edges = edge_set(points, fits, tubes, window.station, window.configuration, keep)
     rejected = [
@@ -344,9 +344,9 @@ def measure(
     refine_camera: bool = False,
 ) -> StationEdges:
     """:func:`measure_stations` of one station's photographs; poses : T_base_platform (K, 4, 4)."""
-    told = {} if blur is None else {photographs.station: blur}
+    blur_by_station = {} if blur is None else {photographs.station: blur}
     placed = Placed(photographs, T_camera_base, poses)
-    return measure_stations([placed], machine, told, refine_camera)[0]
+    return measure_stations([placed], machine, blur_by_station, refine_camera)[0]
 
 
 def measure_stations(
@@ -354,7 +354,7 @@ def measure_stations(
     machine: Machine,
     blur: BlurByStation,
     refine_camera: bool = False,
-    done: PhotographsLookedAt | None = None,
+    done: ImageBatchesInUse | None = None,
 ) -> list[StationEdges]:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
@@ -362,33 +362,33 @@ def measure_stations(
     its photographs as are looked at together, spread over all. refine_camera : also how the edges
     depend on the camera's parameters.
     """
-    known = dict(blur)
+    numbers = dict(blur)
     for one in placed:
         p = one.photographs
-        if p.station not in known and len(p.images) > p.window:
+        if p.station not in numbers and len(p.images) > p.window:
             few = next(windows([one.select(p.spread(p.window))]))
-            known |= _blur_in(_seen(few, machine).across, [p.station])
+            numbers |= _blur_in(_predicted_edges(few, machine).across, [p.station])
             del few
-    looks: list[StationEdges] = []
-    moved: list[Array] = [np.zeros(0)]
+    passes: list[StationEdges] = []
+    shifted: list[Array] = [np.zeros(0)]
     for window in windows(placed):
-        seen = _seen(window, machine)
-        untold = [k for k in np.unique(window.station).tolist() if k not in known]
-        known |= _blur_in(seen.across, untold)
-        look, away = _measured(window, seen, known, refine_camera)
-        looks.append(look.unbinned(window.binning))
-        moved.append(away)
+        prediction = _predicted_edges(window, machine)
+        untold = [k for k in np.unique(window.station).tolist() if k not in numbers]
+        numbers |= _blur_in(prediction.across, untold)
+        station_edges, away = _measured(window, prediction, numbers, refine_camera)
+        passes.append(station_edges.unbinned(window.binning))
+        shifted.append(away)
         if done is not None:
             done(len(window.images))
-        del seen, window  # before the next one is decoded
-    every = joined_looks(looks, float("nan"), float("nan"))
-    away, at = np.concatenate(moved), every.edges.station[every.point_edge]
+        del prediction, window  # before the next one is decoded
+    every = joined_passes(passes, float("nan"), float("nan"))
+    away, at = np.concatenate(shifted), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
     for one in placed:
         station = one.photographs.station
-        own, told = away[at == station], known.get(station, profiles.USUAL_BLUR)
+        own, station_blur = away[at == station], numbers.get(station, profiles.USUAL_BLUR)
         middle = float(np.median(own)) if own.size else 0.0
-        out.append(replace(every.of_station(station), blur=told, moved=middle))
+        out.append(replace(every.of_station(station), blur=station_blur, shift=middle))
     return out
 
 
@@ -402,22 +402,26 @@ def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
     return out
 
 
-def joined_looks(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
+def joined_passes(passes: Sequence[StationEdges], blur: float, shifted: float) -> StationEdges:
     """One station's windows, or all stations, as one look."""
-    first = np.cumsum([0, *(len(look.edges) for look in looks)])[:-1]
-    number = [look.point_edge + k for look, k in zip(looks, first, strict=True)]
+    first = np.cumsum([0, *(len(station_edges.edges) for station_edges in passes)])[:-1]
+    number = [station_edges.point_edge + k for station_edges, k in zip(passes, first, strict=True)]
     return StationEdges(
-        edges=concatenate([EdgeSet.empty(), *(look.edges for look in looks)]),
-        rejected=tuple(rejection for look in looks for rejection in look.rejected),
-        points=np.concatenate([np.zeros((0, 2)), *(look.points for look in looks)]),
+        edges=concatenate([EdgeSet.empty(), *(station_edges.edges for station_edges in passes)]),
+        rejected=tuple(
+            rejection for station_edges in passes for rejection in station_edges.rejected
+        ),
+        points=np.concatenate(
+            [np.zeros((0, 2)), *(station_edges.points for station_edges in passes)]
+        ),
         point_edge=np.concatenate([np.zeros(0, dtype=int), *number]),
         blur=blur,
-        moved=moved,
+        shift=shifted,
     )
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PredictedEdges:
     """A window's predicted places along edges, and the profiles where they are clear, ``full``
     (K, E, EDGE_SEGMENTS).
     """
@@ -428,40 +432,40 @@ class _Seen:
     across: Profiles
 
 
-def _seen(window: PhotographWindow, machine: Machine) -> _Seen:
+def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEdges:
     tubes, points, clear = predicted(window, machine, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
     per_point = (f.name for f in fields(points) if f.name != "normal")
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    return _Seen(tubes, places, *_segment_profiles(window, points, clear, half_width))
+    return _PredictedEdges(tubes, places, *_segment_profiles(window, points, clear, half_width))
 
 
 def _measured(
-    window: PhotographWindow, seen: _Seen, blur: BlurByStation, refine_camera: bool
+    window: PhotographWindow, prediction: _PredictedEdges, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
     """One window's part of :func:`measure_stations`, and how far (px) each place was from its
     prediction.
     """
-    tubes, places, full = seen.tubes, seen.places, seen.full
-    across, highlight = profiles.without_highlights(seen.across, blur)
+    tubes, places, full = prediction.tubes, prediction.places, prediction.full
+    across, highlight = profiles.without_highlights(prediction.across, blur)
     curves = profiles.residual_curves(across, blur)
     about = _leg_lines(profiles.shift_log_likelihoods(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
-    position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
-    position[full], sigma[full], found[full] = at.position, at.sigma, at.found & ~highlight
-    fits = fit_edges(places, position, sigma, found)
+    position, sigma, valid = np.zeros(full.shape), np.ones(full.shape), full.copy()
+    position[full], sigma[full], valid[full] = at.position, at.sigma, at.valid & ~highlight
+    fits = fit_edges(places, position, sigma, valid)
     by_camera = window.camera.project_jacobians(places.point)[1] if refine_camera else None
     names = window.station, window.configuration
     edges = edge_set(places, fits, tubes, *names, fits.good, by_camera)
     lamps = full.copy()
-    lamps[full] = at.found & highlight
-    rejected = _rejections(*names, tubes, full, found, lamps, fits)
+    lamps[full] = at.valid & highlight
+    rejected = _rejections(*names, tubes, full, valid, lamps, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
     number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
-    look = StationEdges(edges, rejected, xy, number[k, e], float("nan"), float("nan"))
-    return look, np.abs(position[k, e, s])
+    station_edges = StationEdges(edges, rejected, xy, number[k, e], float("nan"), float("nan"))
+    return station_edges, np.abs(position[k, e, s])
 
 
 def predicted(
@@ -482,14 +486,14 @@ def _segment_profiles(
 
     Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
     """
-    seen = _by_segment(clear)
-    full = seen.sum(axis=-1) >= FEWEST_SHARE * seen.shape[-1]
+    visible = _by_segment(clear)
+    full = visible.sum(axis=-1) >= FEWEST_SHARE * visible.shape[-1]
     step = np.diff(_by_segment(points.pixel)[full], axis=1)
     pitch = np.fmax.reduce(np.hypot(step[..., 0], step[..., 1]), axis=1)  # from point to point
     pitch = np.nan_to_num(pitch, nan=MOST_PROFILES_A_POINT)  # next to none that has an image
     each = np.clip(np.ceil(pitch), FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT).astype(int)
-    count = each * seen[full].sum(axis=-1)
-    which, at = _between(seen[full], each)
+    count = each * visible[full].sum(axis=-1)
+    which, at = _between(visible[full], each)
     pixel = window.camera.project(_on_edges(points, full, which, at))
     outward = _by_segment(points.outward.astype(np.float32))[full].reshape(-1, 2)[which]
     offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
@@ -517,17 +521,17 @@ def _by_segment(values: Array | Booleans) -> Any:
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
-def _between(seen: Booleans, each: Integers) -> tuple[Integers, Array]:
-    """M profiles about the points of N segments that are ``seen`` (N, points of one), ``each`` (N,)
-    about a point.
+def _between(visible: Booleans, each: Integers) -> tuple[Integers, Array]:
+    """M profiles about the points of N segments that are ``visible`` (N, points of one), ``each``
+    (N,) about a point.
 
     Returns the point of each profile (M,), counted through all segments, and the profile's place
     (M,) from it, -1/2 to 1/2 of the way to the next.
     """
-    times = (seen * each[:, None]).ravel()
+    times = (visible * each[:, None]).ravel()
     which = np.repeat(np.arange(times.size), times)
     turn = np.arange(len(which)) - np.repeat(np.cumsum(times) - times, times)
-    return which, ((turn + 0.5) / each[which // seen.shape[1]] - 0.5).astype(np.float32)
+    return which, ((turn + 0.5) / each[which // visible.shape[1]] - 0.5).astype(np.float32)
 
 
 def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) -> Array:
@@ -568,15 +572,15 @@ def _rejections(
     configuration: Integers,
     tubes: TubeList,
     full: Booleans,
-    found: Booleans,
+    valid: Booleans,
     lamps: Booleans,
     fits: EdgeFits,
 ) -> tuple[Rejection, ...]:
     """Edges without a measurement, each with its reason. station, configuration : (K,)."""
     k, e = np.nonzero(~fits.good)
-    visible, seen, mirrored = (where[k, e].sum(axis=-1) for where in (full, found, lamps))
-    few = seen < FEWEST_PLACES_FOR_TILT
-    lamp = few & (seen + mirrored >= FEWEST_PLACES_FOR_TILT)
+    visible, in_view, mirrored = (where[k, e].sum(axis=-1) for where in (full, valid, lamps))
+    few = in_view < FEWEST_PLACES_FOR_TILT
+    lamp = few & (in_view + mirrored >= FEWEST_PLACES_FOR_TILT)
     why = np.select(
         [visible == 0, lamp, few], [OUT_OF_SIGHT_REASON, _LAMP, _TOO_LITTLE], _NOT_ONE_EDGE
     )

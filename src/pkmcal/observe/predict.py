@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, leg_is_seen, line_through
+from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, has_silhouette, line_through
 from pkmcal.geometry.rigid import apply, cross, dot, of_components
 from pkmcal.mechanisms import Machine
 
@@ -85,15 +85,15 @@ class LegsInCamera:
         pairs = (self.a, other.a), (self.b, other.b), (self.u, other.u)
         return LegsInCamera(*(np.concatenate(pair) for pair in pairs))
 
-    def moved(self, T_camera_base: Array) -> LegsInCamera:
+    def under(self, T_camera_base: Array) -> LegsInCamera:
         """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
         T = T_camera_base.astype(self.a.dtype)
         shape = self.a.shape[-3:-1]
         lead = self.a.shape[:-3] or (1,)
         own = np.stack([self.a, self.b, self.u]).reshape(3, *lead, shape[0] * shape[1], 3)
-        seen = T[:, :3, :3] @ own.mT  # (3, H, 3, K L): one component after the other
-        seen[:2] += T[:, :3, 3:]  # directions do not shift
-        return LegsInCamera(*seen.reshape(3, len(T), 3, *shape).transpose(0, 1, 3, 4, 2))
+        in_view = T[:, :3, :3] @ own.mT  # (3, H, 3, K L): one component after the other
+        in_view[:2] += T[:, :3, 3:]  # directions do not shift
+        return LegsInCamera(*in_view.reshape(3, len(T), 3, *shape).transpose(0, 1, 3, 4, 2))
 
 
 def legs_in_camera(
@@ -174,7 +174,7 @@ def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
 def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
     """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
     m = cross(a, u)
-    ok = leg_is_seen(m, radius)
+    ok = has_silhouette(m, radius)
     sign = SIDE_SIGNS.astype(a.dtype)[tubes.side]
     return edge_normal(u, m, np.where(ok, radius, 0.0), sign), ok
 

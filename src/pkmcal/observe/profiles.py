@@ -105,7 +105,7 @@ class ProfileEdges:
 
     position: Array
     sigma: Array
-    found: Booleans
+    valid: Booleans
 
 
 def sampled_offsets() -> Array:
@@ -254,8 +254,8 @@ def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Bool
     offsets = sampled_offsets()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
     inside = np.flatnonzero(offsets <= -PROFILE_STEP)[::-1]  # from the limb inwards
-    departure = grey[:, inside] - background
-    away = np.abs(departure)
+    violation = grey[:, inside] - background
+    away = np.abs(violation)
     most = np.maximum.accumulate(away, axis=1)
     contrast = _contrast(grey[:, offsets >= -PROFILE_REACH_INSIDE])
     noise = (np.hypot(_noise(contrast, count), PROFILE_MODEL_ERROR) * contrast)[:, None]
@@ -268,7 +268,7 @@ def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Bool
     there, which = less.any(axis=1), np.arange(len(grey))
     middle = np.minimum(offsets[inside[largest]], -LEAST_INSIDE)
     cut = np.searchsorted(profile_offsets(), middle - 1e-9)
-    return np.where(there, cut, 0), there & (departure[which, largest] > 0)
+    return np.where(there, cut, 0), there & (violation[which, largest] > 0)
 
 
 def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profiles, Booleans]:
@@ -284,9 +284,9 @@ def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profile
     bright, odd = np.flatnonzero(profiles.bright), np.zeros(len(profiles.cut), dtype=bool)
     if bright.size:
         whole = profiles.select(bright)
-        left = residual_curves(whole, blur).min(axis=-1) * PROFILE_STEP
+        residual = residual_curves(whole, blur).min(axis=-1) * PROFILE_STEP
         expected = _noise(whole.contrast, whole.count) ** 2 + PROFILE_MODEL_ERROR**2
-        odd[bright] = left > expected * _freedom(whole)
+        odd[bright] = residual > expected * _freedom(whole)
     return replace(profiles, cut=np.maximum(profiles.cut, profiles.strip)), odd
 
 
@@ -417,7 +417,7 @@ class EdgeFits:
 
 
 def fit_edges(
-    points: EdgePoints, position: Array, sigma: Array, found: Booleans, rounds: int = 8
+    points: EdgePoints, position: Array, sigma: Array, valid: Booleans, rounds: int = 8
 ) -> EdgeFits:
     """Robust weighted line through positions (K, E, n) px outward, in the plane's two turns.
 
@@ -426,9 +426,9 @@ def fit_edges(
     """
     middle = _middle_ray(points)
     basis = tangent_basis(points.normal, middle)
-    rows = np.where(found[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
-    value = np.where(found, position, 0.0)
-    base = np.where(found, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
+    rows = np.where(valid[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
+    value = np.where(valid, position, 0.0)
+    base = np.where(valid, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
     # all edges side by side, place after place: what is added up then lies in one piece
     one, two, at, sure = (
         np.ascontiguousarray(v.reshape(-1, v.shape[-1]).T)
@@ -445,15 +445,15 @@ def fit_edges(
     for _ in range(rounds):
         weight = sure / (1 + off2 / 4.0)  # Cauchy, two sigmas
         inverse, turn, off2 = fitted(weight)
-    shape = found.shape[:-1]
-    off2, weight = (v.T.reshape(found.shape) for v in (off2, weight))
-    used = found & (off2 < 9.0)
+    shape = valid.shape[:-1]
+    off2, weight = (v.T.reshape(valid.shape) for v in (off2, weight))
+    used = valid & (off2 < 9.0)
     count = used.sum(axis=-1)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
     factor = np.maximum(scatter, 1.0) * np.maximum(count / MEASUREMENTS_AN_EDGE, 1.0)
     inverse = np.moveaxis(inverse.reshape(2, 2, *shape), (0, 1), (-2, -1))
     operator = inverse @ (rows * weight[..., None]).mT
-    good = (count >= FEWEST_PLACES_FOR_TILT) & (count >= 0.5 * found.sum(axis=-1))
+    good = (count >= FEWEST_PLACES_FOR_TILT) & (count >= 0.5 * valid.sum(axis=-1))
     covariance = inverse * factor[..., None, None]
     good &= np.isfinite(covariance).all(axis=(-1, -2))
     return EdgeFits(turn.T.reshape(*shape, 2), basis, covariance, operator, used, good)

@@ -9,9 +9,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
+from pkmcal.observe.grey_levels import levels_at
+from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
 from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
-from pkmcal.observe.levels import levels_at
-from pkmcal.observe.photographs import Photographs, PhotographWindow, Placed, windows
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
 BLACK_GREY_LEVEL = 8
@@ -64,9 +64,14 @@ def quality(
 ) -> Quality:
     """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
     placed = Placed(photographs, T_camera_base, poses)
-    looks = [_quality(window, machine) for window in windows([placed])]
+    parts = [_quality(window, machine) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
-    return Quality(*(np.concatenate([getattr(look, name) for look in looks]) for name in each))
+    return Quality(
+        *(
+            np.concatenate([getattr(station_edges, name) for station_edges in parts])
+            for name in each
+        )
+    )
 
 
 def _quality(window: PhotographWindow, machine: Machine) -> Quality:
@@ -76,17 +81,17 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
     edge = places.outward(points, clear, tubes)[..., None]
     half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]
 
-    def look(outward: Array) -> Array:
+    def measure(outward: Array) -> Array:
         pixel = points.pixel[..., None, :] + outward[..., None] * points.outward[..., None, :]
         pairs = zip(window.images, pixel, strict=True)
         return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs])
 
-    inside = look(edge - DEPTHS_INSIDE_EDGE * half_width)
+    inside = measure(edge - DEPTHS_INSIDE_EDGE * half_width)
     offsets = np.arange(
         -BLUR_PROFILE_REACH, BLUR_PROFILE_REACH + BLUR_PROFILE_PITCH / 2, BLUR_PROFILE_PITCH
     )
-    across = look(edge + offsets).astype(float)
-    found = clear & places.clear[:, tubes.leg][..., None]
+    across = measure(edge + offsets).astype(float)
+    valid = clear & places.clear[:, tubes.leg][..., None]
     near = (np.abs(offsets) >= BESIDE_EDGE_RANGE[0]) & (np.abs(offsets) <= BESIDE_EDGE_RANGE[1])
     hidden = np.full((len(clear), machine.n_legs), np.nan)
     for leg in np.unique(tubes.leg):
@@ -95,7 +100,7 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
         legs=places.clear,
         saturated=_share(inside >= SATURATED_GREY_LEVEL, clear),
         black=_share(inside <= BLACK_GREY_LEVEL, clear),
-        blur=np.array([_blur(a[f]) for a, f in zip(across, found, strict=True)]),
+        blur=np.array([_blur(a[f]) for a, f in zip(across, valid, strict=True)]),
         hidden=hidden,
         level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
         behind=_middle(across[..., near & (offsets > 0)].mean(axis=-1), clear),

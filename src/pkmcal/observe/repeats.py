@@ -86,24 +86,24 @@ def same_edges(edges: EdgeSet) -> Groups:
     return groups_of(edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
 
 
-def combined(look: StationEdges) -> StationEdges:
+def combined(station_edges: StationEdges) -> StationEdges:
     """One edge for all repeats of it, at their mean; a look without repeats as it is."""
-    groups = same_edges(look.edges)
-    if len(groups.first) == len(look.edges):
-        return look
-    odd = odd_ones(look.edges, groups)
+    groups = same_edges(station_edges.edges)
+    if len(groups.first) == len(station_edges.edges):
+        return station_edges
+    odd = odd_ones(station_edges.edges, groups)
     keep = ~odd.any
-    edges = look.edges.select(keep)
+    edges = station_edges.edges.select(keep)
     groups = same_edges(edges)
     number = np.full(len(keep), -1)
     number[keep] = groups.member
-    point_edge = number[look.point_edge]
-    said = (*look.rejected, *_rejections(look.edges, odd))
+    point_edge = number[station_edges.point_edge]
+    text = (*station_edges.rejected, *_rejections(station_edges.edges, odd))
     return replace(
-        look,
+        station_edges,
         edges=mean_edges(edges, groups),
-        rejected=tuple(dict.fromkeys(said)),  # what is hidden is so in every repeat
-        points=look.points[point_edge >= 0],
+        rejected=tuple(dict.fromkeys(text)),  # what is hidden is so in every repeat
+        points=station_edges.points[point_edge >= 0],
         point_edge=point_edge[point_edge >= 0],
     )
 
@@ -253,6 +253,6 @@ def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
         apart = np.zeros(len(groups.first))
         np.maximum.at(apart, groups.member, odd.off[rows])
         for k, count, far in zip(rows[groups.first].tolist(), groups.count, apart, strict=True):
-            said = _RARE.format(count, odd.most[k]) if kind is odd.rare else _DISPUTED.format(far)
-            out.append(edges.rejection(k, said))
+            text = _RARE.format(count, odd.most[k]) if kind is odd.rare else _DISPUTED.format(far)
+            out.append(edges.rejection(k, text))
     return out

@@ -14,8 +14,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import angle_between
+from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
-from pkmcal.observe.tables import DistanceTables
 
 PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 """Places along the middle of a tube's visible part that are looked at."""

@@ -1,11 +1,11 @@
 """Edges of a whole machine in one photograph, coarse: where its silhouettes lie on picture edges.
 
 A place was compared with others by how well the machine's silhouettes lie on the edges of the
-picture (:mod:`pkmcal.observe.evidence`). The same distances, each counted by the probability that
-it is the machine's own edge and not what chance has put there, say where the silhouettes should
-have been: an edge a tube's side, to a pixel. In a cluttered picture of polished legs that is three
-times as many edges as can be measured one by one, and enough to tell the machine together with the
-places.
+picture (:mod:`pkmcal.observe.pose_likelihood`). The same distances, each counted by the probability
+that it is the machine's own edge and not what chance has put there, say where the silhouettes
+should have been: an edge a tube's side, to a pixel. In a cluttered picture of polished legs that is
+three times as many edges as can be measured one by one, and enough to tell the machine together
+with the places.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.observe.evidence import StationView, first_mixture, look_under
 from pkmcal.observe.legs import OTHER_OUTLINE_CLEARANCE, StationEdges
+from pkmcal.observe.pose_likelihood import StationView, first_mixture, linearize_distances
 from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
 from pkmcal.observe.profiles import edge_set, fit_edges
 
@@ -37,8 +37,10 @@ def silhouette_edges(
     also how the edges depend on the camera's parameters.
     """
     tubes = view.tubes
-    look = look_under(view, T_camera_base[None], np.zeros(1, dtype=int), SILHOUETTE_SAMPLES)
-    distances = look.distances
+    linearization = linearize_distances(
+        view, T_camera_base[None], np.zeros(1, dtype=int), SILHOUETTE_SAMPLES
+    )
+    distances = linearization.distances
     mixture = distances.mixture(first_mixture(1), 10, WIDEST_SCATTER)
     legs = legs_in_camera(view.machine, T_camera_base, view.poses, view.joints)
     points = edge_points(view.machine, view.camera, legs, tubes, SILHOUETTE_SAMPLES)
@@ -46,13 +48,13 @@ def silhouette_edges(
     scale = view.tables.scale
     # how a distance grows as the edge moves outward by a pixel of the tables
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.nan_to_num(np.clip(look.slope * scale / points.gain, -1, 1))
-    position = -scale * distances.found * np.sign(slope)
+        slope = np.nan_to_num(np.clip(linearization.slope * scale / points.gain, -1, 1))
+    position = -scale * distances.distance * np.sign(slope)
     weight = distances.own(mixture) * slope**2
-    found = clear & (distances.length > 0) & (weight > LEAST_OWN)
-    position = np.where(found, position, 0.0)
-    sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(found, weight, 1.0))
-    fits = fit_edges(points, position, sigma, found)
+    valid = clear & (distances.length > 0) & (weight > LEAST_OWN)
+    position = np.where(valid, position, 0.0)
+    sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(valid, weight, 1.0))
+    fits = fit_edges(points, position, sigma, valid)
     by_camera = view.camera.project_jacobians(points.point)[1] if refine_camera else None
     names = np.array([station]), view.configuration
     edges = edge_set(points, fits, tubes, *names, fits.good, by_camera)

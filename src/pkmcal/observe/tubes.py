@@ -42,18 +42,18 @@ SLOPE_ALONG_WEIGHT = 2.0
 """Times that a slope along a pair counts against one across it: directions within 27 degrees."""
 LEAST_PAIR_SUPPORT = 0.24
 """Support below which a place is no pair at all: one place in four of its length."""
-GREATEST_LOG_RARITY = 4.0
+GREATEST_SURPRISAL = 4.0
 """Logarithm of rarity beyond which rarer ones count no more: one leg must not outvote six."""
-RARITY_STEPS = 60
+SURPRISAL_STEPS = 60
 """Steps of the maps' numbers for each factor of e in rarity."""
 
 
 class TubeChart(NamedTuple):
-    """rarity : (W, D, h, w) uint8, minus the logarithm of how rare so clear a pair is, in steps.
+    """surprisal : (W, D, h, w) uint8, minus the logarithm of how rare so clear a pair is, in steps.
     scale : fine cells a radian. size : (w, h) of the fine chart.
     """
 
-    rarity: Integers
+    surprisal: Integers
     scale: float
     size: tuple[int, int]
 
@@ -110,7 +110,10 @@ def _support(grey: Array) -> Array:
     """
     import cv2
 
-    dx, dy = (cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *way) / 8 for way in ((1, 0), (0, 1)))
+    dx, dy = (
+        cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *direction) / 8
+        for direction in ((1, 0), (0, 1))
+    )
     height, width = (n // SUPPORT_SPACING for n in grey.shape)
     out = np.empty((len(PAIR_WIDTHS), PAIR_DIRECTIONS, height, width), dtype=np.float32)
     for k in range(PAIR_DIRECTIONS):
@@ -181,7 +184,7 @@ def _rarity(support: Array) -> Integers:
     for place in np.ndindex(level.shape[:2]):
         count = np.bincount(level[place].ravel(), minlength=256)
         share = count[::-1].cumsum()[::-1] / count.sum()
-        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), GREATEST_LOG_RARITY)
+        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), GREATEST_SURPRISAL)
         worth[: round(255 * LEAST_PAIR_SUPPORT)] = 0.0
-        out[place] = np.rint(RARITY_STEPS * worth)[level[place]]
+        out[place] = np.rint(SURPRISAL_STEPS * worth)[level[place]]
     return out

@@ -155,15 +155,15 @@ class Check:
 class Part:
     """A section of the page, in this order: what follows ``title``, one after the other.
 
-    text : paragraphs. said : sentences that the terminal tells, too. html : made by a template of
-    :mod:`report`, which escapes what it shows: photographs, charts. notes : small print.
-    menu : its name in the page's navigation, where that is shorter.
+    text : paragraphs. terminal_text : sentences that the terminal tells, too. html : made by a
+    template of :mod:`report`, which escapes what it shows: photographs, charts. notes : small
+    print. menu : its name in the page's navigation, where that is shorter.
     """
 
     name: str
     title: str
     text: tuple[str, ...] = ()
-    said: tuple[str, ...] = ()
+    terminal_text: tuple[str, ...] = ()
     plots: tuple[Plot, ...] = ()
     html: str = ""
     tables: tuple[Table, ...] = ()

@@ -40,7 +40,7 @@ from typing import Any
 
 from pkmcal.errors import PkmcalError
 from pkmcal.wording import (
-    SHOWN_UNITS,
+    DISPLAY_UNITS,
     amount,
     capital,
     count,
@@ -52,7 +52,7 @@ from pkmcal.wording import (
 )
 
 _OPTIONAL_PART = re.compile(r"\[\[(.*?)\]\]", re.DOTALL)
-_UNITS = {name: scale for scale, name in SHOWN_UNITS.values()}
+_UNITS = {name: scale for scale, name in DISPLAY_UNITS.values()}
 
 
 class Level(StrEnum):
@@ -207,8 +207,8 @@ def _choice(first: bool, rest: str) -> str:
 
 def _either(noise: tuple[float, Sequence[str]], spec: str) -> str:
     size, units = noise
-    shown = [SHOWN_UNITS[unit] for unit in ("m", "rad") if unit in units]
-    return " or ".join(with_unit(format(size * scale, spec), name) for scale, name in shown)
+    display = [DISPLAY_UNITS[unit] for unit in ("m", "rad") if unit in units]
+    return " or ".join(with_unit(format(size * scale, spec), name) for scale, name in display)
 
 
 def _range(ends: tuple[float, float | None], _rest: str) -> str:

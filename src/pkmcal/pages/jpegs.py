@@ -34,18 +34,21 @@ def small_and_large(
 
     photographs : each as a station's, and its number among them.
     """
-    left, waiting = room, len(photographs)
+    remainder, waiting = room, len(photographs)
     with ThreadPoolExecutor(THREADS) as pool:
         for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
             some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
             for small, large in pool.map(
                 lambda one: _packed(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)), some
             ):
-                if len(small) > left:
+                if len(small) > remainder:
                     return
                 # that of this one and those that follow come before a large one
-                fits = len(small) * waiting + len(large) <= left
-                left, waiting = left - len(small) - (len(large) if fits else 0), waiting - 1
+                fits = len(small) * waiting + len(large) <= remainder
+                remainder, waiting = (
+                    remainder - len(small) - (len(large) if fits else 0),
+                    waiting - 1,
+                )
                 yield small, large if fits else ""
 
 

@@ -144,7 +144,7 @@ def markers(name: str, points: Array, marker: dict[str, Any], **more: Any) -> di
 
 def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) -> dict[str, Any]:
     """A trace of marks at points (n, 3), m, in the colours of values (n,), with their scale."""
-    look = {
+    style = {
         "size": 4,
         "color": [float(f"{x:.3g}") for x in values.tolist()],
         "colorscale": MAGNITUDE_COLOUR_SCALE,
@@ -157,7 +157,7 @@ def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) ->
             "len": 0.8,
         },
     }
-    return markers(name, points, look, **more)
+    return markers(name, points, style, **more)
 
 
 def ring(points: Array) -> Array:
@@ -187,7 +187,7 @@ def space_layout(eye: dict[str, float] = EYE_AT_CORNER) -> dict[str, Any]:
     }
 
 
-def way_between_cameras(cameras: Array) -> Array:
+def path_between_cameras(cameras: Array) -> Array:
     """The way (3,) from which a machine and its cameras, at (S, 3) m from its middle, are looked
     at: between two cameras, so that none stands before it.
     """
@@ -197,11 +197,12 @@ def way_between_cameras(cameras: Array) -> Array:
     return np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
 
 
-def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
+def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
     """The layout of a figure in space that is seen with all of ``data`` in the picture.
 
-    way : (3,) from what is drawn towards the eye. In ``meta`` stands how ``NARROW_SPACE_PICTURE``
-    pictures are looked at; the page takes it where they are narrower than ``WIDE_SPACE_PICTURE``.
+    direction : (3,) from what is drawn towards the eye. In ``meta`` stands how
+    ``NARROW_SPACE_PICTURE`` pictures are looked at; the page takes it where they are narrower than
+    ``WIDE_SPACE_PICTURE``.
     """
     least, most = (
         np.array([f([v for t in data for v in t[axis] if v is not None]) for axis in "xyz"])
@@ -210,18 +211,18 @@ def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
     # Plotly's box is a sixteenth larger, and has a geometric mean of its sides of one
     sides = np.where(most > least, (most - least) * 17 / 16, 2.0)
     corners = sides / float(np.prod(sides)) ** (1 / 3) * (list(np.ndindex(2, 2, 2)) - np.array(0.5))
-    way = way / np.linalg.norm(way)
-    right = np.cross([0.0, 0.0, 1.0], way) / np.linalg.norm(way[:2])
-    axes = np.stack([right, np.cross(way, right)], axis=1)
+    direction = direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 0.0, 1.0], direction) / np.linalg.norm(direction[:2])
+    axes = np.stack([right, np.cross(direction, right)], axis=1)
 
     def camera(width: float, inside: float) -> dict[str, dict[str, float]]:
         # a corner at depth d before the eye is inside where it lies within slope d of the middle,
         # so on each axis the corners on either side decide how far away, and what the middle is
         slope = inside * np.tan(PLOTLY_VIEW_ANGLE / 2) * np.array([width, 1.0])
-        near, across = (corners @ way)[:, None], corners @ axes / slope
+        near, across = (corners @ direction)[:, None], corners @ axes / slope
         one, other = (near + across).max(axis=0), (near - across).max(axis=0)
         middle = axes @ (slope * (one - other) / 2)
-        eye = middle + (one + other).max() / 2 * way
+        eye = middle + (one + other).max() / 2 * direction
         return {
             name: dict(zip("xyz", point.round(3).tolist(), strict=True))
             for name, point in (("eye", eye), ("center", middle))
@@ -253,6 +254,6 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
         return []
     deep = rays[:, 2].min()
     points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
-    seen = apply(T_base_camera, points)
+    in_view = apply(T_base_camera, points)
     eye = T_base_camera[:3, 3]
-    return [seen, *(np.stack([eye, seen[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4))]
+    return [in_view, *(np.stack([eye, in_view[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4))]

@@ -16,30 +16,30 @@ from pkmcal.papers.legs import legs_as_drawn
 from pkmcal.wording import named
 
 
-def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
+def conditions(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
     """All conditions for a machine and the legs that each station sees at once, (S, L).
 
     Necessary at most, see the module.
     """
     out = [
-        every_leg(seen),
-        base(machine, seen),
-        offsets_condition(machine, seen),
-        platform(machine, seen),
+        every_leg(visible),
+        base(machine, visible),
+        offsets_condition(machine, visible),
+        platform(machine, visible),
     ]
-    return (*out, *at_once(machine, seen))
+    return (*out, *at_once(machine, visible))
 
 
-def every_leg(seen: Booleans) -> Condition:
+def every_leg(visible: Booleans) -> Condition:
     """[A] 3.3, first condition: each leg is seen by one station at least."""
-    lost = np.flatnonzero(~seen.any(axis=0))
+    lost = np.flatnonzero(~visible.any(axis=0))
     text = "every leg is seen by a station"
     if lost.size:
         text += f"; none sees {named(lost)}"
-    return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
+    return _condition("3.3", visible.shape[1], int(visible.any(axis=0).sum()), text)
 
 
-def base(machine: Machine, seen: Booleans) -> Condition:
+def base(machine: Machine, visible: Booleans) -> Condition:
     """[A] 12 with 11 (spatial) or 10 (planar): products of the base joints' vectors.
 
     Unknowns: 3 + 3(n - 3) + 2r of n centres and r revolute axes. Planar, as printed
@@ -47,28 +47,28 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
     all its normal; their products say nothing of the plane's points and are not counted.
     """
-    n, legs = seen.shape[1], legs_as_drawn(machine)
-    count = seen.sum(axis=1)
+    n, legs = visible.shape[1], legs_as_drawn(machine)
+    count = visible.sum(axis=1)
     if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
         return _condition("10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
     revolute = legs.base_revolute
-    r = (seen & revolute).sum(axis=1)
+    r = (visible & revolute).sum(axis=1)
     available = _pairs(count) + _pairs(r) + r * np.maximum(count - 1, 0)
     needed = 3 + 3 * (n - 3) + 2 * int(revolute.sum())
     text = "products of vectors between base joints and revolute axes, for centres and axes"
     return _condition("11, 12", needed, int(available.sum()), text)
 
 
-def offsets_condition(machine: Machine, seen: Booleans) -> Condition:
+def offsets_condition(machine: Machine, visible: Booleans) -> Condition:
     """[A] 15: distances between platform joints against offsets and constant lengths."""
     closing = machine.layout.closing
-    available = int(_pairs((seen & closing).sum(axis=1)).sum())
+    available = int(_pairs((visible & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their offsets"
     return _condition("15", int(closing.sum()), available, text)
 
 
-def platform(machine: Machine, seen: Booleans) -> Condition:
+def platform(machine: Machine, visible: Booleans) -> Condition:
     """[A] 17: the same distances against the platform's centres.
 
     E = 3 + 3(n - 3) spatial, 1 + 2(n - 2) planar; n counts legs with a length, as the centre
@@ -77,22 +77,22 @@ def platform(machine: Machine, seen: Booleans) -> Condition:
     closing = machine.layout.closing
     n = int(closing.sum())
     needed = 1 + 2 * (n - 2) if legs_as_drawn(machine).planar else 3 + 3 * (n - 3)
-    available = int(_pairs((seen & closing).sum(axis=1)).sum())
+    available = int(_pairs((visible & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
     return _condition("17", needed, available, text)
 
 
-def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
+def at_once(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
     """[A] 3.5: three legs with a length at once with each passive leg and platform axis.
 
     Legs with a revolute joint count among the three themselves, passive ones do not.
     """
     legs = legs_as_drawn(machine)
-    count = (seen & legs.closing).sum(axis=1)
+    count = (visible & legs.closing).sum(axis=1)
     out: list[Condition] = []
     for j in np.flatnonzero(~legs.closing | legs.platform_revolute):
         passive = not legs.closing[j]
-        most = int(np.max(np.where(seen[:, j], count, 0), initial=0))
+        most = int(np.max(np.where(visible[:, j], count, 0), initial=0))
         what = f"passive leg {j + 1}" if passive else f"the revolute axis of leg {j + 1}"
         text = f"legs with a length seen at once, for {what} on the platform"
         out.append(_condition("19" if passive else "18", 3, most, text))

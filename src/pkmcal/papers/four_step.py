@@ -96,21 +96,21 @@ class FourSteps:
 
 
 def base_items(
-    machine: Machine, axes: Axes, a_camera: Array, found: Booleans, views: StationViews
+    machine: Machine, axes: Axes, a_camera: Array, valid: Booleans, views: StationViews
 ) -> Items:
     """What the views saw of the base: centres, and revolute axes ([A] 7) with their signs.
 
     a_camera : (B, S, L, 3) centres in the camera frames, found (S, L).
     """
-    legs, n = legs_as_drawn(machine), len(found)
-    centres, seen = gathered_points(a_camera, found, views)
+    legs, n = legs_as_drawn(machine), len(valid)
+    centres, visible = gathered_points(a_camera, valid, views)
     if legs.planar:
-        v, v_found = plane_normals(axes.u, axes.seen, axes.station, n, axes.information)
+        v, v_valid = plane_normals(axes.u, axes.visible, axes.station, n, axes.information)
     else:
         some = axes.of_legs(np.flatnonzero(legs.base_revolute))
-        v, v_found = revolute_axes(some.u, some.seen, axes.station, n, some.information)
-    v, v_found = gathered_directions(v, v_found, views)
-    items = Items(centres, seen, v, v_found, legs.base, legs.directions)
+        v, v_valid = revolute_axes(some.u, some.visible, axes.station, n, some.information)
+    v, v_valid = gathered_directions(v, v_valid, views)
+    items = Items(centres, visible, v, v_valid, legs.base, legs.directions)
     if not items.n_directions:
         return items
     return with_signs(items, rough_rotations(machine, axes, items, views))
@@ -120,7 +120,7 @@ def solve_from_centres(
     machine: Machine,
     axes: Axes,
     a_camera: Array,
-    found: Booleans,
+    valid: Booleans,
     form: FourStepForm,
     views: StationViews | None = None,
 ) -> FourSteps:
@@ -130,28 +130,28 @@ def solve_from_centres(
     views : stations joined beforehand, each on its own when absent.
     """
     legs = legs_as_drawn(machine)
-    views = stations_apart(len(found)) if views is None else views
-    items = base_items(machine, axes, a_camera, found, views)
+    views = stations_apart(len(valid)) if views is None else views
+    items = base_items(machine, axes, a_camera, valid, views)
     join = base_by_registration if form == "corrected" else base_by_products
     base = join(items, base_gauge(machine, legs))
     T_camera_base = views.T_camera_view @ base.T_view_base[:, views.of_station]
     usable = items.fixed()[views.of_station][axes.station]
-    axes = replace(axes, seen=axes.seen & usable[:, None])
+    axes = replace(axes, visible=axes.visible & usable[:, None])
     merged = in_base(axes, T_camera_base)
     if form == "corrected":
         q0, platform = _ends(machine, legs, merged, base.centres)
     else:
-        a_photo = np.where(found[..., None], a_camera, 0.0)[:, axes.station]
+        a_photo = np.where(valid[..., None], a_camera, 0.0)[:, axes.station]
         q0, platform = _ends_printed(machine, legs, axes, a_photo)
     if legs.planar:  # a leg lies level, so both its ends have one height
         rise = legs.platform[:, 2] - legs.base[:, 2]
         platform[..., 2] = base.centres[..., 2] + rise
 
     # each configuration's pose ([A] 18), by the legs with a length
-    seen = merged.seen & legs.closing
+    visible = merged.visible & legs.closing
     b = base.centres[:, None] + (merged.readings + q0[:, None])[..., None] * merged.u
-    posed = fixes_pose(legs.platform, seen, motion=legs.motion)
-    weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
+    posed = fixes_pose(legs.platform, visible, motion=legs.motion)
+    weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         # distances leave a translating platform turned against the base frame
         laid = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])
@@ -161,9 +161,9 @@ def solve_from_centres(
     if legs.planar:  # the platform frame keeps the height that the drawing gives it
         T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
     if not legs.closing.all():
-        rows = merged.seen & posed[:, None]
-        passive, known = passive_centres(merged.u, base.centres, rows, T)
-        passive = np.where(known[:, None], passive, np.nan)
+        rows = merged.visible & posed[:, None]
+        passive, reference_values = passive_centres(merged.u, base.centres, rows, T)
+        passive = np.where(reference_values[:, None], passive, np.nan)
         platform = np.where(legs.closing[:, None], platform, passive)
     v, w = _axes(machine, legs, merged, posed, base, RegisteredBody(platform, T), form)
     return FourSteps(
@@ -173,14 +173,14 @@ def solve_from_centres(
 
 def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple[Array, Array]:
     """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
-    with_length = replace(merged, seen=merged.seen & legs.closing)
+    with_length = replace(merged, visible=merged.visible & legs.closing)
     a = np.broadcast_to(base[:, None], merged.u.shape)
     q0 = joint_distance_offsets(with_length, a, legs.rod, "corrected")
     b = a + (merged.readings + q0[:, None])[..., None] * merged.u
-    posed = fixes_pose(legs.platform, with_length.seen, motion=legs.motion)
+    posed = fixes_pose(legs.platform, with_length.visible, motion=legs.motion)
     gauge = platform_gauge(machine, legs)
     platform = platform_by_registration(
-        b[:, posed], with_length.seen[posed], legs.platform, gauge, legs.motion
+        b[:, posed], with_length.visible[posed], legs.platform, gauge, legs.motion
     )
     return q0, platform
 
@@ -189,14 +189,14 @@ def _ends_printed(
     machine: Machine, legs: DrawnLegs, axes: Axes, a_photo: Array
 ) -> tuple[Array, Array]:
     """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
-    with_length = replace(axes, seen=axes.seen & legs.closing)
+    with_length = replace(axes, visible=axes.visible & legs.closing)
     q0 = joint_distance_offsets(with_length, a_photo, legs.rod, "printed")
     b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
     gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
     if legs.planar:  # distances say nothing of the heights, which are the base's
         heights = np.eye(legs.platform.size)[2::3]
         gauge = np.concatenate([platform_gauge(machine, legs), heights])
-    return q0, platform_by_distances(b, with_length.seen, axes.station, legs.platform, gauge)
+    return q0, platform_by_distances(b, with_length.visible, axes.station, legs.platform, gauge)
 
 
 def _axes(
@@ -212,29 +212,31 @@ def _axes(
 
     body : the platform's centres and its poses, known where ``posed`` (K,).
     """
-    u, seen = merged.u, merged.seen & posed[:, None]
+    u, visible = merged.u, merged.visible & posed[:, None]
     v = _as_drawn(machine, legs.base_axes, legs.base, base.centres)
     w = _as_drawn(machine, legs.platform_axes, legs.platform, body.points)
     if legs.base_revolute.any():
         v[:, legs.base_revolute] = base.directions
         if form == "corrected":  # all stations together know a leg's directions better than one
-            found, known = revolute_axes(u, merged.seen, merged.station, 1, merged.information)
-            v = _where(known[0] & legs.base_revolute, found[:, 0], v)
+            valid, reference_values = revolute_axes(
+                u, merged.visible, merged.station, 1, merged.information
+            )
+            v = _where(reference_values[0] & legs.base_revolute, valid[:, 0], v)
     if legs.platform_revolute.any():
-        found, known = platform_axes(u, seen, body.poses, merged.information)
-        w = _where(known & legs.platform_revolute, found, w)
+        valid, reference_values = platform_axes(u, visible, body.poses, merged.information)
+        w = _where(reference_values & legs.platform_revolute, valid, w)
     j = np.flatnonzero(legs.torsion)
     if j.size:
         tolerance = machine.parameters.tolerance[machine.layout.base_axis[j, 0]]
         drawn, rot = (v[:, j], w[:, j]), body.poses[..., :3, :3]
-        v[:, j], w[:, j] = universal_axes(u[:, :, j], rot, seen[:, j], drawn, tolerance)
+        v[:, j], w[:, j] = universal_axes(u[:, :, j], rot, visible[:, j], drawn, tolerance)
     return v, w
 
 
-def _where(legs: Booleans, found: Array, axes: Array) -> Array:
+def _where(legs: Booleans, values: Array, axes: Array) -> Array:
     """Axes (B, L, 3) replaced by the found ones of some legs, on the same side."""
-    side = np.where(dot(found, axes) < 0, -1.0, 1.0)[..., None]
-    return np.where(legs[:, None], side * found, axes)
+    side = np.where(dot(values, axes) < 0, -1.0, 1.0)[..., None]
+    return np.where(legs[:, None], side * values, axes)
 
 
 def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Array:
@@ -245,8 +247,8 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
     out = np.tile(axes, (len(centres), 1, 1))
     if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
         return out
-    known = np.isfinite(centres[..., 0]).astype(float)
-    rot = poses_laying_items(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), known)
+    finite = np.isfinite(centres[..., 0]).astype(float)
+    rot = poses_laying_items(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), finite)
     return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
@@ -287,19 +289,19 @@ def four_step(
     """
     edges = measurements.edges
     checks.can_be_tried(machine, len(edges))
-    found_linear = linear.centres(machine, measurements, "robust", rng)
+    linear_mask = linear.centres(machine, measurements, "robust", rng)
     if form == "corrected":
-        edges = through_centres(machine, edges, found_linear.centres)
-    axes = axes_from_edges(machine, replace(measurements, edges=edges), found_linear.weights)
-    found = _well_known(found_linear, machine)
-    a_camera = np.where(found[..., None], found_linear.centres, 0.0)[None]
+        edges = through_centres(machine, edges, linear_mask.centres)
+    axes = axes_from_edges(machine, replace(measurements, edges=edges), linear_mask.weights)
+    values = _determined_mask(linear_mask, machine)
+    a_camera = np.where(values[..., None], linear_mask.centres, 0.0)[None]
     if form == "printed":
-        a_camera, found = centres_from_axes(axes, measurements.n_stations)
-    checks.every_leg_seen(machine, found)
-    views = _views(machine, measurements, axes, a_camera, found, T_camera_base_guess)
-    usable = base_items(machine, axes, a_camera, found, views).fixed()[views.of_station]
-    checks.platform_can_be_found(machine, axes, usable, form)
-    steps = solve_from_centres(machine, axes, a_camera, found, form, views)
+        a_camera, values = centres_from_axes(axes, measurements.n_stations)
+    checks.every_leg_visible(machine, values)
+    views = _views(machine, measurements, axes, a_camera, values, T_camera_base_guess)
+    usable = base_items(machine, axes, a_camera, values, views).fixed()[views.of_station]
+    checks.platform_is_identifiable(machine, axes, usable, form)
+    steps = solve_from_centres(machine, axes, a_camera, values, form, views)
     checks.lengths_are_fixed(machine, axes, usable, steps.base, steps.T_camera_base, steps.offsets)
     checks.passive_legs_are_fixed(machine, steps.platform)
     stations = steps.T_camera_base[0]
@@ -313,11 +315,11 @@ def four_step(
     return in_gauge(machine, state, default_gauge(machine))
 
 
-def _well_known(found: linear.LinearCentres, machine: Machine) -> Booleans:
+def _determined_mask(value: linear.LinearCentres, machine: Machine) -> Booleans:
     """Base centres (S, L) that their edges fix, to a part of the base's own size at least."""
     size = extent(machine.base_centers())
-    finite = np.all(np.isfinite(found.centres), axis=-1)
-    covariance = np.where(finite[..., None, None], found.covariance, np.eye(3))
+    finite = np.all(np.isfinite(value.centres), axis=-1)
+    covariance = np.where(finite[..., None, None], value.covariance, np.eye(3))
     return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE_CENTRE_SHARE * size) ** 2)
 
 
@@ -326,13 +328,13 @@ def _views(
     measurements: Measurements,
     axes: Axes,
     a_camera: Array,
-    found: Booleans,
+    valid: Booleans,
     guess: Array | None,
 ) -> StationViews:
     """How the stations are joined: by boards on the base, by the legs they share, or as given."""
     on_base = ~measurements.on_platform
-    views = joined_by_boards(measurements.poses, on_base, len(found))
-    items = base_items(machine, axes, a_camera, found, views)
+    views = joined_by_boards(measurements.poses, on_base, len(valid))
+    items = base_items(machine, axes, a_camera, valid, views)
     if guess is None:
         checks.stations_are_fixed(items, views, machine)
         checks.stations_are_joined(items, views)
@@ -346,11 +348,11 @@ def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home:
 
     home : (4, 4) of the drawing; what the steps found need not assemble at mid-range.
     """
-    found = machine.forward_result(measurements.joints, home)
-    poses = found.T_base_platform
-    seen = np.zeros(len(poses), dtype=bool)
-    seen[steps.configuration[steps.posed]] = True
-    lost = ~found.converged & seen
+    fk = machine.forward_result(measurements.joints, home)
+    poses = fk.T_base_platform
+    visible = np.zeros(len(poses), dtype=bool)
+    visible[steps.configuration[steps.posed]] = True
+    lost = ~fk.converged & visible
     if lost.any():
         start = poses.copy()
         start[steps.configuration] = steps.T_base_platform[0]

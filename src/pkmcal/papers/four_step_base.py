@@ -90,7 +90,7 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
         return stations_apart(n_stations)
     pair, group = np.unique(used.station * len(on_base) + used.mount, return_inverse=True)
     T_camera_mount = mean_pose(used.T_station_target, used.whiten, group, len(pair))
-    seen = list(zip(*np.divmod(pair, len(on_base)), T_camera_mount, strict=True))
+    in_view = list(zip(*np.divmod(pair, len(on_base)), T_camera_mount, strict=True))
     of_station, of_mount = np.full(n_stations, -1), np.full(len(on_base), -1)
     T_camera_view = np.tile(np.eye(4), (n_stations, 1, 1))
     T_view_mount = np.tile(np.eye(4), (len(on_base), 1, 1))
@@ -99,7 +99,7 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
             continue
         of_station[first] = view = of_station.max() + 1
         for _ in range(n_stations):  # from the first station to its boards, to their stations
-            for s, m, T in seen:
+            for s, m, T in in_view:
                 if of_station[s] == view and of_mount[m] < 0:
                     of_mount[m] = view
                     T_view_mount[m] = inverse(T_camera_view[s]) @ T
@@ -109,35 +109,35 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
     return StationViews(of_station, T_camera_view)
 
 
-def gathered_points(points: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
+def gathered_points(points: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     """Points of the stations (B, S, L, 3), found (S, L), as the views have them (B, V, L, 3).
 
     The mean, where several stations of a view know a point.
     """
     back = apply(inverse(views.T_camera_view)[:, None], points)
-    return _mean(np.where(found[..., None], back, 0.0), found, views)
+    return _mean(np.where(valid[..., None], back, 0.0), valid, views)
 
 
-def gathered_directions(v: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
+def gathered_directions(v: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     """Directions of either sign, (B, S, D, 3), as the views have them: unit (B, V, D, 3).
 
     One sign in each view: that of the first station that knows the direction.
     """
     rot = views.T_camera_view[:, None, :3, :3].mT
-    back = np.where(found[..., None], (rot @ v[..., None])[..., 0], 0.0)
+    back = np.where(valid[..., None], (rot @ v[..., None])[..., 0], 0.0)
     same = views.of_station == views.of_station[:, None]
-    first = np.argmax(same[:, :, None] & found[None], axis=1)
+    first = np.argmax(same[:, :, None] & valid[None], axis=1)
     reference = back[:, first, np.arange(v.shape[2])]
-    mean, known = _mean(
-        back * np.where(dot(back, reference) < 0, -1.0, 1.0)[..., None], found, views
+    mean, above_limit = _mean(
+        back * np.where(dot(back, reference) < 0, -1.0, 1.0)[..., None], valid, views
     )
     size = np.sqrt(dot(mean, mean))[..., None]
-    return mean / np.where(size > 0, size, 1.0), known
+    return mean / np.where(size > 0, size, 1.0), above_limit
 
 
-def _mean(values: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
+def _mean(values: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     member = (views.of_station == np.arange(views.n)[:, None]).astype(float)
-    count = member @ found
+    count = member @ valid
     total = np.einsum("vs,bsli->bvli", member, values)
     return total / np.maximum(count, 1)[..., None], count > 0
 
@@ -189,9 +189,9 @@ class Items(NamedTuple):
     """
 
     centres: Array
-    centres_seen: Booleans
+    centres_visible: Booleans
     directions: Array
-    directions_seen: Booleans
+    directions_visible: Booleans
     drawn: Array
     drawn_directions: Array
 
@@ -206,9 +206,9 @@ class Items(NamedTuple):
         return np.concatenate([self.centres, self.lever * self.directions], axis=2)
 
     @property
-    def seen(self) -> Booleans:
+    def visible(self) -> Booleans:
         """Which were seen, (V, L + D)."""
-        return np.concatenate([self.centres_seen, self.directions_seen], axis=1)
+        return np.concatenate([self.centres_visible, self.directions_visible], axis=1)
 
     @property
     def drawing(self) -> Array:
@@ -222,11 +222,11 @@ class Items(NamedTuple):
 
     def fixed(self) -> Booleans:
         """Views (V,) whose own items fix their pose."""
-        return fixes_pose(self.drawing, self.seen, self.n_directions)
+        return fixes_pose(self.drawing, self.visible, self.n_directions)
 
     def placed(self, items: Array) -> Array:
         """Poses (B, V, 4, 4) of the views on items (B, L + D, 3)."""
-        weight = np.broadcast_to(self.seen, self.measured.shape[:-1]).astype(float)
+        weight = np.broadcast_to(self.visible, self.measured.shape[:-1]).astype(float)
         return poses_laying_items(items[:, None], self.measured, weight, self.n_directions)
 
 
@@ -238,7 +238,7 @@ def base_by_registration(items: Items, gauge: Array) -> Base:
     are left out.
     """
     use = items.fixed()
-    measured, weight = items.measured, items.seen.astype(float)
+    measured, weight = items.measured, items.visible.astype(float)
     shape = measured[:, use].shape[:-1]
     weight = np.broadcast_to(weight[use], shape)
     body = fit_body(measured[:, use], weight, gauge, items.drawing, directions=items.n_directions)
@@ -254,9 +254,9 @@ def base_by_products(items: Items, gauge: Array) -> Base:
     """
     n = len(items.drawing)
     to_p, to_q, view = [np.zeros((0, n))], [np.zeros((0, n))], [np.zeros(0, dtype=int)]
-    for v, seen in enumerate(items.seen):
-        vectors = np.eye(n)[seen]  # rows that give the view's vectors from its items
-        centres = int(items.centres_seen[v].sum())
+    for v, in_view in enumerate(items.visible):
+        vectors = np.eye(n)[in_view]  # rows that give the view's vectors from its items
+        centres = int(items.centres_visible[v].sum())
         if centres:
             vectors[:centres] -= vectors[0].copy()
             vectors = vectors[1:]
@@ -265,14 +265,14 @@ def base_by_products(items: Items, gauge: Array) -> Base:
         view.append(np.full(len(p), v))
     by_p, by_q = np.concatenate(to_p), np.concatenate(to_q)
     measured = items.measured[:, np.concatenate(view)]
-    known = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
+    above_limit = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
 
     def products(points: Array, runs: Integers) -> tuple[Array, Array]:
         vp, vq = by_p @ points, by_q @ points
         jac = by_p[..., None] * vq[:, :, None] + by_q[..., None] * vp[:, :, None]
-        return dot(vp, vq) - known[runs], jac
+        return dot(vp, vq) - above_limit[runs], jac
 
-    return _base(items, points_by(products, items.drawing, gauge, len(known)))
+    return _base(items, points_by(products, items.drawing, gauge, len(above_limit)))
 
 
 def _base(items: Items, points: Array) -> Base:
@@ -299,7 +299,7 @@ def rough_rotations(machine: Machine, axes: Axes, items: Items, views: StationVi
     """
     alone = items._replace(
         directions=items.directions[:, :, :0],
-        directions_seen=items.directions_seen[:, :0],
+        directions_visible=items.directions_visible[:, :0],
         drawn_directions=items.drawn_directions[:0],
     )
     by_centres = alone.placed(items.drawn[None])[..., :3, :3]
@@ -318,7 +318,7 @@ def _by_directions(machine: Machine, axes: Axes, views: StationViews) -> Array:
     d = b[..., 0] + poses[..., None, :3, 3] - drawn.base_centers()
     d = d / np.sqrt(dot(d, d))[..., None]
     back = views.T_camera_view[axes.station, None, :3, :3].mT
-    u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
+    u = np.where(axes.visible[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
     member = (views.of_station[axes.station] == np.arange(views.n)[:, None]).astype(float)
     h = np.einsum("vc,bcli,bclj->bvij", member, u, d, optimize=True)
     return nearest_rotation(h)

@@ -46,9 +46,9 @@ def can_be_tried(machine: Machine, edges: int) -> None:
         )
 
 
-def every_leg_seen(machine: Machine, found: Booleans) -> None:
+def every_leg_visible(machine: Machine, valid: Booleans) -> None:
     """[A] 3.3, first condition; found (S, L) base centres."""
-    lost = np.flatnonzero(~found.any(axis=0))
+    lost = np.flatnonzero(~valid.any(axis=0))
     if lost.size:
         raise ResultError(
             what=f"leg {lost[0] + 1} of {machine.n_legs} is seen by no station well enough",
@@ -62,14 +62,14 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
     few = np.flatnonzero(~items.fixed()[views.of_station])
     if not few.size:
         return
-    seen = items.centres_seen[views.of_station[few[0]]]
-    which = f" ({named(np.flatnonzero(seen))})" if seen.any() else ""
+    visible = items.centres_visible[views.of_station[few[0]]]
+    which = f" ({named(np.flatnonzero(visible))})" if visible.any() else ""
     need = (
         "two or more" if legs_as_drawn(machine).planar else "three or more that are not on one line"
     )
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
-        found=f"{seen.sum()} base centres{which}",
+        found=f"{visible.sum()} base centres{which}",
         expected=f"{need}, each leg seen in two directions",
         next_step=f"give the station's pose, fix a board to the base, or {USE_JOINT_METHOD}",
     )
@@ -80,11 +80,11 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
     free = free_ways(items)
     if not free.shape[-1]:
         return
-    seen = items.seen[items.fixed()]
-    parts = parts_of(items.drawing, seen, free, items.n_directions)
+    in_view = items.visible[items.fixed()]
+    parts = parts_of(items.drawing, in_view, free, items.n_directions)
     a, b = (np.flatnonzero(part[: len(items.drawn)]) for part in parts)
     sees = [
-        f"station {s + 1} sees {named(np.flatnonzero(items.centres_seen[view]))}"
+        f"station {s + 1} sees {named(np.flatnonzero(items.centres_visible[view]))}"
         for s, view in enumerate(views.of_station)
     ]
     raise ResultError(
@@ -99,26 +99,26 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
 
 def free_ways(items: Items) -> Array:
     """Ways (L + D, 3, f) in which the views leave base joints free to move against others."""
-    return loose(items.drawing, items.seen[items.fixed()], items.n_directions)
+    return loose(items.drawing, items.visible[items.fixed()], items.n_directions)
 
 
-def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
+def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
     """[A] 3.5: enough legs with a length at once, each leg with enough others."""
     legs = legs_as_drawn(machine)
-    seen = axes.seen & usable[axes.station][:, None]
+    visible = axes.visible & usable[axes.station][:, None]
     if form == "corrected":
         configurations, row = np.unique(axes.configuration, return_inverse=True)
-        together = np.zeros((len(configurations), seen.shape[1]), dtype=bool)
-        np.logical_or.at(together, row, seen)
-        seen = together
-    at_once = seen & legs.closing
+        together = np.zeros((len(configurations), visible.shape[1]), dtype=bool)
+        np.logical_or.at(together, row, visible)
+        visible = together
+    at_once = visible & legs.closing
     posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
     if not posed.any():
         _too_few_at_once(legs, at_once)
-    known = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
-    free = loose(*known, motion=legs.motion)
+    reference_values = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
+    free = loose(*reference_values, motion=legs.motion)
     if free.shape[-1]:
-        a, b = parts_of(*known, free, motion=legs.motion)
+        a, b = parts_of(*reference_values, free, motion=legs.motion)
         names = np.flatnonzero(legs.closing)
         raise ResultError(
             what=f"the platform joints of {named(names[a])} can move against those of "
@@ -128,7 +128,7 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
             next_step=f"photograph the same configurations from more stations,"
             f" or {USE_JOINT_METHOD}",
         )
-    _needs_poses(legs, seen & posed[:, None])
+    _needs_poses(legs, visible & posed[:, None])
 
 
 def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
@@ -145,17 +145,17 @@ def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
     )
 
 
-def _needs_poses(legs: DrawnLegs, seen: Booleans) -> None:
+def _needs_poses(legs: DrawnLegs, visible: Booleans) -> None:
     """Passive legs and revolute axes need the platform's pose and the leg, twice."""
     for which, what in (
         (~legs.closing, "passive leg {}'s platform joint"),
         (legs.platform_revolute, "the revolute axis of leg {} on the platform"),
     ):
-        short = np.flatnonzero(which & (seen.sum(axis=0) < 2))
+        short = np.flatnonzero(which & (visible.sum(axis=0) < 2))
         if short.size:
             raise ResultError(
                 what=what.format(short[0] + 1) + " cannot be found",
-                found=f"seen in {seen[:, short[0]].sum()} configurations together with enough "
+                found=f"seen in {visible[:, short[0]].sum()} configurations together with enough "
                 "legs with a length",
                 expected="two directions at least, with three legs with a length at once, [A] 3.5",
                 next_step=f"add configurations or a station that sees it, or {USE_JOINT_METHOD}",
@@ -171,8 +171,8 @@ def lengths_are_fixed(
     """
     legs = legs_as_drawn(machine)
     not_collapsed(legs, q0[0])
-    seen = axes.seen & usable[axes.station][:, None] & legs.closing
-    merged = in_base(replace(axes, seen=seen), T_camera_base)
+    case = axes.visible & usable[axes.station][:, None] & legs.closing
+    merged = in_base(replace(axes, visible=case), T_camera_base)
     a = np.broadcast_to(base[:, None], merged.u.shape)
     value, slopes = (rows[0] for rows in joint_distance_deviations(merged, a, q0, "corrected"))
     freedom = max(np.count_nonzero(np.any(slopes, axis=1)) - int(legs.closing.sum()), 1)

@@ -58,8 +58,8 @@ def joint_distance_deviations(
     printed: differences of consecutive photographs of a station, C_2 as [A] 14 has it. corrected
     (errata): deviations from each pair's mean, sum (d_k - mean d)^2.
     """
-    j, g = np.triu_indices(axes.seen.shape[1], 1)
-    both = axes.seen[:, j] & axes.seen[:, g]
+    j, g = np.triu_indices(axes.visible.shape[1], 1)
+    both = axes.visible[:, j] & axes.visible[:, g]
     used = both.sum(axis=0) > 1
     j, g, both = j[used], g[used], both[:, used]
     b = a_photo + (axes.readings + at[:, None])[..., None] * axes.u
@@ -83,32 +83,32 @@ def joint_distance_deviations(
 
 
 def platform_by_registration(
-    b: Array, seen: Booleans, drawing: Array, gauge: Array, motion: Array = ANY_MOTION
+    b: Array, visible: Booleans, drawing: Array, gauge: Array, motion: Array = ANY_MOTION
 ) -> Array:
     """Step 4 corrected, [A] 16: platform centres (B, L, 3) from those in K frames.
 
     min sum |R_k b_j + t_k - B_jk|^2 over b and the poses. b : (B, K, L, 3) m, seen (K, L);
     each frame fixes its pose. motion : (6, d), how the platform moves in those frames.
     """
-    weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
+    weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
     return fit_body(b, weight, gauge, drawing, motion=motion).points
 
 
 def platform_by_distances(
-    b: Array, seen: Booleans, station: Integers, drawing: Array, gauge: Array
+    b: Array, visible: Booleans, station: Integers, drawing: Array, gauge: Array
 ) -> Array:
     """Step 4 as printed, [A] 16: centres whose distances are each station's mean distances.
 
     b : (B, C, L, 3) in the photographs' frames, seen (C, L), station (C,).
     """
-    j, g = np.triu_indices(seen.shape[1], 1)
-    both = (seen[:, j] & seen[:, g]).astype(float)
+    j, g = np.triu_indices(visible.shape[1], 1)
+    both = (visible[:, j] & visible[:, g]).astype(float)
     of_station = (station == np.unique(station)[:, None]).astype(float)
     count = of_station @ both
     d = np.linalg.norm(b[:, :, j] - b[:, :, g], axis=-1)
-    known = np.einsum("sc,bcp->bsp", of_station, d * both) / np.maximum(count, 1)
+    above_limit = np.einsum("sc,bcp->bsp", of_station, d * both) / np.maximum(count, 1)
     k, pair = np.nonzero(count)
-    j, g, known = j[pair], g[pair], known[:, k, pair]
+    j, g, above_limit = j[pair], g[pair], above_limit[:, k, pair]
     row = np.arange(len(j))
 
     def distances(points: Array, runs: Integers) -> tuple[Array, Array]:
@@ -117,13 +117,13 @@ def platform_by_distances(
         jac = np.zeros((*distance.shape, *points.shape[1:]))
         jac[:, row, j] = v / distance[..., None]
         jac[:, row, g] = -v / distance[..., None]
-        return distance - known[runs], jac
+        return distance - above_limit[runs], jac
 
     return points_by(distances, drawing, gauge, len(b))
 
 
 def platform_axes(
-    u: Array, seen: Booleans, T_base_platform: Array, information: Array | None = None
+    u: Array, visible: Booleans, T_base_platform: Array, information: Array | None = None
 ) -> tuple[Array, Booleans]:
     """[A] 18, then 7 in the platform frame: axes v' (B, L, 3) of either sign, (L,) found.
 
@@ -134,13 +134,13 @@ def platform_axes(
     rot = T_base_platform[..., None, :3, :3]
     back = rot.mT
     info = None if information is None else back @ information @ rot
-    none = np.zeros(len(seen), dtype=int)
-    v, found = revolute_axes((back @ u[..., None])[..., 0], seen, none, 1, info)
-    return v[:, 0], found[0]
+    none = np.zeros(len(visible), dtype=int)
+    v, value = revolute_axes((back @ u[..., None])[..., 0], visible, none, 1, info)
+    return v[:, 0], value[0]
 
 
 def passive_centres(
-    u: Array, base: Array, seen: Booleans, T_base_platform: Array
+    u: Array, base: Array, visible: Booleans, T_base_platform: Array
 ) -> tuple[Array, Booleans]:
     """[A] 19: centres b (B, L, 3) of legs without a length, u x AB = 0 with B = R b + t.
 
@@ -150,9 +150,9 @@ def passive_centres(
     back = inverse(T_base_platform)[:, :, None]
     turned = (back[..., :3, :3] @ u[..., None])[..., 0]
     through = apply(back, np.broadcast_to(base[:, None], u.shape))
-    none = np.zeros(len(seen), dtype=int)
-    b, _ = nearest_points(turned, through, seen, none, 1)
-    return b[:, 0], revolute_axes(turned, seen, none, 1)[1][0]
+    none = np.zeros(len(visible), dtype=int)
+    b, _ = nearest_points(turned, through, visible, none, 1)
+    return b[:, 0], revolute_axes(turned, visible, none, 1)[1][0]
 
 
 def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Array]:
@@ -168,7 +168,7 @@ def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Arr
 
 
 def universal_axes(
-    u: Array, rot: Array, seen: Booleans, drawn: tuple[Array, Array], tolerance: Array
+    u: Array, rot: Array, visible: Booleans, drawn: tuple[Array, Array], tolerance: Array
 ) -> tuple[Array, Array]:
     """First axes of universal-universal legs by the inverse kinematics, [A] 3.5 and errata.
 
@@ -177,7 +177,7 @@ def universal_axes(
     common turn of both axes wherever the platform does not turn, as on a 3-UPU. The torsion's
     own noise is taken from the residuals of a fit that hardly looks at the drawing, so that
     the data decide where they know better.
-    u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. seen : (K, L).
+    u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. visible : (K, L).
     drawn : axes v, w (B, L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
     """
 
@@ -187,9 +187,9 @@ def universal_axes(
         value, by_v, by_w = torsion(u, rot[:, :, None], v[:, None], w[:, None])
         jac = [by_v[..., None, :] @ v_by[:, None], by_w[..., None, :] @ w_by[:, None]]
         slope = np.concatenate(jac, axis=-1)[..., 0, :]
-        return np.where(seen, value, 0.0), np.where(seen[..., None], slope, 0.0)
+        return np.where(visible, value, 0.0), np.where(visible[..., None], slope, 0.0)
 
-    count = np.maximum(seen.sum(axis=0), 5)
+    count = np.maximum(visible.sum(axis=0), 5)
     start = np.zeros((len(u), u.shape[2], 4))
     x, variance = _beside_drawing(rows, start, count, TORSION_NOISE_TOLERANCES * tolerance)
     x, _ = _beside_drawing(rows, x, count, tolerance, variance)
@@ -199,9 +199,9 @@ def universal_axes(
 def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
     """Unit axes (..., 3) moved by x (..., 2) across themselves, and derivatives (..., 3, 2)."""
     tangents = tangent_basis(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
-    moved = axis + (tangents @ x[..., None])[..., 0]
-    size = np.sqrt(dot(moved, moved))[..., None]
-    return moved / size, across_directions(moved / size) @ tangents / size[..., None]
+    shifted = axis + (tangents @ x[..., None])[..., 0]
+    size = np.sqrt(dot(shifted, shifted))[..., None]
+    return shifted / size, across_directions(shifted / size) @ tangents / size[..., None]
 
 
 def _beside_drawing(

@@ -61,12 +61,12 @@ class Pair(NamedTuple):
 class PairProblem:
     """solver.LeastSquares of B runs: ``seen = T_camera_base body T_mount``, K poses each.
 
-    body, seen : (B, K, 4, 4). weight : (B, K). turn, shift : rad and m that count as one standard
-    deviation. size : m, the standard deviation of the mount's place, zero expected.
+    body, observed : (B, K, 4, 4). weight : (B, K). turn, shift : rad and m that count as one
+    standard deviation. size : m, the standard deviation of the mount's place, zero expected.
     """
 
     body: Array
-    seen: Array
+    observed: Array
     weight: Array
     turn: float
     shift: float
@@ -79,7 +79,7 @@ class PairProblem:
     def differences(self, state: Pair) -> Array:
         """Errors (B, K, 6) of the predicted poses, in standard deviations, without weights."""
         predicted = state.T_camera_base[:, None] @ self.body @ state.T_mount[:, None]
-        return pose_difference(predicted, self.seen) / self._sigma
+        return pose_difference(predicted, self.observed) / self._sigma
 
     def residuals(self, state: Pair) -> Values:
         """Weighted errors and the mount's place."""
@@ -91,7 +91,7 @@ class PairProblem:
         one = np.zeros((self.body.shape[1], 1), dtype=int)
         blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one, np.zeros(1))
         data = PoseData(
-            self.seen[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
+            self.observed[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
             np.zeros((1, 1, 1, 6, 0)),
         )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
@@ -107,7 +107,7 @@ class PairProblem:
             np.eye(12)[9:] / self.size,
         )
 
-    def moved(self, state: Pair, shared: Array, own: Array) -> Pair:
+    def retract(self, state: Pair, shared: Array, own: Array) -> Pair:
         """The pair after a step; a pose has no unknowns of its own."""
         del own
         camera = perturb(state.T_camera_base, shared[:, :6])
@@ -115,24 +115,24 @@ class PairProblem:
 
     def select(self, runs: Integers) -> PairProblem:
         """Some runs only."""
-        parts = (self.body[runs], self.seen[runs], self.weight[runs])
-        return replace(self, body=parts[0], seen=parts[1], weight=parts[2])
+        parts = (self.body[runs], self.observed[runs], self.weight[runs])
+        return replace(self, body=parts[0], observed=parts[1], weight=parts[2])
 
 
-def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
+def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
 
     size : the limbs' length, m. Closed forms as starts, then least squares with poses that
     disagree weighing less; of the starts the one that ends best.
     Raises ResultError where the poses do not tell how the camera stands.
     """
-    starts = [_placed(body, seen, *turns) for turns in _turns(body, seen)]
+    starts = [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
-    body, seen = (np.concatenate([part] * n) for part in (body, seen))
+    body, visibility = (np.concatenate([part] * n) for part in (body, visibility))
     problem = PairProblem(
         body,
-        seen,
+        visibility,
         np.ones(body.shape[:2]),
         DRAWN_POSE_TURN_SIGMA,
         DRAWN_POSE_SHIFT_SHARE * size,
@@ -148,11 +148,11 @@ def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
     chosen = best * runs + np.arange(runs)
     pair = take(every, chosen)
-    _check_told(problem.select(chosen), pair)
+    _check_identifiable(problem.select(chosen), pair)
     return pair
 
 
-def _check_told(problem: PairProblem, pair: Pair) -> None:
+def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
     linear = problem.linearize(pair)
     rows = linear.by_shared.reshape(len(linear.value), -1, 12)
     normal = rows.mT @ rows + linear.shared_by.T @ linear.shared_by
@@ -168,33 +168,33 @@ def _check_told(problem: PairProblem, pair: Pair) -> None:
         )
 
 
-def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
+def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
     """Possible turns of camera and mount, (B, 3, 3) each.
 
-    ``q_seen = q_camera q_body q_mount`` is linear in either, so the sum over the poses has the two
-    as its leading singular vectors. Where the platform turns about one axis two singular values
+    ``q_measured = q_camera q_body q_mount`` is linear in either, so the sum over the poses has the
+    two as its leading singular vectors. Where the platform turns about one axis two singular values
     are equal, where it does not turn all four: of what they leave open, the nearest to the turn
     that lays the positions on one another.
     """
-    q_body, q_seen = (quaternion(poses[..., :3, :3]) for poses in (body, seen))
+    q_body, q_measured = (quaternion(poses[..., :3, :3]) for poses in (body, visibility))
     # signs by the turns from the first pose, which both sides share
-    sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_seen, q_seen[:, :1]))
+    sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_measured, q_measured[:, :1]))
     sign = np.where(sign == 0, 1.0, sign)
-    # q_camera . (q_seen conj(q_mount) conj(q_body)) is linear in q_mount
+    # q_camera . (q_measured conj(q_mount) conj(q_body)) is linear in q_mount
     conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
-    each = _left(q_seen) @ _right(q_body @ conjugate) @ conjugate
+    each = _left_product(q_measured) @ _right(q_body @ conjugate) @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
-    laid = quaternion(register(body[..., :3, 3], seen[..., :3, 3])[..., :3, :3])
+    laid = quaternion(register(body[..., :3, 3], visibility[..., :3, 3])[..., :3, :3])
     along = u.mT @ laid[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in HAND_EYE_RANKS:
-        kept = along * (np.arange(4) < rank)[:, None]
-        camera, mount = u @ kept, vt.mT @ kept
+        retained_rows = along * (np.arange(4) < rank)[:, None]
+        camera, mount = u @ retained_rows, vt.mT @ retained_rows
         out.append((from_quaternion(camera[..., 0]), from_quaternion(mount[..., 0])))
     return out
 
 
-def _left(q: Array) -> Array:
+def _left_product(q: Array) -> Array:
     """Matrix (..., 4, 4) of ``p -> q p``, scalar first."""
     out = q[..., :1, None] * np.eye(4)
     out[..., 0, 1:], out[..., 1:, 0] = -q[..., 1:], q[..., 1:]
@@ -204,17 +204,17 @@ def _left(q: Array) -> Array:
 
 def _right(q: Array) -> Array:
     """Matrix (..., 4, 4) of ``p -> p q``."""
-    out = _left(q)
+    out = _left_product(q)
     out[..., 1:, 1:] -= 2 * skew(q[..., 1:])
     return out
 
 
-def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
+def _placed(body: Array, visibility: Array, camera: Array, mount: Array) -> Pair:
     """Places for known turns: ``t_seen = R_camera (R_body t_mount + t_body) + t_camera``, linear;
     t_mount is held to zero within the limbs' length.
     """
     rot = camera[:, None] @ body[..., :3, :3]
-    right = seen[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
+    right = visibility[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
     off_rot = (rot - rot.mean(axis=1, keepdims=True)).reshape(len(body), -1, 3)
     off = (right - right.mean(axis=1, keepdims=True)).reshape(len(body), -1, 1)
     normal = off_rot.mT @ off_rot + DRAWN_POSE_SHIFT_SHARE**2 * np.eye(3)
@@ -224,18 +224,22 @@ def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
 
 
 def start_from_poses(
-    machine: Machine, measurements: Measurements, known: Array | None = None
+    machine: Machine, measurements: Measurements, reference_values: Array | None = None
 ) -> State:
     """A start for the joint estimate, from the measured poses and readings by the drawing.
 
-    known : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without any.
-    Raises InputError for a station that nothing ties to the machine.
+    reference_values : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without
+    any. Raises InputError for a station that nothing ties to the machine.
     """
-    found = machine.forward_result(measurements.joints)
+    fk = machine.forward_result(measurements.joints)
     n_stations = measurements.n_stations
-    usable = found.converged & np.isfinite(found.T_base_platform).all(axis=(-1, -2))
-    poses = np.where(usable[:, None, None], found.T_base_platform, np.nan)
-    stations = np.full((n_stations, 4, 4), np.nan) if known is None else np.array(known, float)
+    usable = fk.converged & np.isfinite(fk.T_base_platform).all(axis=(-1, -2))
+    poses = np.where(usable[:, None, None], fk.T_base_platform, np.nan)
+    stations = (
+        np.full((n_stations, 4, 4), np.nan)
+        if reference_values is None
+        else np.array(reference_values, float)
+    )
     stations, mounts = _carried_on(machine, measurements, poses, stations)
     lost = np.flatnonzero(np.isnan(stations[:, 0, 0]))
     if lost.size:
@@ -248,11 +252,11 @@ def start_from_poses(
     return State(
         machine.values,
         stations,
-        found.T_base_platform,
+        fk.T_base_platform,
         np.zeros(measurements.n_cameras),
         T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
-        internal=found.internal,
+        internal=fk.internal,
     )
 
 
@@ -264,35 +268,37 @@ def _carried_on(
 
     poses : T_base_platform (K, 4, 4), NaN where unknown.
     """
-    seen, on_platform = measurements.poses, measurements.on_platform
+    in_view, on_platform = measurements.poses, measurements.on_platform
     stations, mounts = stations.copy(), np.full((len(on_platform), 4, 4), np.nan)
-    moving = on_platform[seen.mount]
-    body = np.tile(np.eye(4), (len(seen), 1, 1))
-    body[moving] = poses[seen.configuration[moving]]
+    moving = on_platform[in_view.mount]
+    body = np.tile(np.eye(4), (len(in_view), 1, 1))
+    body[moving] = poses[in_view.configuration[moving]]
     good = np.isfinite(body[:, 0, 0])
-    target = seen.T_station_target
+    target = in_view.T_station_target
     while True:
-        has_station = np.isfinite(stations[seen.station, 0, 0])
-        has_mount = np.isfinite(mounts[seen.mount, 0, 0])
+        has_station = np.isfinite(stations[in_view.station, 0, 0])
+        has_mount = np.isfinite(mounts[in_view.mount, 0, 0])
         to_mount, to_station = good & has_station & ~has_mount, good & has_mount & ~has_station
         if to_mount.any():
-            m = seen.mount[to_mount][0]
-            rows = to_mount & (seen.mount == m)
-            T_camera_body = stations[seen.station[rows]] @ body[rows]
+            m = in_view.mount[to_mount][0]
+            rows = to_mount & (in_view.mount == m)
+            T_camera_body = stations[in_view.station[rows]] @ body[rows]
             mounts[m] = middle_pose(inverse(T_camera_body) @ target[rows])
         elif to_station.any():
-            s = seen.station[to_station][0]
-            rows = to_station & (seen.station == s)
-            stations[s] = middle_pose(target[rows] @ inverse(body[rows] @ mounts[seen.mount[rows]]))
+            s = in_view.station[to_station][0]
+            rows = to_station & (in_view.station == s)
+            stations[s] = middle_pose(
+                target[rows] @ inverse(body[rows] @ mounts[in_view.mount[rows]])
+            )
         else:
             fit = good & moving & ~has_station
             pair, count = np.unique(
-                [seen.station[fit], seen.mount[fit]], axis=1, return_counts=True
+                [in_view.station[fit], in_view.mount[fit]], axis=1, return_counts=True
             )
             if count.max(initial=0) < LEAST_PAIR_CONFIGURATIONS:
                 return stations, mounts
             s, m = pair[:, np.argmax(count)]
-            rows = good & (seen.station == s) & (seen.mount == m)
+            rows = good & (in_view.station == s) & (in_view.mount == m)
             solved = solve_pairs(body[None, rows], target[None, rows], size_of(machine))
             stations[s], mounts[m] = solved.T_camera_base[0], solved.T_mount[0]
 

@@ -32,7 +32,7 @@ from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
+from pkmcal.papers.measured_platform import MeasuredPlatform, Taken, measured_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
@@ -72,7 +72,7 @@ class _Rows(NamedTuple):
     """
 
     value: Array
-    seen: SeenPlatform
+    platform: MeasuredPlatform
     taken: Taken
     closure: Closure
     scale: Array
@@ -131,8 +131,8 @@ class ImplicitProblem:
         stations, mounts = np.eye(self.n_stations)[self.station], np.eye(self.n_mounts)[self.mount]
         by_shared = np.concatenate([
             np.pad(closures, off),
-            _placed(rows.by_pose @ rows.seen.by_station, stations),
-            _placed(rows.by_pose @ rows.seen.by_mount, mounts),
+            _placed(rows.by_pose @ rows.platform.by_station, stations),
+            _placed(rows.by_pose @ rows.platform.by_mount, mounts),
         ], axis=-1)  # fmt: skip
         by_own = np.pad(rows.scale[..., None] * rows.closure.rows.by_internal, off)
         value = (self.weigh @ rows.value[..., None])[..., 0]
@@ -148,10 +148,10 @@ class ImplicitProblem:
 
     def _rows(self, state: ImplicitState) -> _Rows:
         theta = self.theta(state)[:, None]
-        seen = seen_platform(
+        in_view = measured_platform(
             state.T_camera_base[:, self.station], self.T_camera_board, state.T_mount[:, self.mount]
         )
-        own = taken(self.layout.motion, seen.pose)
+        own = taken(self.layout.motion, in_view.pose)
         internal = state.internal if self.layout.n_internal else None
         readings = self.readings
         if self.form == "joint":
@@ -165,7 +165,7 @@ class ImplicitProblem:
             # r = measured - wanted, and the closure stays zero: dr = dc / (dc/dq)
             scale = np.where(read, 1 / np.where(read, c.by_reading, 1.0), 1.0)
             value = np.where(read, (self.readings - readings)[..., np.maximum(motor, 0)], value)
-        return _Rows(np.concatenate([value, own.off], axis=-1), seen, own, c, scale)
+        return _Rows(np.concatenate([value, own.off], axis=-1), in_view, own, c, scale)
 
     def whitening(self, state: ImplicitState, noise: Array, joint_noise: float) -> Array:
         """Matrices (B, N, r, r) that whiten the rows at a state.
@@ -174,7 +174,7 @@ class ImplicitProblem:
         reading's, carried through the rows' derivatives.
         """
         rows = self._rows(state)
-        by = rows.by_pose @ rows.seen.by_measured
+        by = rows.by_pose @ rows.platform.by_measured
         covariance = by @ noise @ by.mT
         slope = (rows.scale * rows.closure.by_reading)[..., None] * self.layout.of_motor
         e = slope.shape[-2]
@@ -194,10 +194,10 @@ class ImplicitProblem:
         poses = self.platform_poses(state)
         readings = kinematics.readings_at_poses(self.layout, self.theta(state)[:, None], poses)
         readings = np.where(np.isfinite(readings), readings, self.readings)
-        seen = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
-        return replace(self, T_camera_board=seen, readings=readings)
+        case = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
+        return replace(self, T_camera_board=case, readings=readings)
 
-    def moved(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
+    def retract(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
         """The state after a step."""
         shared, u = shared * self.keep, self.unknowns
         camera = shared[:, u.stations].reshape(-1, self.n_stations, 6)
@@ -350,7 +350,7 @@ def fit_machine_to_poses(
     state = on_axis(problem, start)
     if noise is not None:
         problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
-    keep, rank = unknowns_kept(machine, problem, state, whitened=noise is not None)
+    keep, rank = estimable_unknowns(machine, problem, state, whitened=noise is not None)
     problem = replace(problem, keep=keep)
     solution = minimise(problem, state, max_steps=MOST_POSE_FIT_STEPS)
     if noise is not None:
@@ -397,7 +397,7 @@ def turn_between(a: Array, b: Array) -> Array:
     return rotation(across * angle / np.where(size > 0, size, 1.0))
 
 
-def unknowns_kept(
+def estimable_unknowns(
     machine: Machine, problem: ImplicitProblem, state: ImplicitState, *, whitened: bool
 ) -> tuple[Booleans, int]:
     """Unknowns (na,) that are estimated, and the rank of the Jacobian with all of them.
@@ -455,18 +455,18 @@ def _session_state(
     machine: Machine, measurements: Measurements, start: State, fit: PoseFit
 ) -> State:
     """The fit as a session's state, in the default frames, poses by the readings."""
-    stop, found = fit.solution.stop[0], fit.solution.state
+    stop, solution = fit.solution.stop[0], fit.solution.state
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the inverse-kinematic method failed: {stop.value}")
-    theta = fit.problem.theta(found)[0]
+    theta = fit.problem.theta(solution)[0]
     solved = machine.with_values(theta)
     poses = solved.forward_result(measurements.joints, start.T_base_platform)
     cameras, mounts = start.T_camera_base.copy(), start.T_mount.copy()
-    for before, after, told in (
-        (cameras, found.T_camera_base[0], fit.problem.station),
-        (mounts, found.T_mount[0], fit.problem.mount),
+    for before, after, covariance in (
+        (cameras, solution.T_camera_base[0], fit.problem.station),
+        (mounts, solution.T_mount[0], fit.problem.mount),
     ):
-        before[told] = after[told]  # the others have no pose among the data
+        before[covariance] = after[covariance]  # the others have no pose among the data
     state = replace(
         start,
         theta=theta,

@@ -31,7 +31,7 @@ ONE_PLANE = 1e-4
 class Axes:
     """Leg axes as the photographs show them, camera frame.
 
-    station, configuration : (C,) of each photograph. seen : (C, L).
+    station, configuration : (C,) of each photograph. visible : (C, L).
     u, point : (B, C, L, 3) direction from A to B, and any point of the axis (m).
     readings : (B, C, L). information : (B, C, L, 3, 3) how well each direction is known, any
     scale; it tells where several photographs show the same leg. Without it all count alike.
@@ -39,7 +39,7 @@ class Axes:
 
     station: Integers
     configuration: Integers
-    seen: Booleans
+    visible: Booleans
     u: Array
     point: Array
     readings: Array
@@ -49,7 +49,7 @@ class Axes:
         """Some legs only."""
         return replace(
             self,
-            seen=self.seen[:, legs],
+            visible=self.visible[:, legs],
             u=self.u[:, :, legs],
             point=self.point[:, :, legs],
             readings=self.readings[:, :, legs],
@@ -73,7 +73,7 @@ def across_directions(u: Array) -> Array:
 
 
 def nearest_points(
-    u: Array, point: Array, seen: Booleans, group: Integers, n_groups: int
+    u: Array, point: Array, visible: Booleans, group: Integers, n_groups: int
 ) -> tuple[Array, Booleans]:
     """[A] 6: the point nearest to a leg's axes, sum (I - u u^T)(M - A) = 0.
 
@@ -81,15 +81,15 @@ def nearest_points(
     equations that are not independent. u, point : (B, C, L, 3) in the frames of ``group``
     (C,). Returns A (B, G, L, 3) and (G, L) whether there are two directions.
     """
-    project = np.where(seen[..., None, None], across_directions(u), 0.0)
-    right = (project @ np.where(seen[..., None], point, 0.0)[..., None])[..., 0]
+    project = np.where(visible[..., None, None], across_directions(u), 0.0)
+    right = (project @ np.where(visible[..., None], point, 0.0)[..., None])[..., 0]
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
     normal = np.einsum("sc,bclij->bslij", of_group, project)
     right = np.einsum("sc,bcli->bsli", of_group, right)
     values = np.linalg.eigvalsh(normal)
-    found = np.all(values[..., 0] > ONE_DIRECTION * values[..., 2], axis=0)
-    normal = np.where(found[..., None, None], normal, np.eye(3))
-    return np.linalg.solve(normal, right[..., None])[..., 0], found
+    value = np.all(values[..., 0] > ONE_DIRECTION * values[..., 2], axis=0)
+    normal = np.where(value[..., None, None], normal, np.eye(3))
+    return np.linalg.solve(normal, right[..., None])[..., 0], value
 
 
 def centres_from_axes(axes: Axes, n_stations: int) -> tuple[Array, Booleans]:
@@ -97,12 +97,12 @@ def centres_from_axes(axes: Axes, n_stations: int) -> tuple[Array, Booleans]:
 
     Returns A (B, S, L, 3) and (S, L) whether each could be found.
     """
-    return nearest_points(axes.u, axes.point, axes.seen, axes.station, n_stations)
+    return nearest_points(axes.u, axes.point, axes.visible, axes.station, n_stations)
 
 
 def revolute_axes(
     u: Array,
-    seen: Booleans,
+    visible: Booleans,
     group: Integers,
     n_groups: int,
     information: Array | None = None,
@@ -115,11 +115,11 @@ def revolute_axes(
     sight than across it; with it, each equation counts by the noise that it has along v.
     """
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
-    u = np.where(seen[..., None], u, 0.0)
+    u = np.where(visible[..., None], u, 0.0)
 
     def least_along(weight: Array) -> tuple[Array, Array]:
         """Eigenvalues and -vectors of the weighted sum of u u^T in each group."""
-        weighted = np.where(seen, weight, 0.0)[..., None] * u
+        weighted = np.where(visible, weight, 0.0)[..., None] * u
         normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, u, optimize=True)
         return np.linalg.eigh(normal)
 
@@ -128,9 +128,9 @@ def revolute_axes(
     if information is not None:
         # covariances of the directions, across them, up to one factor
         size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
-        known = seen[..., None, None] & (size > 0)
+        above_limit = visible[..., None, None] & (size > 0)
         along = size * (u[..., :, None] * u[..., None, :])
-        covariance = np.linalg.inv(np.where(known, information + along, np.eye(3)))
+        covariance = np.linalg.inv(np.where(above_limit, information + along, np.eye(3)))
         for _ in range(REVOLUTE_WEIGHT_ROUNDS):
             v = np.einsum("sc,bsli->bcli", of_group, vectors[..., 0])
             noise = dot(v, (covariance @ v[..., None])[..., 0])
@@ -140,7 +140,7 @@ def revolute_axes(
 
 def plane_normals(
     u: Array,
-    seen: Booleans,
+    visible: Booleans,
     group: Integers,
     n_groups: int,
     information: Array | None = None,
@@ -152,7 +152,7 @@ def plane_normals(
     n = (u.shape[0], u.shape[1] * u.shape[2], 1)
     flat = None if information is None else information.reshape(*n, 3, 3)
     legs = np.repeat(group, u.shape[2])
-    return revolute_axes(u.reshape(*n, 3), seen.reshape(-1, 1), legs, n_groups, flat)
+    return revolute_axes(u.reshape(*n, 3), visible.reshape(-1, 1), legs, n_groups, flat)
 
 
 def in_base(axes: Axes, T_camera_base: Array) -> Axes:
@@ -164,15 +164,15 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     """
     rot = T_camera_base[:, axes.station, None, :3, :3]
     back = rot.mT
-    u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
+    u = np.where(axes.visible[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
     names, first, row = np.unique(axes.configuration, return_index=True, return_inverse=True)
     member = (row == np.arange(len(names))[:, None]).astype(float)
-    count = member @ axes.seen
+    count = member @ axes.visible
     total = np.einsum("kc,bcli->bkli", member, u)
     info = None
     if count.max(initial=0) > 1 or axes.information is not None:
         info = across_directions(axes.u) if axes.information is None else axes.information
-        info = np.where(axes.seen[..., None, None], back @ info @ rot, 0.0)
+        info = np.where(axes.visible[..., None, None], back @ info @ rot, 0.0)
         info = np.einsum("kc,bclij->bklij", member, info)
         joined = np.linalg.eigh(info)[1][..., 0]
         joined = joined * np.where(dot(joined, total) < 0, -1.0, 1.0)[..., None]
@@ -199,9 +199,9 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     np.add.at(information, group, weighted[:, :, None] * edges.normal[:, None])
     np.add.at(right, group, -radius[:, None] * weighted)
     np.add.at(sides, (edges.side, group), weighted)
-    seen: Booleans = np.all(np.linalg.norm(sides, axis=-1) > 0, axis=0)
+    visible: Booleans = np.all(np.linalg.norm(sides, axis=-1) > 0, axis=0)
     total = np.maximum(np.bincount(group, weight, n), 1e-300)
-    normal = np.where(seen[:, None, None], information / total[:, None, None], np.eye(3))
+    normal = np.where(visible[:, None, None], information / total[:, None, None], np.eye(3))
     u = np.linalg.eigh(normal)[1][..., 0]
     u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]
     # n.M = -R in the plane across the axis, and u.M = 0
@@ -212,7 +212,7 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     return Axes(
         station,
         configuration,
-        seen.reshape(full[1:]),
+        visible.reshape(full[1:]),
         u.reshape(*full, 3),
         point.reshape(*full, 3),
         joint_values(machine.layout, machine.values, measurements.joints[configuration])[None],
@@ -227,12 +227,12 @@ def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet
     centres : (S, L, 3) m, camera frames; edges of a NaN centre stay as they are.
     """
     a = centres[edges.station, edges.leg]
-    known: Booleans = np.all(np.isfinite(a), axis=-1)
-    a = np.where(known[:, None], a, 0.0)
+    finite: Booleans = np.all(np.isfinite(a), axis=-1)
+    a = np.where(finite[:, None], a, 0.0)
     along = edges.basis.mT @ a[..., None]
     gain = edges.covariance @ along
     spread = np.maximum((along.mT @ gain)[..., 0], 1e-300)
-    miss = np.where(known, dot(edges.normal, a) + machine.radii_of(edges.leg, edges.tube), 0.0)
+    miss = np.where(finite, dot(edges.normal, a) + machine.radii_of(edges.leg, edges.tube), 0.0)
     change = (edges.basis @ gain)[..., 0] * (miss[:, None] / spread)
     normal = edges.normal - change
     return replace(edges, normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True))

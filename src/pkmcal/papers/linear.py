@@ -161,8 +161,8 @@ def least_median(
         at = np.broadcast_to(half_of[some], r.shape[:2])[..., None]
         flat[some] = np.take_along_axis(np.sort(r, axis=-1), at, axis=-1)[..., 0]
     best = np.argmin(np.where(good, cost, np.inf), axis=-1)
-    found = np.take_along_axis(a, best[..., None, None], axis=-2)[..., 0, :]
-    return np.where((count[..., 0] >= 3) & good.any(axis=-1, keepdims=True), found, np.nan)
+    valid = np.take_along_axis(a, best[..., None, None], axis=-2)[..., 0, :]
+    return np.where((count[..., 0] >= 3) & good.any(axis=-1, keepdims=True), valid, np.nan)
 
 
 def errors_in_variables(
@@ -234,8 +234,8 @@ def solve_regressions(
     a, inverse = weighted_solution(n, radius, present)
     w = present
     if method in ("least-median", "robust"):
-        told = noise if method == "robust" else None
-        a = least_median(n, radius, present, rng, noise=told)
+        stated_noise = noise if method == "robust" else None
+        a = least_median(n, radius, present, rng, noise=stated_noise)
         if method == "least-median":
             return a, w, np.full((*a.shape, 3), np.nan)
     if method == "robust":

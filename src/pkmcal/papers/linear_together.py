@@ -130,7 +130,7 @@ class _State(NamedTuple):
     T_camera_base: Array
     shifts: Array
 
-    def moved(self, step: Array, u: Unknowns) -> _State:
+    def retract(self, step: Array, u: Unknowns) -> _State:
         """The state after a step (na,) of all unknowns."""
         turns = step[u.stations].reshape(-1, 6)
         shifts = self.shifts + step[u.optics.start : u.shading.stop]
@@ -183,11 +183,11 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
         )
     edges = measurements.edges
     alone = linear.centres(machine, measurements, "robust")
-    known: Booleans = np.all(np.isfinite(alone.centres), axis=-1)
-    if (known.sum(axis=1) < 3).any():
+    finite: Booleans = np.all(np.isfinite(alone.centres), axis=-1)
+    if (finite.sum(axis=1) < 3).any():
         raise ResultError(
             "[B]'s linear method needs three legs, each in two directions, at every station",
-            found=f"{known.sum(axis=1).min()} legs at one of them",
+            found=f"{finite.sum(axis=1).min()} legs at one of them",
             next_step=USE_DEFAULT_METHOD,
         )
     n_cameras = measurements.n_cameras
@@ -211,30 +211,30 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
         shifts=shifts,
         noise=edges.basis @ edges.covariance @ edges.basis.mT,
         by_shift=(edges.basis @ edges.shift[..., None])[..., 0],
-        used=known[edges.station, edges.leg],
+        used=finite[edges.station, edges.leg],
         start=_State(
             table.to_free(machine.values),
             np.tile(np.eye(4), (measurements.n_stations, 1, 1)),
             np.zeros(n_shifts),
         ),
     )
-    return _registered(system, alone.centres, known)
+    return _registered(system, alone.centres, finite)
 
 
-def _registered(system: _System, centres: Array, known: Booleans) -> _System:
+def _registered(system: _System, centres: Array, valid: Booleans) -> _System:
     """The system with its stations where the drawing, laid on three legs' centres (15), explains
     the most edges: among few configurations a leg may be lost to wrong edges, and would take a
     station that is laid on all legs along.
 
-    centres : (S, L, 3) leg by leg; known : (S, L).
+    centres : (S, L, 3) leg by leg; valid : (S, L).
     """
     edges, start = system.edges, system.start
     drawing = system.theta(start)[centre_index(system.machine.layout)[0]]
-    best, least = start.T_camera_base.copy(), np.full(len(known), np.inf)
+    best, least = start.T_camera_base.copy(), np.full(len(valid), np.inf)
     for legs in ((), *combinations(range(len(drawing)), 3)):
         three = np.isin(np.arange(len(drawing)), legs) if legs else np.ones(len(drawing), bool)
-        for s, (a, there) in enumerate(zip(centres, known & three, strict=True)):
-            if there.sum() < 3 or (legs and not known[s][list(legs)].all()):
+        for s, (a, there) in enumerate(zip(centres, valid & three, strict=True)):
+            if there.sum() < 3 or (legs and not valid[s][list(legs)].all()):
                 continue
             trial = start.T_camera_base.copy()
             trial[s] = register(drawing[there], a[there])
@@ -307,7 +307,7 @@ def _solved(
         q, r = np.linalg.qr(rows / size)
         half = np.linalg.inv(r) / size[:, None]
         step = -half @ (q.T @ right)
-        state = state.moved(step, u)
+        state = state.retract(step, u)
         if np.linalg.norm(q.T @ right) < PREDICTED_MOVE_SETTLED * max(1.0, np.linalg.norm(right)):
             return state, half
     raise ResultError(

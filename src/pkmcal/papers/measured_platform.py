@@ -17,7 +17,7 @@ from pkmcal.geometry.rigid import pose, rotation, rotation_vector, skew
 from pkmcal.measurements.poses import turn_jacobian
 
 
-class SeenPlatform(NamedTuple):
+class MeasuredPlatform(NamedTuple):
     """Platform poses (..., 4, 4) and their change (..., 6, 6) by T_base_camera, by the mount's pose
     and by the measured one.
     """
@@ -39,9 +39,9 @@ class Taken(NamedTuple):
     off_by: Array
 
 
-def seen_platform(
+def measured_platform(
     T_camera_base: Array, T_camera_board: Array, T_platform_board: Array
-) -> SeenPlatform:
+) -> MeasuredPlatform:
     """[C] eq. 6 and its derivatives; (..., 4, 4) each, leading axes broadcast."""
     back = T_camera_base[..., :3, :3].mT
     rot = back @ T_camera_board[..., :3, :3] @ T_platform_board[..., :3, :3].mT
@@ -56,7 +56,7 @@ def seen_platform(
         out[..., 3:, :3] = skew(lever) @ turn
         return out
 
-    return SeenPlatform(
+    return MeasuredPlatform(
         pose(rot, place), by(np.eye(3), camera - place), by(-rot, arm), by(back, arm)
     )
 

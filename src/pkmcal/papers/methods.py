@@ -17,8 +17,8 @@ from pkmcal.arrays import Array
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import data_share, told_in_gauge
-from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
+from pkmcal.identify.covariance import data_share, prior_in_gauge
+from pkmcal.identify.estimate import Estimate, State, Statistics, estimated_unknowns
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
@@ -97,10 +97,10 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
     poses = machine.with_values(base.theta).forward_result(measurements.joints, machine.home())
     state = with_boards(measurements, base.theta, base.T_camera_base, poses.T_base_platform)
     state = replace(state, edge_shift=base.edge_shift)
-    gauge, told = default_gauge(machine), told_unknowns(state)
-    spread = np.zeros((told.count, base.spread.shape[1]))
+    gauge, estimated = default_gauge(machine), estimated_unknowns(state)
+    spread = np.zeros((estimated.count, base.spread.shape[1]))
     spread[: len(base.spread)] = base.spread
-    full = told_in_gauge(machine, state, spread, np.eye(spread.shape[1]), gauge)
+    full = prior_in_gauge(machine, state, spread, np.eye(spread.shape[1]), gauge)
     state = in_gauge(machine, state, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     return replace(
@@ -125,12 +125,12 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
     noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
     poses = measurements.poses
     # what was not measured has no noise
-    moved = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
+    shifted = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
     return replace(
         measurements,
         edges=replace(edges, normal=normal),
         joints=measurements.joints + noise,
-        poses=replace(poses, T_station_target=perturb(poses.T_station_target, moved)),
+        poses=replace(poses, T_station_target=perturb(poses.T_station_target, shifted)),
     )
 
 
@@ -139,13 +139,13 @@ def _estimate(
     measurements: Measurements,
     state: State,
     joint: Array,
-    trust: tuple[Array, float] | None = None,
+    irls_weight: tuple[Array, float] | None = None,
 ) -> Estimate:
     """The method's result with its residuals.
 
-    joint : covariance as :class:`~pkmcal.identify.estimate.Estimate` has it. trust : weights (N,)
-    of the edges and the factor on their noise, where the method has its own; else edges far off the
-    rest have weight 0.
+    joint : covariance as :class:`~pkmcal.identify.estimate.Estimate` has it. irls_weight : weights
+    (N,) of the edges and the factor on their noise, where the method has its own; else edges far
+    off the rest have weight 0.
     """
     gauge = default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=False)
@@ -156,8 +156,8 @@ def _estimate(
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
     weight = (distance < NO_WEIGHT_DISTANCE * scale).astype(float)
-    if trust is not None:
-        weight, scale = trust
+    if irls_weight is not None:
+        weight, scale = irls_weight
     poses = assembled.places.poses.taken(unweighted.poses[0])
     links = assembled.places.links.taken(unweighted.links[0])[:, 0]
     n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
@@ -183,7 +183,7 @@ def _estimate(
         edge_trust=np.ones(len(weight)),
         joint_residuals=joints / measurements.joint_noise,
         data_share=data_share(machine, state.theta, joint, gauge),
-        configurations=assembled.seen,
+        configurations=assembled.observed,
         statistics=Statistics(
             chi2=chi2,
             dof=n_edges,

@@ -89,7 +89,7 @@ class BodyProblem:
             self.gauge / REGISTRATION_UNIT_SIGMA,
         )
 
-    def moved(self, state: RegisteredBody, shared: Array, own: Array) -> RegisteredBody:
+    def retract(self, state: RegisteredBody, shared: Array, own: Array) -> RegisteredBody:
         """The body after a step."""
         poses = perturb(state.poses, own @ self.motion.T)
         return RegisteredBody(state.points + shared.reshape(state.points.shape), poses)
@@ -138,11 +138,11 @@ def poses_laying_items(
     if motion.shape[1] == 6 and directions == 0:
         return register(items, measured, w)
     share = w[..., :n] / w[..., :n].sum(axis=-1, keepdims=True)
-    mean, seen = (np.sum(share[..., None] * p[..., :n, :], axis=-2) for p in (items, measured))
+    mean, visible = (np.sum(share[..., None] * p[..., :n, :], axis=-2) for p in (items, measured))
     centred = items.copy() * np.ones(measured.shape)
     target = measured * np.ones(centred.shape)
     centred[..., :n, :] -= mean[..., None, :]
-    target[..., :n, :] -= seen[..., None, :]
+    target[..., :n, :] -= visible[..., None, :]
     h = target.mT @ (w[..., None] * centred)
     if motion.shape[1] == 6:
         rot = nearest_rotation(h)
@@ -151,7 +151,7 @@ def poses_laying_items(
         if motion[2].any():  # about z
             omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
         rot = rotation(omega)
-    shift = seen - (rot @ mean[..., None])[..., 0]
+    shift = visible - (rot @ mean[..., None])[..., 0]
     return pose(rot, shift @ motion[3:] @ motion[3:].T)
 
 
@@ -161,15 +161,17 @@ def extent(points: Array) -> float:
     return float(np.sqrt(np.mean(dot(away, away))))
 
 
-def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION) -> Array:
+def loose(
+    items: Array, visible: Booleans, directions: int = 0, motion: Array = ANY_MOTION
+) -> Array:
     """Ways (n, 3, f) in which a body's items could move against each other unnoticed.
 
     The null space of the registration's Jacobian at ``items`` (n, 3), without the body's own
-    rigid motions: what frames that see ``seen`` (K, n) together leave open. f = 0 : all is
+    rigid motions: what frames that see ``visible`` (K, n) together leave open. f = 0 : all is
     fixed. Every item should be seen.
     """
     own = _own_motions(items, directions, motion)
-    mask = np.repeat(seen, 3, axis=1)[:, :, None]
+    mask = np.repeat(visible, 3, axis=1)[:, :, None]
     # an orthonormal basis of each frame's motions; those that it does not see count as nothing
     u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
     u = u * (s > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items)))[:, None, :]
@@ -180,7 +182,7 @@ def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY
 
 
 def parts_of(
-    items: Array, seen: Booleans, free: Array, directions: int = 0, motion: Array = ANY_MOTION
+    items: Array, visible: Booleans, free: Array, directions: int = 0, motion: Array = ANY_MOTION
 ) -> tuple[Booleans, Booleans]:
     """Two sets of items (n,) that ``free`` (n, 3, f), found by :func:`loose`, moves against each
     other: what moves while one frame's items are held, and what while another's are.
@@ -191,24 +193,24 @@ def parts_of(
     own = _own_motions(items, directions, motion)
     flat = free.reshape(len(own), -1)
     stay = []
-    for frame in seen:
+    for frame in visible:
         mask = np.repeat(frame, 3)
         held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE_ITEMS_EIGENVALUE)[0]
         rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
         stay.append(rate < 0.05 * rate.max())
     first = next((s for s in stay if not s.all()), np.zeros(len(items), dtype=bool))
     # where one frame holds nearly all, no other may look beyond it
-    beyond = (s for s, frame in zip(stay, seen, strict=True) if (frame & ~first).any())
+    beyond = (s for s, frame in zip(stay, visible, strict=True) if (frame & ~first).any())
     other = next(beyond, ~first)
     return first & ~other, other & ~first
 
 
 def fixes_pose(
-    items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION
+    items: Array, visible: Booleans, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Booleans:
     """Frames (K,) whose own items, seen (K, n), fix their pose of the body."""
     own = _own_motions(items, directions, motion)
-    s = np.linalg.svd(own * np.repeat(seen, 3, axis=1)[:, :, None], compute_uv=False)
+    s = np.linalg.svd(own * np.repeat(visible, 3, axis=1)[:, :, None], compute_uv=False)
     return s[:, -1] > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items))
 
 
@@ -249,7 +251,7 @@ class Dense:
         )
 
     @staticmethod
-    def moved(state: Array, shared: Array, own: Array) -> Array:
+    def retract(state: Array, shared: Array, own: Array) -> Array:
         """The vector after a step."""
         return state + shared + 0 * own.sum()
 

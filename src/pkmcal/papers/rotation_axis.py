@@ -34,7 +34,7 @@ LEAST_PAIR_TURN = np.radians(10.0)
 """Turns (rad) between two poses below which their axis is left out: noise grows as 1 / turn."""
 DROPPED_HYPOTHESIS_CHANCE = 1e-3
 """Probability below which a hypothesis is dropped: one honest session in a thousand."""
-KEPT_CHI2_A_FREEDOM = 2.0
+ACCEPTED_CHI2_A_FREEDOM = 2.0
 """chi2 per degree of freedom up to which a hypothesis is kept all the same: the noise of a pose out
 of a photograph is itself known to some 40 % only (lens, print, shading)."""
 ROTATION_AXIS_STEPS = 10
@@ -65,7 +65,8 @@ class RotationAxis:
     def tenable(self) -> bool:
         """Whether noise, or noise a little larger than stated, explains what is off."""
         return (
-            self.p_value >= DROPPED_HYPOTHESIS_CHANCE or self.chi2 <= KEPT_CHI2_A_FREEDOM * self.dof
+            self.p_value >= DROPPED_HYPOTHESIS_CHANCE
+            or self.chi2 <= ACCEPTED_CHI2_A_FREEDOM * self.dof
         )
 
     @property
@@ -82,8 +83,8 @@ class RotationAxis:
         )
         one = self.hypothesis == "one axis"
         if self.tenable:
-            kept = "turn about one axis" if one else "do not turn"
-            return f"The boards {kept}, as far as their noise tells: {facts}."
+            retained = "turn about one axis" if one else "do not turn"
+            return f"The boards {retained}, as far as their noise tells: {facts}."
         broken = "do not turn about one axis alone" if one else "turn, and the machine should not"
         return f"The boards {broken}: {facts}. The model leaves something out."
 
@@ -169,9 +170,9 @@ def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Arra
     """
     back = frames.camera.mT
     own = back @ rot @ frames.board.mT
-    found = taken(MOTION_DIRECTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
-    by = found.off_by[..., :3]
-    return found.off, by, own, by @ back @ noise @ frames.camera @ by.mT
+    count = taken(MOTION_DIRECTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
+    by = count.off_by[..., :3]
+    return count.off, by, own, by @ back @ noise @ frames.camera @ by.mT
 
 
 def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
@@ -212,8 +213,8 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     covariance = across @ noise[j] @ across.mT
     covariance = covariance + back @ noise[i] @ back.mT
     expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
-    found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
-    return float(found), float(expected)
+    values = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
+    return float(values), float(expected)
 
 
 def _pairs(n: int) -> tuple[Integers, Integers]:

@@ -69,15 +69,15 @@ def neighbours(
         step = NEIGHBOUR_RANGE_SHARE * (high - low)
         ends = [low + share * (high - low) for share in READING_RANGE_SHARES]
         wanted = np.clip(joints + rng.uniform(-1, 1, joints.shape) * step, *ends)
-        found = machine.forward_result(wanted, poses)
-        poses = found.T_base_platform[found.converged]
+        fk = machine.forward_result(wanted, poses)
+        poses = fk.T_base_platform[fk.converged]
     else:
         size = float(np.ptp(chosen.T_base_platform[:, :3, 3], axis=0).max())
         unit = np.array([NEIGHBOUR_RANGE_SHARE] * 3 + [NEIGHBOUR_RANGE_SHARE * size] * 3)
         motion = machine.layout.motion
         delta = rng.uniform(-1, 1, (len(poses), 6)) * unit @ motion @ motion.T
-        moved = on_manifold(machine.layout, machine.values, perturb(poses, delta))
-        poses = moved.T_base_platform[moved.converged]
+        shifted = on_manifold(machine.layout, machine.values, perturb(poses, delta))
+        poses = shifted.T_base_platform[shifted.converged]
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
     poses, joints = poses[finite], joints[finite]
@@ -108,8 +108,8 @@ def camera_ring_places(
             2 * np.pi * (np.arange(CAMERA_PLACES_A_RING) + 0.5 * (k % 2)) / CAMERA_PLACES_A_RING
         ):
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-            way = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
-            out.append(StationPlace(_tuple(centre + away * way), _tuple(centre)))
+            direction = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
+            out.append(StationPlace(_tuple(centre + away * direction), _tuple(centre)))
     return tuple(out)
 
 

@@ -40,7 +40,7 @@ LEAST_DIRECTION_INFORMATION = 1e-6
 """Information, in tolerances^-2, that a direction has at least for the logarithm of O1: a drawing
 knows it a million times better."""
 
-ToldShare = Callable[[float], None]
+ShareProgress = Callable[[float], None]
 
 
 class Index(Protocol):
@@ -118,8 +118,8 @@ class O1Index:
 
     def value(self, covariance: Array) -> Array:
         """-log of the geometric mean of the singular values."""
-        told = np.linalg.eigvalsh(np.linalg.inv(covariance)) - 1.0
-        return -0.5 * np.log(np.maximum(told, LEAST_DIRECTION_INFORMATION)).mean(axis=-1)
+        eigenvalues = np.linalg.eigvalsh(np.linalg.inv(covariance)) - 1.0
+        return -0.5 * np.log(np.maximum(eigenvalues, LEAST_DIRECTION_INFORMATION)).mean(axis=-1)
 
     def size(self, value: float, _p: int, /) -> float:
         """In tolerances."""
@@ -128,8 +128,8 @@ class O1Index:
     def slope(self, covariance: Array) -> Array:
         """By C, through its inverse."""
         values, vectors = np.linalg.eigh(np.linalg.inv(covariance))
-        told = np.maximum(values - 1.0, LEAST_DIRECTION_INFORMATION)
-        return vectors * (values / np.sqrt(2 * len(values) * told))
+        excess = np.maximum(values - 1.0, LEAST_DIRECTION_INFORMATION)
+        return vectors * (values / np.sqrt(2 * len(values) * excess))
 
 
 def _tool(info: CandidateRows) -> Index:
@@ -148,8 +148,8 @@ PLAN_INDICES: Mapping[str, Callable[[CandidateRows], Index]] = {
 def _root(matrix: Array) -> Array:
     """F (p, k) with F F^T = matrix."""
     values, vectors = np.linalg.eigh(matrix)
-    kept = values > 1e-12 * values[-1]
-    return vectors[:, kept] * np.sqrt(values[kept])
+    retained_rows = values > 1e-12 * values[-1]
+    return vectors[:, retained_rows] * np.sqrt(values[retained_rows])
 
 
 class Greedy(NamedTuple):
@@ -161,10 +161,12 @@ class Greedy(NamedTuple):
     path: Array
 
 
-def greedy(info: CandidateRows, count: int, index: Index, told: ToldShare | None = None) -> Greedy:
+def greedy(
+    info: CandidateRows, count: int, index: Index, progress: ShareProgress | None = None
+) -> Greedy:
     """``count`` candidates of each group, the best next one of each group in turn.
 
-    Each group has ``count`` candidates or more. told : called with the share done.
+    Each group has ``count`` candidates or more. progress : called with the share done.
     """
     work, groups = _Work(info, index), int(info.group.max()) + 1
     chosen, path = list[int](), list[Array]()
@@ -174,8 +176,8 @@ def greedy(info: CandidateRows, count: int, index: Index, told: ToldShare | None
         work.add(best, 1.0)
         chosen.append(best)
         path.append(work.machine)
-        if told:
-            told((k + 1) / (count * groups))
+        if progress:
+            progress((k + 1) / (count * groups))
     return Greedy(np.array(chosen), np.array(path))
 
 
@@ -202,26 +204,26 @@ class _Work:
     """
 
     def __init__(self, info: CandidateRows, index: Index) -> None:
-        diagonal = np.diag(info.known) + np.einsum("nri,nri->i", info.rows, info.rows)
+        diagonal = np.diag(info.information) + np.einsum("nri,nri->i", info.rows, info.rows)
         self._unit = np.sqrt(diagonal)
         self._rows = info.rows / self._unit
         self._group, self._where = info.group, info.where
-        self._known = info.known / np.outer(self._unit, self._unit)
-        self._way = info.machine / self._unit
+        self._information = info.information / np.outer(self._unit, self._unit)
+        self._directions = info.machine / self._unit
         self._index = index
-        self._covariance = np.zeros_like(self._known)
+        self._covariance = np.zeros_like(self._information)
 
     def begin(self, chosen: list[int]) -> None:
         """The covariance with these candidates."""
         rows = self._rows[np.array(chosen, dtype=int)].reshape(-1, len(self._unit))
-        half = np.linalg.cholesky(self._known + rows.T @ rows)
+        half = np.linalg.cholesky(self._information + rows.T @ rows)
         inverse = np.linalg.solve(half, np.eye(len(half)))
         self._covariance = inverse.T @ inverse
 
     @property
     def machine(self) -> Array:
         """(p, p) of the machine's directions."""
-        return self._way @ self._covariance @ self._way.T
+        return self._directions @ self._covariance @ self._directions.T
 
     def add(self, candidate: int, sign: float) -> None:
         """A candidate comes (1) or goes (-1)."""
@@ -235,7 +237,7 @@ class _Work:
         makes the index smallest; of those with which it is equal, the one of the least variance.
         """
         now = self.machine
-        to_slope = self._covariance @ (self._way.T @ self._index.slope(now))
+        to_slope = self._covariance @ (self._directions.T @ self._index.slope(now))
         begin, end = np.searchsorted(self._group, [group, group + 1])
         own = np.array([t for t in taken if begin <= t < end], dtype=int)
         free = np.ones(end - begin, dtype=bool)
@@ -250,10 +252,10 @@ class _Work:
         rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT
-        moved = across @ self._way.T
-        after = now - moved.mT @ np.linalg.solve(inner, moved)
+        shifted = across @ self._directions.T
+        after = now - shifted.mT @ np.linalg.solve(inner, shifted)
         value = self._index.value(after)
         # while some direction is told nothing, the largest eigenvalue is the same whatever comes
-        alike = value <= value.min() + EXCHANGE_GAIN_ROUNDING * np.abs(value.min())
-        spread = np.where(alike, after.trace(axis1=1, axis2=2), np.inf)
+        same = value <= value.min() + EXCHANGE_GAIN_ROUNDING * np.abs(value.min())
+        spread = np.where(same, after.trace(axis1=1, axis2=2), np.inf)
         return int(begin + top[np.argmin(spread)])

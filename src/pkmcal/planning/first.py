@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, numbered
-from pkmcal.calibration.gather import refinement_of
+from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
@@ -21,7 +21,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.photographs import Photographs, placed_at
+from pkmcal.observe.image_batches import Photographs, placed_at
 from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
@@ -50,7 +50,7 @@ class EdgePool(NamedTuple):
     lengths (n,) in px of the edges that told it. shading : px, its own.
     """
 
-    told: Array
+    information: Array
     weight: Array
     length: Array
     shading: float = OWN_SHADING
@@ -80,13 +80,13 @@ Pools = tuple[EdgePool, ...]
 class EdgesOf:
     """Edges (k, E) of a station's first photographs, in the order of ``tubes_of``.
 
-    photographs : (k,) their numbers. expected : of which nothing hides the most. found : that were
+    photographs : (k,) their numbers. expected : of which nothing hides the most. valid : that were
     measured and agree with all others.
     """
 
     photographs: Integers
     expected: Booleans
-    found: Booleans
+    valid: Booleans
 
 
 @dataclass(frozen=True)
@@ -143,23 +143,23 @@ def first_edges(
             edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
         )
 
-    looks = legs.search_stations(placed_at(few, T_camera_base, poses), machine)
-    coarse = replace(measurements(concatenate([one.edges for one in looks])), shaded=False)
+    passes = legs.search_stations(placed_at(few, T_camera_base, poses), machine)
+    coarse = replace(measurements(concatenate([one.edges for one in passes])), shaded=False)
     # a pixel is what the search is good to, so there is no noise to be estimated
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
     state = estimate.state
     placed = placed_at(few, state.T_camera_base, state.T_base_platform)
-    looks = legs.measure_stations(placed, estimate.machine, {})
-    fine = measurements(concatenate([one.edges for one in looks]))
+    passes = legs.measure_stations(placed, estimate.machine, {})
+    fine = measurements(concatenate([one.edges for one in passes]))
     held = refinement_of(session, refine=False)
     fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
     start = replace(state, intrinsics=np.zeros_like(held.at))
     estimate = bundle(machine, fine, start)
-    return _told(few, rows, estimate, fine.edges)
+    return _edge_information(few, rows, estimate, fine.edges)
 
 
-def _told(
+def _edge_information(
     few: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
 ) -> FirstEdges:
     """What an edge that ought to be seen tells on average, lost ones with nothing."""
@@ -184,27 +184,31 @@ def _told(
     def place(some: EdgeSet) -> tuple[Integers, Integers, Integers]:
         return some.station, some.configuration, number[some.leg, some.tube, some.side]
 
-    expected, kept, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
+    expected, retained_rows, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
     expected[place(ideal)] = True
     # of a tube that is hidden for the most part nobody asks why its edges are lost
     length = np.ptp(ideal.span, axis=1)
     longest = np.zeros(n_edges)
     np.maximum.at(longest, place(ideal)[2], length)
     whole[place(ideal)] = length > EXPECTED_EDGE_FREE_SHARE * longest[place(ideal)[2]]
-    kept[place(edges.select(estimate.edge_weights > 0.5))] = True
-    kept &= expected
+    retained_rows[place(edges.select(estimate.edge_weights > 0.5))] = True
+    retained_rows &= expected
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
     scale = estimate.edge_noise.scale[edges.tube]
     weight = estimate.edge_weights * estimate.edge_trust / scale**2
     own = unit[place(edges)]
-    told = np.zeros((*shape, 2, 2))  # lost edges stay zero
-    told[place(edges)] = own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
+    information = np.zeros((*shape, 2, 2))  # lost edges stay zero
+    information[place(edges)] = (
+        own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
+    )
     kind = np.stack([tubes.tube, tubes.side], axis=1)
     long = np.ones(shape)
     long[place(ideal)] = pixel_lengths(ideal)
     own_shading = estimate.edge_noise.shading[tubes.tube]
-    pools = tuple(_pools(told[s], long[s], expected[s], kind, own_shading) for s in range(len(few)))
+    pools = tuple(
+        _pools(information[s], long[s], expected[s], kind, own_shading) for s in range(len(few))
+    )
     sigma = np.full((len(few), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.hypot(
@@ -214,31 +218,33 @@ def _told(
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
         sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
     by_station = tuple(
-        EdgesOf(own, whole[s, p.configuration], (kept & whole)[s, p.configuration])
+        EdgesOf(own, whole[s, p.configuration], (retained_rows & whole)[s, p.configuration])
         for s, (own, p) in enumerate(zip(rows, few, strict=True))
     )
     return FirstEdges(estimate, pools, sigma, by_station)
 
 
-def _pools(told: Array, length: Array, expected: Booleans, kind: Integers, shading: Array) -> Pools:
+def _pools(
+    values: Array, length: Array, expected: Booleans, kind: Integers, shading: Array
+) -> Pools:
     """What edges of a station may tell, by edge (E,): its tube's own, and that of all of its kind.
 
-    told : (K, E, 2, 2), zero where lost; length : (K, E), px; expected : (K, E). kind : (E, 2) tube
-    and side. shading : (E,) px. Edges differ: a mean would promise more than edges of which some
-    tell much and others nothing.
+    values : (K, E, 2, 2), zero where lost; length : (K, E), px; expected : (K, E). kind : (E, 2)
+    tube and side. shading : (E,) px. Edges differ: a mean would promise more than edges of which
+    some tell much and others nothing.
     """
     out: list[EdgePool] = []
-    for e in range(told.shape[1]):
-        alike = np.all(kind == kind[e], axis=1)
-        mine, like = expected[:, e], expected[:, alike]
+    for e in range(values.shape[1]):
+        same = np.all(kind == kind[e], axis=1)
+        mine, like = expected[:, e], expected[:, same]
         weight = np.concatenate(
             [np.ones(mine.sum()), np.full(like.sum(), SHARED_EDGES_WEIGHT / max(like.sum(), 1))]
         )
         out.append(
             EdgePool(
-                np.concatenate([told[mine, e], told[:, alike][like]]),
+                np.concatenate([values[mine, e], values[:, same][like]]),
                 weight,
-                np.concatenate([length[mine, e], length[:, alike][like]]),
+                np.concatenate([length[mine, e], length[:, same][like]]),
                 float(shading[e]),
             )
         )
@@ -256,21 +262,23 @@ def drawn_edges(
     own, length = np.zeros((len(edges), 2, 2)), pixel_lengths(edges)
     shading = edges.shading.copy()
     for e in range(len(tubes)):
-        alike = (edges.leg == tubes.leg[e]) & (edges.tube == tubes.tube[e])
-        alike &= edges.side == tubes.side[e]
+        same = (edges.leg == tubes.leg[e]) & (edges.tube == tubes.tube[e])
+        same &= edges.side == tubes.side[e]
         for s, station in enumerate(pools):
-            mine, pool = np.flatnonzero(alike & (edges.station == s)), station[e]
-            if not len(pool.told) or not mine.size:
+            mine, pool = np.flatnonzero(same & (edges.station == s)), station[e]
+            if not len(pool.information) or not mine.size:
                 continue
             shading[mine] = pool.shading
             chance = pool.chances(length[mine])
             if rng is None:
-                own[mine] = np.tensordot(chance, pool.told, axes=1)
+                own[mine] = np.tensordot(chance, pool.information, axes=1)
             else:
                 drawn = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
-                own[mine] = pool.told[np.minimum(drawn.sum(axis=1), len(pool.told) - 1)]
-    told = np.linalg.eigvalsh(own)[:, 0] > 0
-    edges, own = replace(edges, shading=shading).select(told), own[told]
+                own[mine] = pool.information[
+                    np.minimum(drawn.sum(axis=1), len(pool.information) - 1)
+                ]
+    informative = np.linalg.eigvalsh(own)[:, 0] > 0
+    edges, own = replace(edges, shading=shading).select(informative), own[informative]
     unit = pixel_turns(edges)
     return replace(edges, covariance=unit @ np.linalg.inv(own) @ unit.mT)
 

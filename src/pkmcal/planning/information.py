@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.saved import Known
+from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
@@ -81,12 +81,12 @@ class Candidates:
 
 class Directions(NamedTuple):
     """Directions (nz, p) of the machine's free parameters z that frames and conventions leave, each
-    a tolerance large, and back from z, (p, nz); moved : (nz, g) what those do to z.
+    a tolerance large, and back from z, (p, nz); span : (nz, g) what those do to z.
     """
 
     to_z: Array
     of_z: Array
-    moved: Array
+    span: Array
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class CandidateRows:
 
     rows : (n, r, na) on the shared unknowns in their own units. group : (n,) in increasing order,
     which group of stations measures each. where : (n, m) its readings, in parts of the motors'
-    ranges. known : (na, na) information beforehand, with the drawing's. machine : (p, na) the
+    ranges. information : (na, na) information beforehand, with the drawing's. machine : (p, na) the
     machine's directions, of which the drawing alone knows each to one. work : (M, 6, p) turn and
     shift of the platform at M poses of the workspace by each direction, rad and m.
     """
@@ -103,21 +103,21 @@ class CandidateRows:
     rows: Array
     group: Integers
     where: Array
-    known: Array
+    information: Array
     machine: Array
     work: Array
 
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
         """(na, na) information of a choice of candidates, each measured ``times`` over."""
         rows = self.rows[chosen].reshape(-1, self.rows.shape[-1])
-        return self.known + times * (rows.T @ rows)
+        return self.information + times * (rows.T @ rows)
 
     def covariance(self, information: Array) -> Array:
         """(p, p) of the machine's directions, in tolerances, by an information (na, na)."""
         scale = np.sqrt(np.diag(information))
         half = np.linalg.cholesky(information / np.outer(scale, scale))
-        left = np.linalg.solve(half, (self.machine / scale).T)
-        return left.T @ left
+        residual = np.linalg.solve(half, (self.machine / scale).T)
+        return residual.T @ residual
 
     def tool(self, covariance: Array) -> tuple[float, float]:
         """Standard deviations of the platform's position (m) and turn (rad) by a covariance (p, p),
@@ -132,55 +132,57 @@ def information_of(
     rig: Rig,
     candidates: Candidates,
     work: Array,
-    known: Known | None = None,
+    reference_values: CalibrationPrior | None = None,
     rng: np.random.Generator | None = None,
     wanted: int | None = None,
 ) -> CandidateRows:
     """Rows of all candidates; see the module.
 
-    work : T_base_platform (M, 4, 4) where the tool counts. known : what an earlier calibration
-    knows of the machine, in place of its drawing. rng : as for
+    work : T_base_platform (M, 4, 4) where the tool counts. reference_values : what an earlier
+    calibration knows of the machine, in place of its drawing. rng : as for
     :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : how many of each group are to be
     measured in the end, all by default: edges that are shaded alike count together. Raises
     InputError where a group of stations measures nothing at any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
-    _check_seen(rig, candidates, measurements)
+    _check_observed(rig, candidates, measurements)
     each = len(joints) / len(candidates.groups)
     share = 1.0 if wanted is None or each < 2 else min((wanted - 1) / (each - 1), 1.0)
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
-    way, u = machine_directions(machine, problem), problem.unknowns
+    direction, u = machine_directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
-    rows[assembled.seen] = reduced  # of what shows nothing, nothing is told
+    rows[assembled.observed] = reduced  # of what shows nothing, nothing is told
     prior = problem.prior
-    if known is not None:  # the drawing speaks in it already
+    if reference_values is not None:  # the drawing speaks in it already
         prior = prior[~prior[:, u.machine].any(axis=1)]
     total = prior.T @ prior
     for part in (u.stations, u.mounts):
         total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_PLACE_SIGMA**2
-    if known is not None:
-        at, told = _told_by(known, machine, problem, rig.T_station_base, way)
-        total[np.ix_(at, at)] += told
-    directed = np.zeros((len(way.of_z), u.count))
-    directed[:, u.machine] = way.of_z
+    if reference_values is not None:
+        at, values = _prior_information(
+            reference_values, machine, problem, rig.T_station_base, direction
+        )
+        total[np.ix_(at, at)] += values
+    directed = np.zeros((len(direction.of_z), u.count))
+    directed[:, u.machine] = direction.of_z
     return CandidateRows(
         rows=rows,
         group=candidates.group,
         where=joints / motor_spans(joints, machine.joint_ranges),
-        known=total,
+        information=total,
         machine=directed,
-        work=tool_by_free(rig, problem, machine.inverse(work), work) @ way.to_z,
+        work=tool_by_free(rig, problem, machine.inverse(work), work) @ direction.to_z,
     )
 
 
-def _check_seen(rig: Rig, candidates: Candidates, measurements: Measurements) -> None:
+def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements) -> None:
     """Raise `InputError` where a group of stations measures nothing anywhere."""
     edges, poses = measurements.edges.configuration, measurements.poses.configuration
-    seen = np.unique(candidates.group[np.concatenate([edges, poses])])
-    lost = np.setdiff1d(candidates.group, seen)
+    in_view = np.unique(candidates.group[np.concatenate([edges, poses])])
+    lost = np.setdiff1d(candidates.group, in_view)
     if not lost.size:
         return
     names = [rig.names[s] for s in candidates.groups[lost[0]]]
@@ -197,13 +199,17 @@ def machine_directions(machine: Machine, problem: Problem) -> Directions:
     """The machine's directions at its present values."""
     tolerance = machine.parameters.tolerances_free()
     moves = move_generators(machine.layout, machine.values) @ conventions(machine)
-    moved = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
-    basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, moved.shape[1] :]
-    return Directions(tolerance[:, None] * basis, basis.T / tolerance, moved)
+    shifted = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
+    basis = np.linalg.qr(shifted / tolerance[:, None], mode="complete")[0][:, shifted.shape[1] :]
+    return Directions(tolerance[:, None] * basis, basis.T / tolerance, shifted)
 
 
-def _told_by(
-    known: Known, machine: Machine, problem: Problem, T_station_base: Array, way: Directions
+def _prior_information(
+    prior: CalibrationPrior,
+    machine: Machine,
+    problem: Problem,
+    T_station_base: Array,
+    sense: Directions,
 ) -> tuple[Integers, Array]:
     """Where in the shared unknowns, and with which information, an earlier calibration speaks.
 
@@ -211,23 +217,23 @@ def _told_by(
     tolerance's variance: they move the kept stations with the machine, and no measurement minds.
     """
     u, n = problem.unknowns, len(machine.values)
-    kept = np.array(known.stations, dtype=int)
-    to_free = np.zeros((u.n_free + 6 * len(kept), n + 6 * len(kept)))
+    retained_rows = np.array(prior.stations, dtype=int)
+    to_free = np.zeros((u.n_free + 6 * len(retained_rows), n + 6 * len(retained_rows)))
     to_free[: u.n_free, :n] = problem.structure.to_free
-    to_free[u.n_free :, n:] = np.eye(6 * len(kept))
+    to_free[u.n_free :, n:] = np.eye(6 * len(retained_rows))
     frames = conventions(machine)
-    moved = [way.moved]
-    if len(kept):
-        stations = station_generators(T_station_base[kept]) @ frames[:12]
-        moved.append(stations.reshape(-1, frames.shape[1]))
-    moved = np.concatenate(moved)
-    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(kept)))
-    share = moved / size[:, None]
-    moved = moved / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
-    spread = to_free @ known.covariance @ to_free.T + moved @ moved.T
+    shifted = [sense.span]
+    if len(retained_rows):
+        stations = station_generators(T_station_base[retained_rows]) @ frames[:12]
+        shifted.append(stations.reshape(-1, frames.shape[1]))
+    shifted = np.concatenate(shifted)
+    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(retained_rows)))
+    share = shifted / size[:, None]
+    shifted = shifted / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
+    spread = to_free @ prior.covariance @ to_free.T + shifted @ shifted.T
     values, vectors = np.linalg.eigh(spread / np.outer(size, size))
     half = vectors / np.sqrt(np.maximum(values, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
-    columns = u.stations.start + 6 * kept[:, None] + np.arange(6)
+    columns = u.stations.start + 6 * retained_rows[:, None] + np.arange(6)
     at = np.concatenate([np.arange(u.n_free), columns.ravel()])
     return at, half @ half.T
 
@@ -240,5 +246,5 @@ def tool_by_free(rig: Rig, problem: Problem, joints: Array, poses: Array) -> Arr
     state = State(machine.values, rig.T_station_base, poses, np.zeros(1))
     free = transformation(machine, state, BestFit())[:n, :n] @ problem.free
     by = pose_by_parameters(machine, joints, poses)
-    legs_seen = any(isinstance(one, LegsFrom) for one in rig.instruments)
-    return without_frames(machine, poses, by, every=not legs_seen) @ free
+    legs_observed = any(isinstance(one, LegsFrom) for one in rig.instruments)
+    return without_frames(machine, poses, by, every=not legs_observed) @ free

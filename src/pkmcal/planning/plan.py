@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.calibration.saved import Known
+from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
@@ -26,10 +26,10 @@ from pkmcal.planning.candidates import (
     neighbours,
 )
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
-from pkmcal.planning.exchange import PLAN_INDICES, ToldShare, exchanged, greedy
+from pkmcal.planning.exchange import PLAN_INDICES, ShareProgress, exchanged, greedy
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
-from pkmcal.planning.route import length, motor_distances, shortest_way
+from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import Subject
 from pkmcal.ranges import check_number
 from pkmcal.simulation.placement import StationPlace, usable
@@ -48,7 +48,7 @@ FOR_PLACES = 24
 """Configurations by which places of a camera are compared."""
 RANDOM_PLANS_COMPARED = 10
 """Choices by chance that a plan is compared with."""
-CAPTURE_MULTIPLES_TOLD = (2, 4)
+CAPTURE_MULTIPLES = (2, 4)
 """How many times as many photographs are told as well."""
 WORTHWHILE_ACCURACY_GAIN = 0.01
 """Part of its standard deviation by which one more configuration from each place has to better the
@@ -143,7 +143,7 @@ def plan_measurements(
     free_places: int | None = None,
     best_of: int | None = None,
     seed: int = PLAN_SEED,
-    told: ToldShare | None = None,
+    progress: ShareProgress | None = None,
 ) -> MeasurementPlan:
     """The plan.
 
@@ -152,10 +152,10 @@ def plan_measurements(
     reach if absent. together : whether all stations measure every configuration; by default where
     they have cameras or trackers of their own. free_places : how many places of the camera to
     choose on a sphere about the machine. best_of : how many of the rig's stations to choose.
-    seed : of what is drawn. told : called with the share done.
+    seed : of what is drawn. progress : called with the share done.
     Raises InputError for what cannot be planned.
     """
-    told = told or (lambda _share: None)
+    progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
@@ -163,20 +163,22 @@ def plan_measurements(
     drawn = configurations(
         rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
     )
-    told(0.1)
+    progress(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
-        rig, known, tried = _with_places(subject, work, drawn, count, index, free_places, best_of)
-        subject = replace(subject, rig=rig, known=known)
-    told(0.3)
+        rig, reference_values, tried = _with_places(
+            subject, work, drawn, count, index, free_places, best_of
+        )
+        subject = replace(subject, rig=rig, prior=reference_values)
+    progress(0.3)
     joined = _together(rig) if together is None else together
     stations = range(len(rig.names))
     groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
-    made = _Making(rig, subject.known, groups, count, index, work)
+    made = _Making(rig, subject.prior, groups, count, index, work)
     pool = made.pool(Candidates.of_all(groups, *drawn))
-    found = made.chosen(pool, rng, lambda share: told(0.3 + 0.6 * share))
-    told(0.9)
-    return _ordered(subject, made, found, pool, region, joined, tried, rng)
+    item = made.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
+    progress(0.9)
+    return _ordered(subject, made, item, pool, region, joined, tried, rng)
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
@@ -228,7 +230,7 @@ class _Making:
     """What is chosen, and by what."""
 
     rig: Rig
-    known: Known | None
+    prior: CalibrationPrior | None
     groups: tuple[tuple[int, ...], ...]
     count: int
     index: str
@@ -236,17 +238,17 @@ class _Making:
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with what they tell; rng : as of :func:`information_of`."""
-        rig, work, known = self.rig, self.work, self.known
-        return _Pool(candidates, information_of(rig, candidates, work, known, rng, self.count))
+        rig, work, prior = self.rig, self.work, self.prior
+        return _Pool(candidates, information_of(rig, candidates, work, prior, rng, self.count))
 
-    def chosen(self, pool: _Pool, rng: np.random.Generator, told: ToldShare) -> Candidates:
+    def chosen(self, pool: _Pool, rng: np.random.Generator, progress: ShareProgress) -> Candidates:
         """The best of a pool, bettered about where they are."""
         index = PLAN_INDICES[self.index](pool.info)
-        first = greedy(pool.info, self.count, index, lambda x: told(0.4 * x)).chosen
+        first = greedy(pool.info, self.count, index, lambda x: progress(0.4 * x)).chosen
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
         size = np.inf
         for k in range(BETTERING_ROUNDS):
-            told(0.5 + 0.5 * k / BETTERING_ROUNDS)
+            progress(0.5 + 0.5 * k / BETTERING_ROUNDS)
             pool, start = self._about(best, rng)
             chosen = np.sort(exchanged(pool.info, start, index))
             best = pool.candidates.only(chosen)
@@ -280,7 +282,7 @@ def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
 def _ordered(
     subject: Subject,
     made: _Making,
-    found: Candidates,
+    value: Candidates,
     drawn: _Pool,
     region: Region,
     together: bool,
@@ -290,30 +292,28 @@ def _ordered(
     """The plan of what was chosen: in the order of the shortest way, with what it promises."""
     machine, count, groups = subject.rig.machine, made.count, made.groups
     # as good as such photographs turn out, one by one, not as they are on average
-    own = made.pool(found, np.random.default_rng(PLAN_SEED)).info
-    index, every = PLAN_INDICES[made.index](own), np.arange(len(found.group))
+    own = made.pool(value, np.random.default_rng(PLAN_SEED)).info
+    index, every = PLAN_INDICES[made.index](own), np.arange(len(value.group))
     nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
-    more = [
-        _accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES_TOLD
-    ]
+    more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES]
     by_chance, at_random = _by_chance(made, drawn, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
-    order, blocked, travel = _route(machine, found, rng)
+    order, blocked, travel = _route(machine, value, rng)
     return MeasurementPlan(
         subject=subject,
-        stations=tuple(tuple(subject.rig.names[s] for s in groups[found.group[k]]) for k in order),
-        names=_new_names(found.group[order], subject.names),
-        joints=found.joints[order],
-        T_base_platform=found.T_base_platform[order],
+        stations=tuple(tuple(subject.rig.names[s] for s in groups[value.group[k]]) for k in order),
+        names=_new_names(value.group[order], subject.names),
+        joints=value.joints[order],
+        T_base_platform=value.T_base_platform[order],
         rank=rank[order],
         index=made.index,
         value=float(index.value(covariance)),
         at_random=at_random,
-        now=_accuracy(own, own.covariance(own.known), 0),
+        now=_accuracy(own, own.covariance(own.information), 0),
         promised=promised,
         by_chance=by_chance,
         curve=(*curve, promised, *more),
@@ -346,12 +346,12 @@ def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[A
     n = len(drawn.info.group) // n_groups
     evenly = np.arange(n // 2, n)  # the first half are at the ends of the ranges
     count = min(made.count, len(evenly))
-    found: list[tuple[float, float, float]] = []
+    results: list[tuple[float, float, float]] = []
     for _ in range(RANDOM_PLANS_COMPARED):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
         covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
-        found.append((*drawn.info.tool(covariance), float(index.value(covariance))))
-    position, orientation, value = np.mean(found, axis=0).tolist()
+        results.append((*drawn.info.tool(covariance), float(index.value(covariance))))
+    position, orientation, value = np.mean(results, axis=0).tolist()
     return Accuracy(made.count, position, orientation), value
 
 
@@ -359,7 +359,7 @@ def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[A
 
 
 def _route(
-    machine: Machine, found: Candidates, rng: np.random.Generator
+    machine: Machine, value: Candidates, rng: np.random.Generator
 ) -> tuple[Integers, Booleans, tuple[float, float]]:
     """The order (n,), group by group; which steps are blocked (n,); and how long the way is, and
     one by chance.
@@ -368,19 +368,19 @@ def _route(
     order: list[Integers] = []
     barred: list[Booleans] = []
     own, chance = 0.0, 0.0
-    for g in range(len(found.groups)):
-        rows = np.flatnonzero(found.group == g)
-        joints, poses = found.joints[rows], found.T_base_platform[rows]
+    for g in range(len(value.groups)):
+        rows = np.flatnonzero(value.group == g)
+        joints, poses = value.joints[rows], value.T_base_platform[rows]
         apart = motor_distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
-        way, blocked = _free_way(machine, joints, poses, home, apart)
-        order.append(rows[way])
+        path, blocked = _free_path(machine, joints, poses, home, apart)
+        order.append(rows[path])
         barred.append(blocked)
-        own += length(way, apart[:-1, :-1], apart[-1, :-1])
+        own += length(path, apart[:-1, :-1], apart[-1, :-1])
         chance += length(rng.permutation(len(rows)), apart[:-1, :-1], apart[-1, :-1])
     return np.concatenate(order), np.concatenate(barred), (own, chance)
 
 
-def _free_way(
+def _free_path(
     machine: Machine, joints: Array, poses: Array, home: Array, apart: Array
 ) -> tuple[Integers, Booleans]:
     """A short way that avoids steps on which legs touch or the machine is lost, where that can be;
@@ -388,18 +388,18 @@ def _free_way(
     """
     bars = np.zeros((len(joints), len(joints)), dtype=bool)
     first = apart[-1, :-1].copy()
-    way = shortest_way(apart[:-1, :-1], first, bars)
-    blocked = _blocked(machine, joints[way], poses[way], home)
+    path = shortest_path(apart[:-1, :-1], first, bars)
+    blocked = _blocked(machine, joints[path], poses[path], home)
     for _ in range(REROUTING_ATTEMPTS):
         steps = np.flatnonzero(blocked[1:])
         if not len(steps) and not blocked[0]:
             break
-        bars[way[steps], way[steps + 1]] = bars[way[steps + 1], way[steps]] = True
+        bars[path[steps], path[steps + 1]] = bars[path[steps + 1], path[steps]] = True
         if blocked[0]:
-            first[way[0]] += len(joints) * apart.max()
-        way = shortest_way(apart[:-1, :-1], first, bars)
-        blocked = _blocked(machine, joints[way], poses[way], home)
-    return way, blocked
+            first[path[0]] += len(joints) * apart.max()
+        path = shortest_path(apart[:-1, :-1], first, bars)
+        blocked = _blocked(machine, joints[path], poses[path], home)
+    return path, blocked
 
 
 def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
@@ -408,10 +408,10 @@ def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Bool
     n = POSES_BETWEEN_CONFIGURATIONS
     share = (np.arange(n) + 0.5)[:, None, None] / n
     between = (before + share * (joints - before)).reshape(-1, joints.shape[1])
-    found = machine.forward_result(between, np.tile(poses, (n, 1, 1)))
-    good = found.converged.copy()
+    fk = machine.forward_result(between, np.tile(poses, (n, 1, 1)))
+    good = fk.converged.copy()
     at = np.flatnonzero(good)
-    good[at] = usable(machine, found.T_base_platform[at], between[at])
+    good[at] = usable(machine, fk.T_base_platform[at], between[at])
     return np.asarray(~good.reshape(POSES_BETWEEN_CONFIGURATIONS, -1).all(axis=0))
 
 
@@ -426,7 +426,7 @@ def _with_places(
     index: str,
     free_places: int | None,
     best_of: int | None,
-) -> tuple[Rig, Known | None, tuple[TriedPlace, ...]]:
+) -> tuple[Rig, CalibrationPrior | None, tuple[TriedPlace, ...]]:
     """The rig with the best places: free ones on a sphere, or some of its own.
 
     Each place is an information of its own on the machine, its station's place and shading
@@ -440,8 +440,11 @@ def _with_places(
         wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
     few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
     part = Configurations(*(x[few] for x in drawn))
-    known = subject.known and subject.known.only(())
-    infos = [_seen_from(wide.only([s]), part, work, known) for s in range(len(wide.names))]
+    reference_values = subject.prior and subject.prior.only(())
+    infos = [
+        _view_information(wide.only([s]), part, work, reference_values)
+        for s in range(len(wide.names))
+    ]
     first = next((info for info in infos if info is not None), None)
     if first is None:
         raise InputError(
@@ -449,15 +452,15 @@ def _with_places(
             where="--places",
             expected="a camera that sees the legs, or a board that faces some place",
         )
-    start = np.linalg.inv(first.covariance(first.known))
-    told, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
+    start = np.linalg.inv(first.covariance(first.information))
+    covariances, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
     for s, info in enumerate(infos):
         after = np.linalg.inv(start)
         if info is not None:
             after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
-            told[s] = np.linalg.inv(after) - start
+            covariances[s] = np.linalg.inv(after) - start
         alone[s] = first.tool(after)[0]
-    roots = np.stack([_padded_root(told[s]) for s in range(len(told))])
+    roots = np.stack([_padded_root(covariances[s]) for s in range(len(covariances))])
     same = np.zeros(len(roots), dtype=int)
     number = np.arange(len(roots), dtype=float)[:, None]  # no two places are the same
     whole = CandidateRows(roots, same, number, start, np.eye(len(start)), first.work)
@@ -470,19 +473,19 @@ def _with_places(
     chosen = wide.only(best.tolist())
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
-        return replace(chosen, names=names), known, tried
-    kept = subject.known and subject.known.only(best.tolist())
-    if kept is not None:  # by their new numbers
-        kept = replace(kept, stations=tuple(np.searchsorted(best, kept.stations).tolist()))
-    return chosen, kept, tried
+        return replace(chosen, names=names), reference_values, tried
+    prior = subject.prior and subject.prior.only(best.tolist())
+    if prior is not None:  # by their new numbers
+        prior = replace(prior, stations=tuple(np.searchsorted(best, prior.stations).tolist()))
+    return chosen, prior, tried
 
 
-def _seen_from(
-    rig: Rig, part: Configurations, work: Array, known: Known | None
+def _view_information(
+    rig: Rig, part: Configurations, work: Array, prior: CalibrationPrior | None
 ) -> CandidateRows | None:
     """What configurations tell from one place; None where nothing is seen from there."""
     try:
-        return information_of(rig, Candidates.of_all(((0,),), *part), work, known)
+        return information_of(rig, Candidates.of_all(((0,),), *part), work, prior)
     except InputError:
         return None
 

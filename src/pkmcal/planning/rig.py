@@ -103,31 +103,33 @@ class BoardFrom:
         """The board's pose wherever enough corners are seen."""
         T = self.T_camera_base @ at.T_base_platform[rows] @ self.T_platform_board
         there = apply(T[:, None], self.points)
-        seen = self._seen(At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there)
+        prediction = self._visible_corners(
+            At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there
+        )
         by_point = self.camera.project_jacobians(there)[0]
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
-        by_pose = np.where(seen[..., None, None], by_pose, 0.0) / self.sigma
+        by_pose = np.where(prediction[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
-        enough = seen.sum(axis=1) >= LEAST_CORNERS_WEIGHED
+        enough = prediction.sum(axis=1) >= LEAST_CORNERS_WEIGHED
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 
-    def _seen(self, at: At, T: Array, there: Array) -> Booleans:
+    def _visible_corners(self, at: At, T: Array, there: Array) -> Booleans:
         """(K, N) corners in the picture, on the board's face, and not behind a leg."""
         with np.errstate(invalid="ignore"):
-            seen = np.asarray(self.camera.in_image(self.camera.project(there)))
+            visible = np.asarray(self.camera.in_image(self.camera.project(there)))
         # the print is on the side of the board's -z
         eye = inverse(T)[:, :3, 3] - self.points.mean(axis=0)
-        seen &= (-eye[:, 2] / np.linalg.norm(eye, axis=-1) > FLATTEST_BOARD_COSINE)[:, None]
+        visible &= (-eye[:, 2] / np.linalg.norm(eye, axis=-1) > FLATTEST_BOARD_COSINE)[:, None]
         machine, tubes = at.machine, tubes_of(at.machine)
         if not len(tubes):
-            return seen
+            return visible
         ends = machine.ends_at(at.joints, at.T_base_platform)
         a, b = apply(self.T_camera_base, ends.a), apply(self.T_camera_base, ends.b)
         nothing, radius = np.array([-1]), machine.values[tubes.radius]
         pixel = pixel_angle(self.camera)
         behind = hidden(there[:, None], nothing, nothing, tubes, radius, a, b, pixel)
-        return seen & ~behind[:, 0]
+        return visible & ~behind[:, 0]
 
 
 @dataclass(frozen=True)
@@ -208,11 +210,11 @@ class Rig:
         at = At(self.machine, joints, T_base_platform)
         for one in self.instruments:
             rows = pairs[pairs[:, 0] == one.station, 1]
-            found = one.measure(at, rows, rng)
-            if isinstance(found, EdgeSet):
-                edges.append(found)
+            value = one.measure(at, rows, rng)
+            if isinstance(value, EdgeSet):
+                edges.append(value)
             else:
-                poses.append(found)
+                poses.append(value)
         edges = concatenate(edges)
         return Measurements(
             edges=edges,

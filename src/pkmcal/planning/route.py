@@ -28,7 +28,7 @@ def motor_spans(joints: Array, ranges: Array) -> Array:
     return np.where(np.isfinite(span) & (span > 0), span, np.where(own > 0, own, 1.0))
 
 
-def shortest_way(
+def shortest_path(
     apart: Array, first: Array | None = None, barred: Booleans | None = None
 ) -> Integers:
     """An order (n,) that makes the way through all n points short, open at its end.
@@ -44,54 +44,56 @@ def shortest_way(
     cost = np.zeros((n + 1, n + 1))
     cost[:n, :n] = apart + (0.0 if barred is None else barred * (apart.max() * n + 1.0))
     cost[n, :n] = 0.0 if first is None else first
-    order, left = [n], np.ones(n, dtype=bool)
-    while left.any():
-        rest = np.flatnonzero(left)
+    order, remaining = [n], np.ones(n, dtype=bool)
+    while remaining.any():
+        rest = np.flatnonzero(remaining)
         order.append(int(rest[np.argmin(cost[order[-1], rest])]))
-        left[order[-1]] = False
-    way = np.array([*order, n])
+        remaining[order[-1]] = False
+    direction = np.array([*order, n])
     for _ in range(ROUTE_CHANGES_A_POINT * n):
-        gain, better = max((_turned(way, cost), _moved(way, cost)), key=lambda found: found[0])
+        gain, better = max(
+            (_turned(direction, cost), _best_move(direction, cost)), key=lambda item: item[0]
+        )
         if gain < ROUTE_GAIN_ROUNDING * cost.max():
             break
-        way = better
-    return way[1:-1]
+        direction = better
+    return direction[1:-1]
 
 
-def length(way: Integers, apart: Array, first: Array | None = None) -> float:
+def length(path: Integers, apart: Array, first: Array | None = None) -> float:
     """Of a way, with that to its beginning."""
-    begin = 0.0 if first is None else float(first[way[0]])
-    return begin + float(apart[way[:-1], way[1:]].sum())
+    begin = 0.0 if first is None else float(first[path[0]])
+    return begin + float(apart[path[:-1], path[1:]].sum())
 
 
-def _turned(way: Integers, cost: Array) -> tuple[float, Integers]:
+def _turned(path: Integers, cost: Array) -> tuple[float, Integers]:
     """The best gain by turning round the stretch from i to j, and the way after it."""
-    before, here, after = way[:-2], way[1:-1], way[2:]
+    before, here, after = path[:-2], path[1:-1], path[2:]
     now = cost[before, here][:, None] + cost[here, after]
     gain = now - cost[before[:, None], here] - cost[here[:, None], after]
     gain = np.triu(gain, 1)
     i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    better = np.concatenate([way[: i + 1], way[i + 1 : j + 2][::-1], way[j + 2 :]])
+    better = np.concatenate([path[: i + 1], path[i + 1 : j + 2][::-1], path[j + 2 :]])
     return float(gain[i, j]), better
 
 
-def _moved(way: Integers, cost: Array) -> tuple[float, Integers]:
+def _best_move(path: Integers, cost: Array) -> tuple[float, Integers]:
     """The best gain by moving a stretch of up to three points between two others."""
-    found: list[tuple[float, int, int, int]] = []
-    step = cost[way[:-1], way[1:]]
-    for size in range(1, min(MOST_POINTS_MOVED_TOGETHER, len(way) - 3) + 1):
-        i = np.arange(1, len(way) - size)
-        first, last = way[i], way[i + size - 1]
-        without = step[i - 1] + step[i + size - 1] - cost[way[i - 1], way[i + size]]
-        j = np.arange(len(way) - 1)
-        with_ = cost[way[j], first[:, None]] + cost[last[:, None], way[j + 1]] - step
+    results: list[tuple[float, int, int, int]] = []
+    step = cost[path[:-1], path[1:]]
+    for size in range(1, min(MOST_POINTS_MOVED_TOGETHER, len(path) - 3) + 1):
+        i = np.arange(1, len(path) - size)
+        first, last = path[i], path[i + size - 1]
+        without = step[i - 1] + step[i + size - 1] - cost[path[i - 1], path[i + size]]
+        j = np.arange(len(path) - 1)
+        with_ = cost[path[j], first[:, None]] + cost[last[:, None], path[j + 1]] - step
         gain = without[:, None] - with_
         gain[(j >= i[:, None] - 1) & (j <= i[:, None] + size - 1)] = -np.inf
         a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        found.append((float(gain[a, b]), int(i[a]), size, int(b)))
-    if not found:
-        return -np.inf, way
-    gain, i, size, j = max(found)
-    part, rest = way[i : i + size], np.delete(way, np.s_[i : i + size])
+        results.append((float(gain[a, b]), int(i[a]), size, int(b)))
+    if not results:
+        return -np.inf, path
+    gain, i, size, j = max(results)
+    part, rest = path[i : i + size], np.delete(path, np.s_[i : i + size])
     j = j if j < i else j - size
     return gain, np.concatenate([rest[: j + 1], part, rest[j + 1 :]])

@@ -12,16 +12,16 @@ import numpy as np
 from pkmcal.arrays import Array, numbered, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.gather import measurements_of
-from pkmcal.calibration.recognise import (
+from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.localization import (
     boards_of,
+    localize_stations,
     platform_poses,
     read_photographs,
-    station_poses,
 )
+from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE
-from pkmcal.calibration.same_machine import read_same_machine
-from pkmcal.calibration.saved import Known, SavedCalibration, load
+from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse
@@ -61,13 +61,13 @@ LAST_CALIBRATION_FOLDER = "calibration"
 class Subject:
     """What a plan is made for.
 
-    rig : what measures. known : what an earlier calibration knows. columns : of joints.csv.
+    rig : what measures. prior : what an earlier calibration knows. columns : of joints.csv.
     names : of the configurations that there are already. words : where its numbers come from, in
     sentences. board : fields of the board's file, if one is seen.
     """
 
     rig: Rig
-    known: Known | None
+    prior: CalibrationPrior | None
     columns: tuple[str, ...]
     names: tuple[str, ...]
     words: tuple[str, ...]
@@ -252,23 +252,23 @@ def subject_of_session(
     if saved is not None:
         session = replace(session, machine=saved.machine)
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
-    seen = _Photographed.of(session, saved, np.random.default_rng(seed))
-    T_camera_base = _places(session, saved, seen, anywhere, seed)
-    rig, board, told = _rig(session, saved, seen, T_camera_base, edge, corner, seed)
-    known = None
+    in_view = _Photographed.of(session, saved, np.random.default_rng(seed))
+    T_camera_base = _places(session, saved, in_view, anywhere, seed)
+    rig, board, corner_source = _rig(session, saved, in_view, T_camera_base, edge, corner, seed)
+    reference_values = None
     if saved is not None:
-        kept = [name for name in session.station_names if same_place and name in saved.placed]
-        known = saved.known(kept, session.station_names)
+        prior = [name for name in session.station_names if same_place and name in saved.placed]
+        reference_values = saved.prior(prior, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, known, columns, names, (*words, *told), fields)
+    return Subject(rig, reference_values, columns, names, (*words, *corner_source), fields)
 
 
 def _rig(
     session: Session,
     saved: SavedCalibration | None,
-    seen: _Photographed,
+    in_view: _Photographed,
     T_camera_base: Array,
     edge: float,
     corner: float,
@@ -286,9 +286,9 @@ def _rig(
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
         mounts.append(Mount(BOARD_MOUNT_NAME, "platform", board.tolerance))
-        T_mount.append(_board_place(session, board, saved, seen, T_camera_base, seed))
-        sigma, told = _corner_noise(seen.boards, corner)
-        words.append(told)
+        T_mount.append(_board_place(session, board, saved, in_view, T_camera_base, seed))
+        sigma, corner_source = _corner_noise(in_view.boards, corner)
+        words.append(corner_source)
         for s, station in enumerate(session.stations):
             if "board" in station.observe:
                 place = T_mount[0]
@@ -299,8 +299,10 @@ def _rig(
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
-        pixels, pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
-        words.append(told)
+        pixels, pools, shading, corner_source = _edge_noise(
+            session, legs, in_view, T_camera_base, edge
+        )
+        words.append(corner_source)
         for s, binning, pool in zip(legs, pixels, pools, strict=True):
             camera = session.stations[s].camera
             instruments.append(LegsFrom(s, camera, T_camera_base[s], pool, binning))
@@ -357,7 +359,7 @@ class _Photographed(NamedTuple):
         boards = boards_of(session, photographs)
         if saved is not None and _saved_places(session, saved) is not None:
             return cls(photographs, boards, None)
-        return cls(photographs, boards, station_poses(session, photographs, boards, rng))
+        return cls(photographs, boards, localize_stations(session, photographs, boards, rng))
 
 
 def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
@@ -369,23 +371,27 @@ def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
 
 
 def _places(
-    session: Session, saved: SavedCalibration | None, seen: _Photographed, anywhere: bool, seed: int
+    session: Session,
+    saved: SavedCalibration | None,
+    in_view: _Photographed,
+    anywhere: bool,
+    seed: int,
 ) -> Array:
     """Where all stations stand, (S, 4, 4), by the first that tells: the calibration, the
     photographs, a pose by hand; a tracker in the base frame. anywhere : where nothing tells, any
     usual place serves.
     """
-    known = None if saved is None else _saved_places(session, saved)
-    if known is None:
-        known = seen.T_camera_base
-    if known is not None:
-        return known
+    reference_values = None if saved is None else _saved_places(session, saved)
+    if reference_values is None:
+        reference_values = in_view.T_camera_base
+    if reference_values is not None:
+        return reference_values
     out: list[Array] = []
     for station in session.stations:
         if station.T_camera_base is None and anywhere:
-            seen_on = "platform" if "legs" not in station.observe else None
+            observed_side = "platform" if "legs" not in station.observe else None
             rng = np.random.default_rng(seed)
-            (place,) = default_stations(session.machine, (station.camera,), rng, seen_on)
+            (place,) = default_stations(session.machine, (station.camera,), rng, observed_side)
             out.append(place.T_camera_base())
             continue
         if station.T_camera_base is None:
@@ -401,27 +407,27 @@ def _places(
 
 
 def _edge_noise(
-    session: Session, legs: list[int], seen: _Photographed, T_camera_base: Array, edge: float
+    session: Session, legs: list[int], in_view: _Photographed, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
     """How many pixels are one where each station's edges are looked for, what these tell, the
     shading, and where that comes from.
     """
     why = "no photograph tells it yet"
-    if len(seen.photographs) == len(legs):
+    if len(in_view.photographs) == len(legs):
         rows = [
             spread_over(p.configuration, len(legs), PLAN_PHOTOGRAPHS_A_STATION)
-            for p in seen.photographs
+            for p in in_view.photographs
         ]
         try:
             poses = platform_poses(session)
-            first = first_edges(session, seen.photographs, rows, T_camera_base[legs], poses)
+            first = first_edges(session, in_view.photographs, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
             # `check` and `calibrate` tell what is wrong with them; here they serve nothing
             why = "the photographs that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
-            pixels = tuple(p.binning for p in seen.photographs)
+            pixels = tuple(p.binning for p in in_view.photographs)
             return pixels, first.pools, first.estimate.statistics.shading, words
     # how sharp they will be nobody has seen
     pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
@@ -432,14 +438,14 @@ def _edge_noise(
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
     """Px of a board's corner, and where that comes from."""
     sigma = [
-        float(np.hypot(np.median(s.seen.views.sigma[s.seen.views.seen]), s.seen.poses.noise))
+        float(np.hypot(np.median(s.views.views.sigma[s.views.views.visible]), s.views.poses.noise))
         for s in boards.stations.values()
-        if s.seen.views.seen.any()
+        if s.views.views.visible.any()
     ]
     if not sigma:
         return corner, f"Corners are taken to be good to {corner:g} px: no photograph tells it yet."
-    found = float(np.median(sigma))
-    return found, f"Corners of the board are good to {brief(found)} px in the photographs."
+    values = float(np.median(sigma))
+    return values, f"Corners of the board are good to {brief(values)} px in the photographs."
 
 
 def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
@@ -455,16 +461,16 @@ def _board_place(
     session: Session,
     board: Board,
     saved: SavedCalibration | None,
-    seen: _Photographed,
+    in_view: _Photographed,
     T_camera_base: Array,
     seed: int,
 ) -> Array:
     """T_platform_board (4, 4): as calibrated, as photographed, or where it would be seen best."""
-    known = _saved_target(saved, BOARD_MOUNT_NAME)
-    if known is not None:
-        return known
-    if seen.boards.stations:
-        measurements = measurements_of(session, seen.boards)
+    reference_values = _saved_target(saved, BOARD_MOUNT_NAME)
+    if reference_values is not None:
+        return reference_values
+    if in_view.boards.stations:
+        measurements = measurements_of(session, in_view.boards)
         return start_mounts(measurements, T_camera_base, platform_poses(session, most=True))[0]
     users = [s for s, station in enumerate(session.stations) if "board" in station.observe]
     cameras = tuple(session.stations[s].camera for s in users)

@@ -28,7 +28,7 @@ from pkmcal.export.klipper import (
     homed,
     klipper_carriage_heights,
 )
-from pkmcal.files import shown
+from pkmcal.files import quoted
 from pkmcal.printers.printer import CARRIAGE_STEP, LARGEST_PRINTER_VALUE, Printer, Touches
 
 SAVED_LINE_MARK = "#*#"
@@ -52,22 +52,22 @@ def is_one(text: str) -> bool:
 def printer(text: str, label: str) -> Printer:
     """The printer of a printer.cfg, checked field by field."""
     _check_saved(text, label)
-    found = sections(text, label)
-    kinematics = found["printer"].get("kinematics", ("", f"{label}, [printer]"))
+    result = sections(text, label)
+    kinematics = result["printer"].get("kinematics", ("", f"{label}, [printer]"))
     if kinematics[0] != "delta":
         raise InputError(
             "heights of a bed are read of linear deltas",
             where=kinematics[1],
-            found=shown(kinematics[0]),
+            found=quoted(kinematics[0]),
             expected="kinematics: delta",
         )
-    radius = _positive(found, label, "printer", "delta_radius")
+    radius = _positive(result, label, "printer", "delta_radius")
     each = {
-        name: [_of_tower(found, label, k, name, value) for k in range(3)]
+        name: [_of_tower(result, label, k, name, value) for k in range(3)]
         for name, value in (("arm_length", _positive), ("position_endstop", _number))
     }
     each["angle"] = [
-        _number(found, label, f"stepper_{s}", "angle", default)
+        _number(result, label, f"stepper_{s}", "angle", default)
         for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
     ]
     config = ConfigParser()
@@ -80,7 +80,7 @@ def printer(text: str, label: str) -> Printer:
             },
         }
     )
-    stepped = {"rotation_distance", "microsteps"} <= found.get("stepper_a", {}).keys()
+    stepped = {"rotation_distance", "microsteps"} <= result.get("stepper_a", {}).keys()
     with np.errstate(invalid="ignore"):
         ends = homed(config)
     return Printer(
@@ -91,11 +91,11 @@ def printer(text: str, label: str) -> Printer:
         angle=np.array(each["angle"]),
         rod=np.array(each["arm_length"]),
         homed=ends,
-        reach=_positive(found, label, "printer", "print_radius", radius),
+        reach=_positive(result, label, "printer", "print_radius", radius),
         carriages=partial(klipper_carriage_heights, config),
-        offset=_probe(found, label),
-        touches=_touches(found, label, ends),
-        step=max(_step(found, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
+        offset=_probe(result, label),
+        touches=_touches(result, label, ends),
+        step=max(_step(result, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
         if stepped
         else CARRIAGE_STEP,
     )
@@ -115,7 +115,7 @@ def _check_saved(text: str, label: str) -> None:
                 "is marked and not below its header" if marked else "below its header is not marked"
             ),
             where=f"{label}, line {n + 1}",
-            found=shown(line),
+            found=quoted(line),
             expected=f"'{SAVED_LINE_MARK} ' before each line below SAVE_CONFIG's header,"
             " and no other",
             next_step="Put the header back"
@@ -146,17 +146,19 @@ def sections(text: str, label: str) -> Sections:
     return out
 
 
-def _of_tower(found: Sections, label: str, k: int, name: str, value: Callable[..., float]) -> float:
+def _of_tower(
+    config: Sections, label: str, k: int, name: str, value: Callable[..., float]
+) -> float:
     """A tower's value; the second and the third have the first's unless they say otherwise."""
-    first = value(found, label, "stepper_a", name)
-    return value(found, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
+    first = value(config, label, "stepper_a", name)
+    return value(config, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
 
 
 def _number(
-    found: Sections, label: str, section: str, name: str, default: float | None = None
+    config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
     """A value of a section; raises InputError where it is no number, or absent without default."""
-    if name not in found.get(section, {}):
+    if name not in config.get(section, {}):
         if default is not None:
             return default
         raise InputError(
@@ -165,7 +167,7 @@ def _number(
             expected=f"{name}: a number",
             next_step="If it stands in a file that this one includes, copy it here",
         )
-    text, where = found[section][name]
+    text, where = config[section][name]
     try:
         value = float(text)
     except ValueError:
@@ -174,41 +176,41 @@ def _number(
         raise InputError(
             f"{name} is no number that a printer can have",
             where=where,
-            found=shown(text),
+            found=quoted(text),
             expected="a number in mm, or degrees",
         )
     return value
 
 
 def _positive(
-    found: Sections, label: str, section: str, name: str, default: float | None = None
+    config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
     """A value of a section that is above zero on every machine."""
-    value = _number(found, label, section, name, default)
+    value = _number(config, label, section, name, default)
     if value <= 0:
-        text, where = found[section][name]
+        text, where = config[section][name]
         raise InputError(
             f"{name} is no number that a printer can have",
             where=where,
-            found=shown(text),
+            found=quoted(text),
             expected="a number above zero",
         )
     return value
 
 
-def _probe(found: Sections, label: str) -> tuple[float, float, float]:
+def _probe(config: Sections, label: str) -> tuple[float, float, float]:
     """Where a probe is from the nozzle, mm; nowhere else where there is none."""
-    for section, entries in found.items():
+    for section, entries in config.items():
         if "z_offset" in entries:
-            x, y = (_number(found, label, section, f"{c}_offset", 0.0) for c in "xy")
-            return x, y, _number(found, label, section, "z_offset")
+            x, y = (_number(config, label, section, f"{c}_offset", 0.0) for c in "xy")
+            return x, y, _number(config, label, section, "z_offset")
     return 0.0, 0.0, 0.0
 
 
-def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
+def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
     """The points that DELTA_CALIBRATE kept, and those entered by hand."""
     section = "delta_calibrate"
-    entries = found.get(section, {})
+    entries = config.get(section, {})
     names = [
         f"{kind}{k}"
         for kind in ("height", "manual_height")
@@ -216,16 +218,16 @@ def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
     ]
     if not names:
         return None
-    way = np.array([_step(found, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
-    heights = [_number(found, label, section, name) for name in names]
+    direction = np.array([_step(config, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
+    heights = [_number(config, label, section, name) for name in names]
     steps = [_three(entries, label, f"{name}_pos") for name in names]
     origin = f"{label}, [{section}]"
-    return Touches(ends - np.array(steps) * way, np.array(heights), origin)
+    return Touches(ends - np.array(steps) * direction, np.array(heights), origin)
 
 
-def _step(found: Sections, label: str, section: str) -> float:
+def _step(config: Sections, label: str, section: str) -> float:
     """Mm of a carriage for a step of its motor."""
-    own = {**found.get("stepper_a", {}), **found.get(section, {})}
+    own = {**config.get("stepper_a", {}), **config.get(section, {})}
     both = {section: own}
     turn = _positive(both, label, section, "rotation_distance")
     micro = _positive(both, label, section, "microsteps")
@@ -237,7 +239,7 @@ def _step(found: Sections, label: str, section: str) -> float:
         pairs = [[math.nan]]
     if any(len(p) != 2 or not all(0 < x <= LARGEST_PRINTER_VALUE for x in p) for p in pairs):
         raise InputError(
-            "the gears cannot be read", where=where, found=shown(text), expected="such as 80:20"
+            "the gears cannot be read", where=where, found=quoted(text), expected="such as 80:20"
         )
     return turn / (full * micro * prod(a / b for a, b in pairs))
 
@@ -253,7 +255,7 @@ def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[f
         raise InputError(
             f"{name} does not tell where the three motors were",
             where=where,
-            found=shown(text),
+            found=quoted(text),
             expected="three numbers, as SAVE_CONFIG wrote them",
         )
     return values

@@ -47,12 +47,12 @@ def read_touches(path: Path, printer: Printer) -> Touches:
         points, heights = _table(path, label), 0.0
     elif text.startswith(HEIGHT_MAP_TITLE):
         points, heights = _map(text, label), 0.0
-    elif found := _TRIGGERED.findall(text):
-        points, heights = _together(np.array(found, dtype=float)), dz
-    elif found := _CONTACT.findall(text):
-        points, heights = _together(np.array(found, dtype=float)) - [dx, dy, 0.0], 0.0
-    elif found := _HEIGHTS.findall(text):
-        points, heights = _sequence(text, label, found[-1][0]), 0.0
+    elif values := _TRIGGERED.findall(text):
+        points, heights = _together(np.array(values, dtype=float)), dz
+    elif values := _CONTACT.findall(text):
+        points, heights = _together(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
+    elif values := _HEIGHTS.findall(text):
+        points, heights = _sequence(text, label, values[-1][0]), 0.0
     else:
         raise InputError(
             "there is no point of a bed in this file",
@@ -93,22 +93,22 @@ def _map(text: str, label: str) -> Array:
     lines = [line for line in text.splitlines()[1:] if line.strip()]
     names = [word.strip() for word in (lines[0] if lines else "").split(",")]
     values = [word.strip() for word in (lines[1] if len(lines) > 1 else "").split(",")]
-    known = dict(zip(names, values, strict=False))
+    numbers = dict(zip(names, values, strict=False))
 
     def value(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
-        text = next((known[name] for name in called if name in known), "")
+        text = next((numbers[name] for name in called if name in numbers), "")
         try:
-            found = float(text)
+            value = float(text)
         except ValueError:
-            found = np.nan
-        if not above < found <= LARGEST_PRINTER_VALUE:
+            value = np.nan
+        if not above < value <= LARGEST_PRINTER_VALUE:
             raise InputError(
                 "the height map does not tell its grid",
                 where=f"{label}, line 3",
                 found=", ".join(values) or "nothing",
                 expected=f"a number{'' if above else ' above zero'} under {called[0]}",
             )
-        return found
+        return value
 
     x0, y0 = value("xmin", "min0"), value("ymin", "min1")
     dx = value("xspacing", "spacing0", "spacing", above=0.0)
@@ -135,9 +135,9 @@ def _sequence(text: str, label: str, heights: str) -> Array:
     z = [float(word) for word in heights.split()]
     places: dict[int, tuple[float, float]] = {}
     for words in _G30.findall(text):
-        found = {letter.upper(): float(number) for letter, number in _WORD.findall(words)}
-        if found.keys() >= {"P", "X", "Y"}:
-            places[int(found["P"])] = found["X"], found["Y"]
+        results = {letter.upper(): float(number) for letter, number in _WORD.findall(words)}
+        if results.keys() >= {"P", "X", "Y"}:
+            places[int(results["P"])] = results["X"], results["Y"]
     if sorted(places) != list(range(len(z))):
         raise InputError(
             "heights and points do not belong together",

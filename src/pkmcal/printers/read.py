@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.errors import InputError
-from pkmcal.files import LARGEST_WRITTEN_FILE, read_text, shown
+from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
 from pkmcal.printers import klipper, reprap
 from pkmcal.printers.printer import Printer
 
@@ -48,7 +48,7 @@ def read_printer(path: Path) -> Printer:
     raise InputError(
         "this is neither a Klipper nor a RepRapFirmware configuration of a delta",
         where=label,
-        found=shown(first),
+        found=quoted(first),
         expected="a printer.cfg with a section [printer], or G-code with a line M665",
         next_step="Name the file that holds these values; files that it includes are not followed",
     )

@@ -18,7 +18,7 @@ from pkmcal.export.reprap import (
     read_words,
     reprap_carriage_heights,
 )
-from pkmcal.files import shown
+from pkmcal.files import quoted
 from pkmcal.printers.printer import LARGEST_PRINTER_VALUE, Printer
 
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
@@ -73,18 +73,18 @@ def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
     places: dict[str, str] = {}
     for n, line in lines:
         try:
-            found = read_words(line)
+            value = read_words(line)
         except ValueError:
-            found = {"": np.array([np.inf])}
-        if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in found.values()):
+            value = {"": np.array([np.inf])}
+        if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in value.values()):
             raise InputError(
                 "a value of this line is no number that a printer can have",
                 where=f"{label}, line {n}",
-                found=shown(line.strip()),
+                found=quoted(line.strip()),
                 expected="numbers in mm, or degrees",
             )
-        words.update({name.upper(): values for name, values in found.items()})
-        places.update({name.upper(): f"{label}, line {n}" for name in found})
+        words.update({name.upper(): values for name, values in value.items()})
+        places.update({name.upper(): f"{label}, line {n}" for name in value})
     return words, places
 
 

@@ -118,21 +118,21 @@ def write_printer_session(
     folder: Path | str,
     printer: Path,
     probed: Path | None = None,
-    seen: Literal["board"] | None = None,
+    in_view: Literal["board"] | None = None,
     places: int = 1,
 ) -> tuple[str, ...]:
     """Write a printer's session into a new or empty folder; returns its files.
 
     printer : its configuration. probed : points of its bed; without them those that its
-    configuration keeps. seen : None of heights, or ``board``, then from so many places. Raises
+    configuration keeps. in_view : None of heights, or ``board``, then from so many places. Raises
     InputError for files that do not tell what is needed.
     """
-    found = read_printer(printer)
-    if seen is None:
-        touches = found.touches if probed is None else read_touches(probed, found)
-        texts = heights_texts(found, _enough(found, touches))
+    value = read_printer(printer)
+    if in_view is None:
+        touches = value.touches if probed is None else read_touches(probed, value)
+        texts = heights_texts(value, _enough(value, touches))
     else:
-        texts = carried_texts(found, places)
+        texts = carried_texts(value, places)
     return write_texts(folder, texts)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.calibration.model_errors import BedSurface, ModelError, uneven_bed
+from pkmcal.calibration.discrepancy_basis import BedSurface, ModelError, uneven_bed
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages.plots import plane
 from pkmcal.session.load import Session

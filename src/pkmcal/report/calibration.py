@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
-from pkmcal.calibration.kept import keep_earlier
+from pkmcal.calibration.archive import keep_earlier
 from pkmcal.calibration.results import (
     CALIBRATION_REPORT_FILE,
     calibration_document,
@@ -30,14 +30,14 @@ from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
 from pkmcal.pages import page
-from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
+from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report import (
     bed,
     field,
     identifiability,
+    image_scene,
     linked,
     parameters,
-    photographed,
     pictures,
     poses,
     provenance,
@@ -57,17 +57,17 @@ if TYPE_CHECKING:
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
     c, held_out, over = calibration, _held_out(calibration), _tool_map(calibration)
-    seen = digests(c.session)
-    told = report_of(c, held_out, over, session_digest(c.session, seen))
+    in_view = digests(c.session)
+    report = report_of(c, held_out, over, session_digest(c.session, in_view))
     open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
-        told,
+        report,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, calibration_document(c, open_, predicted, over, seen)),
+        texts=texts_of(c, calibration_document(c, open_, predicted, over, in_view)),
         summary={
             "verdict": c.verdict.document(),
-            **(told.summary or {}),
+            **(report.summary or {}),
             "session_warnings": c.session.warnings,
             "photographs": c.session.images_taken,
             "rejected_photographs": rejected_photographs(c.session),
@@ -102,13 +102,13 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
     """
     folder = Path(folder)
     check_output(folder, force=force)
-    found = outcome_of(calibration)
-    texts = {CALIBRATION_REPORT_FILE: page.page_html(found, datetime.now()), **found.texts}
+    outcome = outcome_of(calibration)
+    texts = {CALIBRATION_REPORT_FILE: page.page_html(outcome, datetime.now()), **outcome.texts}
     with output_lock(folder):  # another process may have written there meanwhile
         over = check_output(folder, force=force)
-        kept = None if force else keep_earlier(folder, found.texts)
+        archive_folder = None if force else keep_earlier(folder, outcome.texts)
         write_folder(folder, texts, over)
-    return kept
+    return archive_folder
 
 
 def report_of(
@@ -133,7 +133,7 @@ def report_of(
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
     links = album.links
-    space = photographed.plot(session, estimate, links, poses.target_places(observation, estimate))
+    space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
         provenance.stations(session, observation, estimate, space),
@@ -187,22 +187,22 @@ def calibration_cards(
     )
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
     farthest = int(np.argmax(change))
-    moved = Figure(
+    shifted = Figure(
         "How far is the machine from its drawing?",
         ((brief(float(change.mean())), "mm"),),
         "mean distance of the joint centres, drawing and result laid over each other; largest "
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
-    found = (
+    value = (
         _flat(flatness, tool) if flatness else None,
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
-        moved,
+        shifted,
         _tool_change(session, estimate, tool),
         _data(session, observation, estimate, _links(calibration)),
         _fit(session, estimate),
     )
-    return tuple(card for card in found if card)
+    return tuple(card for card in value if card)
 
 
 def calibration_numbers(
@@ -253,9 +253,9 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
 def _flat(bed: Bed, tool: ToolError) -> Figure:
     """What heights are good for, and how the drawing bent the bed."""
     there = tool.T_base_platform[:, :2, 3]
-    known = np.isfinite(tool.off_position)
-    plane = np.column_stack([np.ones(int(known.sum())), there[known]])
-    off = tool.off[known, 5]
+    finite = np.isfinite(tool.off_position)
+    plane = np.column_stack([np.ones(int(finite.sum())), there[finite]])
+    off = tool.off[finite, 5]
     bent = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
     return Figure(
         "How flat will the bed be?",
@@ -305,7 +305,7 @@ def _data(
         )
     if not taken:
         weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
-        quiet, n = int(np.sum(weights < KEPT_EDGE_WEIGHT)), len(weights)
+        quiet, n = int(np.sum(weights < INLIER_WEIGHT)), len(weights)
         kinds = sorted({table.target.label for table in session.trackers})
         kinds += [measurement_kinds()[links.kind].label for links in session.links]
         return Figure(
@@ -317,7 +317,7 @@ def _data(
     coarse = int(observation.edges.coarse.sum())
     beside = f" and {coarse} told by silhouettes" if coarse else ""
     parts = [
-        f"{count(n, thing)} measured{more}, {int(np.sum(weights < KEPT_EDGE_WEIGHT))} of"
+        f"{count(n, thing)} measured{more}, {int(np.sum(weights < INLIER_WEIGHT))} of"
         " them given less than half their weight"
         for thing, weights, n, more in (
             ("edge", estimate.edge_weights, len(observation.edges) - coarse, beside),
@@ -327,11 +327,11 @@ def _data(
         if len(weights)
     ]
     lost = taken - sum(len(station.photographs) for station in session.stations)
-    left = f"; {count(lost, 'photograph')} left out whole" if lost else ""
+    remainder = f"; {count(lost, 'photograph')} left out whole" if lost else ""
     return Figure(
         "What is it based on?",
         ((f"{used} of {taken}", "photographs"),),
-        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected{left}",
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected{remainder}",
     )
 
 
@@ -354,12 +354,12 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
             (("–", "χ² per degree of freedom"),),
             "as many unknowns as measurements: nothing is left over that could tell",
         )
-    found = s.chi2 / s.dof
+    value = s.chi2 / s.dof
     return Figure(
         "Does the model explain the data?",
         ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
         f"1 is expected of the noise as stated, over {count(s.dof, 'degree')} of freedom"
-        + (f"; {number(found, 2)} after {' and '.join(scaled)}" if scaled else ""),
+        + (f"; {number(value, 2)} after {' and '.join(scaled)}" if scaled else ""),
     )
 
 

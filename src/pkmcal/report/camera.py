@@ -15,8 +15,8 @@ from pkmcal.boards.camera import COVERAGE_CELLS, CameraCalibration, coverage, ti
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
-from pkmcal.pages.drawn import Arrow, Picture
 from pkmcal.pages.jpegs import jpeg
+from pkmcal.pages.overlays import Arrow, Picture
 from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
@@ -58,7 +58,7 @@ def outcome_of(
     """
     c = calibration
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
-    factor = charts.enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
+    factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
     # with its covariance, so that `calibrate --refine-camera` knows how far to move it
@@ -94,7 +94,7 @@ def outcome_of(
                     "corners.html.j2",
                     pictures=_photographs(c, [Path(path) for path in paths], factor),
                     factor=factor,
-                    missed=[d for d in c.detections if not d.found],
+                    missed=[d for d in c.detections if not d.success],
                 ),
             ),
             Part("how", "What σ means", (CAMERA_SIGMA_TEXT,)),
@@ -126,12 +126,12 @@ def _intrinsics(c: CameraCalibration) -> Table:
     for name, value, sigma in values:
         unit = INTRINSIC_UNITS.get(name.partition(".")[0], "")
         places = decimals(sigma)
-        shown = (
+        display = (
             (number(value, places), number(sigma, places))
             if sigma > 0
             else (f"{value:g}", "not estimated")
         )
-        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*shown, unit)))
+        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*display, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
 
 
@@ -157,7 +157,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     share = float(np.max(c.sigma[:2] / c.camera.parameters[:2])) * 100
     tilt = tilts(c.T_camera_board, c.board.points)
     covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
+    finite = int(np.isfinite(c.residuals).all(axis=-1).sum())
     return (
         Figure(
             "How sure is the focal length?",
@@ -184,7 +184,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
-            f"{count(seen, 'corner')}, {seen - int(c.kept.sum())} of them put aside",
+            f"{count(finite, 'corner')}, {finite - int(c.inliers.sum())} of them put aside",
         ),
         Figure(
             "How different are the views?",
@@ -211,9 +211,9 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
 
 def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
     """One view with the corners found in it."""
-    seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
+    finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
     corners: list[Arrow] = []
-    for i in seen.tolist():
+    for i in finite.tolist():
         (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
         places = decimals(max(c.rms, 1e-6)) + 1
         tip = (
@@ -221,9 +221,11 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
             f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
         )
         dx, dy = (off * factor).tolist()
-        corners.append(Arrow(x, y, dx, dy, not c.kept[v, i], tip))
-    aside = sum(corner.quiet for corner in corners)
-    caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
+        corners.append(Arrow(x, y, dx, dy, not c.inliers[v, i], tip))
+    n_rejected = sum(corner.quiet for corner in corners)
+    caption = f"{count(len(finite), 'corner')}" + (
+        f", {n_rejected} put aside" if n_rejected else ""
+    )
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     caption += "" if jpeg else "; the photograph is not at hand"
     width, height = c.camera.image_size
@@ -244,7 +246,7 @@ def _field(c: CameraCalibration) -> Markup:
     """
     width, height = c.camera.image_size
     columns, rows = FIELD_CELLS
-    pixels, off = c.pixels[c.kept], c.residuals[c.kept]
+    pixels, off = c.pixels[c.inliers], c.residuals[c.inliers]
     dx, dy = width / columns, height / rows
     column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
     row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
@@ -270,8 +272,8 @@ def _field(c: CameraCalibration) -> Markup:
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
     """Held-out error a view; the fit's own beside it in the tooltip."""
-    squares = np.where(c.kept, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
-    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.kept.sum(axis=1), 1))
+    squares = np.where(c.inliers, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
+    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.inliers.sum(axis=1), 1))
     middle = float(np.median(c.held_out.by_view))
     bars = [
         charts.UprightBar(
@@ -290,7 +292,7 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
 
 def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
     """How far from the axis the corners lie."""
-    rays = c.camera.ray(c.pixels[c.kept])
+    rays = c.camera.ray(c.pixels[c.inliers])
     angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
     angle = angle[np.isfinite(angle)]
     last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1

@@ -49,21 +49,21 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Board
     state = estimate.state
     size = 1 + boards.tolerance * float(state.sizes[0]) if len(state.sizes) else 1.0
     for s, station in boards.stations.items():
-        seen, moves = station.seen, boards.body == "platform"
-        usable = dict(zip(seen.shown.tolist(), seen.usable.tolist(), strict=True))
-        for p, (k, found) in enumerate(
-            zip(seen.configuration.tolist(), seen.detections, strict=True)
+        views, moves = station.views, boards.body == "platform"
+        usable = dict(zip(views.numbers.tolist(), views.usable.tolist(), strict=True))
+        for p, (k, item) in enumerate(
+            zip(views.configuration.tolist(), views.detections, strict=True)
         ):
-            if not found.found or not estimate.configurations[k]:
+            if not item.success or not estimate.configurations[k]:
                 continue
             body = state.T_base_platform[k] if moves else np.eye(4)
             T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[ONLY_BOARD_MOUNT]
-            points = apply(T_camera_board, size * seen.board.points[found.ids])
-            off = found.pixels - session.stations[s].camera.project(points)
+            points = apply(T_camera_board, size * views.board.points[item.ids])
+            off = item.pixels - session.stations[s].camera.project(points)
             n = len(off)
-            whole = (np.full(n, s), np.full(n, k), np.full(n, p), np.asarray(found.ids))
+            whole = (np.full(n, s), np.full(n, k), np.full(n, p), np.asarray(item.ids))
             used = np.full(n, usable.get(p, False))
-            here = BoardCorners(*whole, found.pixels, off, used)
+            here = BoardCorners(*whole, item.pixels, off, used)
             parts.append(here.select(np.asarray(np.isfinite(off).all(axis=-1))))
     return BoardCorners(
         *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(BoardCorners))

@@ -12,9 +12,9 @@ from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
 from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT, coloured, space_layout
-from pkmcal.report.watch import NOTHING_KNOWN_SIGN, chance_text
+from pkmcal.report.watch import NO_VALUE_SIGN, chance_text
 from pkmcal.report.workspace import middle_and_worst
-from pkmcal.wording import SHOWN_UNITS, brief, count, decimals, number
+from pkmcal.wording import DISPLAY_UNITS, brief, count, decimals, number
 
 CHANGES_ON_TERMINAL = 8
 """Changes that a terminal shows."""
@@ -23,9 +23,9 @@ CHANGES_ON_TERMINAL = 8
 def outcome_of(d: MachineDifference) -> Outcome:
     """Everything that ``pkmcal diff`` tells and writes."""
     tool = () if isinstance(d.tool, str) else (_space(d.tool),)
-    said = (d.tool,) if isinstance(d.tool, str) else ()
+    text = (d.tool,) if isinstance(d.tool, str) else ()
     parts = (
-        Part("tool", "What it does to the tool", said, plots=tool, tables=_tool_tables(d)),
+        Part("tool", "What it does to the tool", text, plots=tool, tables=_tool_tables(d)),
         Part(
             "joints",
             "Joints and legs",
@@ -58,7 +58,7 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
         if off.size:
             middle, worst = middle_and_worst(off)
             by_chance = middle_and_worst(sigma)[0]
-            spread = f"; chance alone makes {by_chance} mm" if d.found.dof else ""
+            spread = f"; chance alone makes {by_chance} mm" if d.change.dof else ""
             out.append(
                 Figure(
                     "How much does the tool differ?",
@@ -66,31 +66,31 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
                     f"median over {d.tool.region}; at worst {worst} mm{spread}",
                 )
             )
-    moved = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in d.centres]) * 1e3
+    shifted = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in d.centres]) * 1e3
     out.append(
         Figure(
             "How far did the joints move?",
-            ((brief(float(moved.mean())), "mm"),),
-            f"mean distance of {count(len(moved), 'joint centre')}, largest"
-            f" {brief(float(moved.max()))} mm",
+            ((brief(float(shifted.mean())), "mm"),),
+            f"mean distance of {count(len(shifted), 'joint centre')}, largest"
+            f" {brief(float(shifted.max()))} mm",
         )
     )
-    if d.found.dof:
+    if d.change.dof:
         out.append(
             Figure(
                 "How likely by chance alone?",
                 ((chance_text(d.chance), ""),),
-                f"χ² {number(d.found.chi2, 1)} for {count(d.found.dof, 'degree')} of freedom",
+                f"χ² {number(d.change.chi2, 1)} for {count(d.change.dof, 'degree')} of freedom",
             )
         )
     return tuple(out)
 
 
-def _changes(found: ToolMap) -> tuple[Array, Array]:
+def _changes(tool_map: ToolMap) -> tuple[Array, Array]:
     """Changes and standard deviations of the tool at the evenly spread poses, mm."""
-    _, after = found.evenly
-    known = np.isfinite(after.off_position)
-    return after.off_position[known] * 1e3, after.position[known] * 1e3
+    _, after = tool_map.evenly
+    finite = np.isfinite(after.off_position)
+    return after.off_position[finite] * 1e3, after.position[finite] * 1e3
 
 
 def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
@@ -104,9 +104,9 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
         kinds.append(("Turn, °", turn, np.rad2deg(after.orientation)))
     rows: list[Row] = []
     for name, off, sigma in kinds:
-        known = np.isfinite(off)
-        if known.any():
-            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NOTHING_KNOWN_SIGN
+        finite = np.isfinite(off)
+        if finite.any():
+            by_chance = middle_and_worst(sigma[finite])[0] if d.change.dof else NO_VALUE_SIGN
             rows.append(Row(name, (*middle_and_worst(off), by_chance)))
     columns = ("At the same readings", "median", "worst", "by chance, 1σ")
     note = (
@@ -120,11 +120,11 @@ def _legs(d: MachineDifference) -> Table:
     """How far each leg's joints moved."""
     rows: list[Row] = []
     sides = [(np.linalg.norm(x.change, axis=-1) * 1e3, x.sigma * 1e3) for x in d.centres]
-    by_chance = bool(d.found.dof)
+    by_chance = bool(d.change.dof)
     for leg in range(d.a.machine.n_legs):
         cells = tuple(
-            brief(float(moved[leg])) + (f" (±{brief(float(sigma[leg]))})" if by_chance else "")
-            for moved, sigma in sides
+            brief(float(shifted[leg])) + (f" (±{brief(float(sigma[leg]))})" if by_chance else "")
+            for shifted, sigma in sides
         )
         rows.append(Row(f"Leg {leg + 1}", cells))
     brackets = "; in brackets the standard deviation of a coordinate by chance" if by_chance else ""
@@ -150,7 +150,7 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
     note = (
         "1σ: of the change by chance. Chance: of as large a change of this number in a machine that"
         " did not change, the number of numbers allowed for."
-        if d.found.dof
+        if d.change.dof
         else ""
     )
     every = tuple(_row(d, k) for k in names)
@@ -160,9 +160,9 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
 
 def _row(d: MachineDifference, k: int) -> Row:
     table = d.a.machine.parameters
-    factor, unit = SHOWN_UNITS.get(table.units[k], (1.0, ""))
+    factor, unit = DISPLAY_UNITS.get(table.units[k], (1.0, ""))
     value = float(table.unit_axes(d.a.machine.values)[k]) * factor
-    change, sigma = float(d.found.change[k]) * factor, float(d.found.sigma[k]) * factor
+    change, sigma = float(d.change.change[k]) * factor, float(d.change.sigma[k]) * factor
     size = sigma if sigma > 0 else abs(change)
     places = decimals(size) if size > 0 else 3
     name = table.in_words(table.names[k])
@@ -173,7 +173,7 @@ def _row(d: MachineDifference, k: int) -> Row:
             number(value, places),
             number(value + change, places),
             number(change, places, signed=True),
-            brief(sigma) if sigma > 0 else NOTHING_KNOWN_SIGN,
+            brief(sigma) if sigma > 0 else NO_VALUE_SIGN,
             chance,
         ),
         mark=Level.DOUBTFUL if k in d.significant else None,
@@ -188,18 +188,18 @@ def _joints(d: MachineDifference) -> Plot:
     legs = [f"leg {leg + 1}" for leg in range(d.a.machine.n_legs)]
     data: list[dict[str, Any]] = []
     for side, colour in zip(d.centres, ("--drawing", "--calibrated"), strict=True):
-        moved = np.linalg.norm(side.change, axis=-1) * 1e3
+        shifted = np.linalg.norm(side.change, axis=-1) * 1e3
         data.append(
             {
                 "type": "bar",
                 "name": f"{side.side} joint",
                 "x": legs,
-                "y": np.round(moved, 5).tolist(),
+                "y": np.round(shifted, 5).tolist(),
                 "marker": {"color": colour},
                 "error_y": {
                     "type": "data",
                     "array": np.round(side.sigma * 1e3, 5).tolist(),
-                    "visible": bool(d.found.dof),
+                    "visible": bool(d.change.dof),
                     "color": "--ink",
                     "thickness": 1,
                 },
@@ -218,7 +218,7 @@ def _joints(d: MachineDifference) -> Plot:
         "joints",
         "How far each joint moved",
         "Bars with lines: the standard deviation by chance."
-        if d.found.dof
+        if d.change.dof
         else "Joints of both drawings laid over each other.",
         "Bars of how far each leg's base joint and platform joint moved, in millimetres; the table"
         " below has the numbers.",
@@ -227,17 +227,17 @@ def _joints(d: MachineDifference) -> Plot:
     )
 
 
-def _space(found: ToolMap) -> Plot:
+def _space(tool_map: ToolMap) -> Plot:
     """The evenly spread poses, coloured by how far the tool moved there."""
-    _, after = found.evenly
-    off, sigma = _changes(found)
-    told = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]
+    _, after = tool_map.evenly
+    off, sigma = _changes(tool_map)
+    hover = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]
     points = coloured(
         "tool",
         after.T_base_platform[np.isfinite(after.off_position), :3, 3],
         off,
         "mm",
-        customdata=told,
+        customdata=hover,
         hovertemplate="x: %{x:.3g}<br>y: %{y:.3g}<br>z: %{z:.3g}<br>differs by %{customdata[0]:.3g}"
         " mm<br>σ %{customdata[1]:.3g} mm<extra></extra>",
     )

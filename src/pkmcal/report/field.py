@@ -20,8 +20,8 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
-from pkmcal.pages.drawn import (
-    KEPT_EDGE_WEIGHT,
+from pkmcal.pages.overlays import (
+    INLIER_WEIGHT,
     Arrow,
     measured_curves,
     offsets_across_curves,
@@ -93,15 +93,15 @@ def section(
     links: Links,
 ) -> Part | None:
     """The section; None without anything seen."""
-    found = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
-    if not found:
+    value = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
+    if not value:
         return None
-    shown, factor, longest = found
+    display, factor, longest = value
     text = (
         f"{FIELD_READING_TEXT} Drawn {factor:g} times as long as they are; the longest is"
         f" {brief(longest)} px."
     )
-    html = page.filled_template("fields.html.j2", fields=shown)
+    html = page.filled_template("fields.html.j2", fields=display)
     return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
 
 
@@ -113,7 +113,7 @@ def field_offsets(
     """
     parts = [
         _of_edges(session, edges, estimate, s)
-        for s in np.unique(edges.station[estimate.edge_weights >= KEPT_EDGE_WEIGHT]).tolist()
+        for s in np.unique(edges.station[estimate.edge_weights >= INLIER_WEIGHT]).tolist()
     ]
     used, n = np.flatnonzero(corners.used), len(edges)
     parts += [
@@ -127,17 +127,17 @@ def field_offsets(
         )
         for axis in (0, 1)
     ]
-    found = Offsets(
+    values = Offsets(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Offsets))
     )
-    known = np.isfinite(found.value) & np.isfinite(found.pixel).all(axis=-1)
-    return found.select(np.asarray(known))
+    finite = np.isfinite(values.value) & np.isfinite(values.pixel).all(axis=-1)
+    return values.select(np.asarray(finite))
 
 
 def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
     """Of one station's edges."""
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
-    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= KEPT_EDGE_WEIGHT))
+    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
     rows, photograph = np.unique(some.configuration, return_inverse=True)
     legs = legs_in_camera(
@@ -165,27 +165,27 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
 
 
 def fields(
-    session: Session, found: Offsets, links: Links
+    session: Session, value: Offsets, links: Links
 ) -> tuple[tuple[ImageField, ...], float, float] | None:
     """A field for each station, hand-held photographs of one camera together; the factor by which
     all arrows are enlarged, and the longest of them, px. None without any cell.
     """
     entries = [station.entry or station.name for station in session.stations]
-    shown: list[tuple[str, int, list[Arrow]]] = []
+    arrows: list[tuple[str, int, list[Arrow]]] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
-        mine = np.isin(found.station, of_entry)
+        mine = np.isin(value.station, of_entry)
         size = session.stations[of_entry[0]].camera.image_size
-        cells = _cells(found.select(mine), size, links)
+        cells = _cells(value.select(mine), size, links)
         if cells:
-            shown.append((entry, of_entry[0], cells))
-    if not shown:
+            arrows.append((entry, of_entry[0], cells))
+    if not arrows:
         return None
-    lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in shown for cell in cells])
-    width = max(session.stations[s].camera.image_size[0] for _, s, _ in shown)
+    lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in arrows for cell in cells])
+    width = max(session.stations[s].camera.image_size[0] for _, s, _ in arrows)
     factor = enlargement(lengths, FIELD_ARROW_LENGTH * width)
     return (
-        tuple(_field(session, entry, s, cells, factor) for entry, s, cells in shown),
+        tuple(_field(session, entry, s, cells, factor) for entry, s, cells in arrows),
         factor,
         float(lengths.max()),
     )
@@ -204,13 +204,13 @@ def _field(
     )
 
 
-def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
+def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     """The mean shifts of the cells of one picture that hold enough, px."""
     from scipy.special import fdtrc
 
     side = size[0] / FIELD_CELLS_ACROSS
-    inside = np.all((found.pixel > -0.5) & (found.pixel < np.array(size) - 0.5), axis=1)
-    some = found.select(np.asarray(inside))
+    inside = np.all((result.pixel > -0.5) & (result.pixel < np.array(size) - 0.5), axis=1)
+    some = result.select(np.asarray(inside))
     at = np.floor((some.pixel + 0.5) / side).astype(int)
     # an edge counts once in a cell: its places there are one measurement; a corner twice
     steep = np.abs(some.direction).argmax(axis=1)
@@ -229,14 +229,16 @@ def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
 
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
-    known = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
+    above_limit = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
     along = np.einsum("cij,ci->cj", axes, total(direction * value[:, None]))
-    shift = np.einsum("cij,cj->ci", axes, np.where(known, along / np.maximum(strength, 1e-12), 0.0))
+    shift = np.einsum(
+        "cij,cj->ci", axes, np.where(above_limit, along / np.maximum(strength, 1e-12), 0.0)
+    )
     explained = np.einsum("ci,cij,cj->c", shift, information, shift)
-    rank = known.sum(axis=1)
+    rank = above_limit.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
-    left = np.maximum(total(value**2) - explained, 1e-300)
-    loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CELL_BY_CHANCE_SHARE
+    residual = np.maximum(total(value**2) - explained, 1e-300)
+    loud = fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5

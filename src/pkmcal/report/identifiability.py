@@ -27,7 +27,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
         "identifiability.html.j2",
         headline=directions_headline(findings),
         told=findings,
-        fixed=held(findings, table),
+        fixed=held_text(findings, table),
         tied=tied(table),
         spectrum=spectrum(findings),
     )
@@ -36,18 +36,18 @@ def section(findings: Findings, table: ParameterTable) -> Part:
 
 def directions_headline(findings: Findings) -> str:
     """How many of the directions that exist the data fix."""
-    told = findings.told
-    possible = told.n_parameters - told.n_frames
-    frames = f"{told.n_parameters} free values less {told.n_frames} that only place the frames"
-    lost = possible - told.rank
-    start = f"The data fix {told.rank} of {possible} directions ({frames})."
-    if lost == 0 and not told.weak:
+    ranks = findings.identifiability
+    possible = ranks.n_parameters - ranks.n_frames
+    frames = f"{ranks.n_parameters} free values less {ranks.n_frames} that only place the frames"
+    lost = possible - ranks.rank
+    start = f"The data fix {ranks.rank} of {possible} directions ({frames})."
+    if lost == 0 and not ranks.weak:
         return f"{start} Each is known better from the data than from the drawing."
     parts: list[str] = []
     if lost:
         parts.append(f"{count(lost, 'direction')} no amount of such data would fix")
-    if told.weak:
-        parts.append(f"{count(len(told.weak), 'direction')} the drawing knows better")
+    if ranks.weak:
+        parts.append(f"{count(len(ranks.weak), 'direction')} the drawing knows better")
     return f"{start} {capital(joined(parts))}."
 
 
@@ -55,7 +55,7 @@ def spectrum(findings: Findings) -> BarChart | None:
     """Bars of all directions, best known first, on a logarithmic scale from
     ``LEAST_BAR_INFORMATION``.
     """
-    values = np.asarray(findings.told.singular_values, dtype=float)
+    values = np.asarray(findings.identifiability.singular_values, dtype=float)
     if values.size == 0:
         return None
     decades = math.log10(1 / LEAST_BAR_INFORMATION)
@@ -64,11 +64,16 @@ def spectrum(findings: Findings) -> BarChart | None:
     )
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
-        UprightBar(str(k + 1), f"Direction {k + 1}: {known}", float(height), quiet=bool(value >= 1))
+        UprightBar(
+            str(k + 1),
+            f"Direction {k + 1}: {reference_values}",
+            float(height),
+            quiet=bool(value >= 1),
+        )
         for k, (value, height) in enumerate(zip(values, heights, strict=True))
-        for known in [
+        for reference_values in [
             "the data say nothing"
-            if k >= findings.told.rank
+            if k >= findings.identifiability.rank
             else f"the drawing knows it {brief(1 / value)} times better"
             if value < 1
             else f"the data know it {brief(value)} times better than the drawing"
@@ -80,8 +85,8 @@ def spectrum(findings: Findings) -> BarChart | None:
     return BarChart(
         title="How well each direction is known",
         unit="directions of the parameters, best known first",
-        alt=f"{len(bars)} directions; {findings.told.rank} are fixed by the data and "
-        f"{len(findings.told.weak)} of those are known better by the drawing",
+        alt=f"{len(bars)} directions; {findings.identifiability.rank} are fixed by the data and "
+        f"{len(findings.identifiability.weak)} of those are known better by the drawing",
         bars=bars,
         high=high,
         ticks=ticks,
@@ -97,27 +102,28 @@ def _power(exponent: int) -> str:
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def held(findings: Findings, table: ParameterTable) -> str:
+def held_text(findings: Findings, table: ParameterTable) -> str:
     """What the mechanism file holds, in a sentence; empty where it holds nothing."""
     if not table.fixed:
         return ""
-    told = [name for name in table.fixed if name in findings.conventional]
-    if not told and not findings.also_conventional:
+    names = [name for name in table.fixed if name in findings.conventional]
+    if not names and not findings.also_conventional:
         verb, them = ("was", "it") if len(table.fixed) == 1 else ("were", "them")
         return (
             f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
             " under fixed, so the drawing's value counts as exact and no direction belongs to it."
         )
     # some of what is held only chooses frames, or repeats what is free
-    others = [name for name in table.fixed if name not in told]
+    others = [name for name in table.fixed if name not in names]
     parts: list[str] = []
-    if told:
+    if names:
         parts.append(
-            f"{_listed(table, tuple(told))} {'is' if len(told) == 1 else 'are'} held by convention:"
+            f"{_listed(table, tuple(names))} {'is' if len(names) == 1 else 'are'} held by"
+            " convention:"
             " any other value would only move a frame, or be made good by a value that is"
             " estimated, and the platform would be where it is."
         )
-    if any(".platform." in name and name.endswith(".z") for name in told):
+    if any(".platform." in name and name.endswith(".z") for name in names):
         parts.append(
             "Of the heights of base joints and platform only the sum counts: the camera and the "
             "board take up the rest."
@@ -144,12 +150,12 @@ def tied(table: ParameterTable) -> str:
         return ""
     against = {name for names in table.opposed for name in names}
     order = [tuple(name for name in table.names if name in names) for names in groups]
-    said = [
+    text = [
         joined(grouped(table, names)) + (" (by opposite amounts)" if against & set(names) else "")
         for names in order[:MOST_NAMES_LISTED]
     ]
     more = f" and {len(order) - MOST_NAMES_LISTED} more" if len(order) > MOST_NAMES_LISTED else ""
-    return f"Changes together, as one value: {'; '.join(said)}{more}."
+    return f"Changes together, as one value: {'; '.join(text)}{more}."
 
 
 def _together(table: ParameterTable) -> list[set[str]]:

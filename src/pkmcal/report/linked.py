@@ -11,7 +11,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
+from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, capital, count, decimals, number
 
@@ -29,13 +29,13 @@ def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> 
         unit, factor = DISPLAY_UNITS[kind.unit]
         white, weight = estimate.link_residuals[mine], estimate.link_weights[mine]
         off = white * estimate.statistics.link_scale * links.sigma
-        kept = weight >= KEPT_EDGE_WEIGHT
-        aside = "" if kept.all() else f", {int(np.sum(~kept))} rejected"
+        inliers = weight >= INLIER_WEIGHT
+        n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} rejected"
         joined = count(len(np.unique(links.configuration)), "configuration")
-        times = number(_rms(off[kept] / links.sigma[kept]), 2)
+        times = number(_rms(off[inliers] / links.sigma[inliers]), 2)
         text = (
-            f"{count(len(links), kind.one)} between {joined}{aside}. They are"
-            f" {brief(_rms(off[kept]) * factor)} {unit} off the calibrated machine (root mean"
+            f"{count(len(links), kind.one)} between {joined}{n_rejected}. They are"
+            f" {brief(_rms(off[inliers]) * factor)} {unit} off the calibrated machine (root mean"
             f" square), which is {times} times their stated noise."
         )
         out.append(
@@ -43,7 +43,7 @@ def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> 
                 kind.code,
                 capital(kind.label),
                 (text,),
-                tables=(_table(session, links, off, white, kept, unit, factor),),
+                tables=(_table(session, links, off, white, inliers, unit, factor),),
             )
         )
     return tuple(out)
@@ -70,7 +70,7 @@ def _table(
     links: LinkSet,
     off: Array,
     white: Array,
-    kept: Booleans,
+    retained: Booleans,
     unit: str,
     factor: float,
 ) -> Table:
@@ -85,7 +85,7 @@ def _table(
             number(float(links.value[k] + off[k]) * factor, digits),
             number(float(off[k]) * factor, digits),
             number(float(white[k]), 1),
-            "used" if kept[k] else "rejected",
+            "used" if retained[k] else "rejected",
         )
         rows.append(Row(first, cells))
     values = (f"Measured, {unit}", f"Calibrated, {unit}", f"Off, {unit}")

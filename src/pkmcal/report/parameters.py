@@ -14,14 +14,19 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.found import ROUNDING_SIGMA, FoundParameter, FoundParameters, found_parameters
+from pkmcal.identify.parameter_estimates import (
+    ROUNDING_SIGMA,
+    ParameterEstimate,
+    ParameterEstimates,
+    parameter_estimates,
+)
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
 from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT
 from pkmcal.wording import (
-    SHOWN_UNITS,
+    DISPLAY_UNITS,
     capital,
     decimals,
     joined,
@@ -34,7 +39,7 @@ from pkmcal.wording import (
 TIGHT_CORRELATION = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
 MOST_TIGHT_PAIRS = 6
-MOST_SHOWN = 250
+MOST_CORRELATIONS = 250
 """Parameters up to which they are shown: of more, a cell would be less than three pixels."""
 RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
 HOW_TOGETHER = (
@@ -98,30 +103,30 @@ class ParameterGroup:
 
 def section(drawing: Machine, estimate: Estimate) -> Part:
     """The table."""
-    seen = estimate.edge_weights.size or estimate.pose_weights.size
-    found = found_parameters(
+    visible = estimate.edge_weights.size or estimate.pose_weights.size
+    estimates = parameter_estimates(
         drawing.values, estimate.machine, estimate.covariance, estimate.data_share
     )
-    groups = parameter_groups(found)
+    groups = parameter_groups(estimates)
     html = page.filled_template(
         "parameters.html.j2",
         groups=groups,
         downloads={
-            "parameters.csv": _as_link("text/csv", parameters_csv(found)),
+            "parameters.csv": _as_link("text/csv", parameters_csv(estimates)),
             "parameters.tex": _as_link("application/x-tex", parameters_tex(groups)),
             "parameters.json": _as_link(
-                "application/json", json_text({"parameters": found.records()})
+                "application/json", json_text({"parameters": estimates.records()})
             ),
         },
         gauge=estimate.gauge,
-        told="heights" if only_heights(estimate) else "photographs" if seen else "readings",
+        told="heights" if only_heights(estimate) else "photographs" if visible else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 
 
-def parameters_csv(found: FoundParameters) -> str:
+def parameters_csv(estimates: ParameterEstimates) -> str:
     """The table for a spreadsheet: SI, all digits."""
-    stream, rows = io.StringIO(), found.records()
+    stream, rows = io.StringIO(), estimates.records()
     writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -152,15 +157,15 @@ def _as_link(kind: str, text: str) -> str:
     return f"data:{kind};charset=utf-8;base64,{packed}"
 
 
-def parameter_groups(found: FoundParameters) -> tuple[ParameterGroup, ...]:
+def parameter_groups(estimates: ParameterEstimates) -> tuple[ParameterGroup, ...]:
     """All parameters, grouped by leg in the order of the file."""
-    rows = [_row(found.table, k, one) for k, one in enumerate(found)]
+    rows = [_row(estimates.table, k, one) for k, one in enumerate(estimates)]
     legs = list(dict.fromkeys(row.leg for row in rows))
     return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
-def _row(table: ParameterTable, k: int, one: FoundParameter) -> ParameterRow:
-    factor, unit = SHOWN_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
+def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
+    factor, unit = DISPLAY_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
     sigma = one.sigma if one.sigma > ROUNDING_SIGMA else 0.0
     numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
     places = decimals(numbers[3])
@@ -191,12 +196,12 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
     """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
     table = estimate.machine.parameters
     names = table.names
-    found = () if findings is None else findings.unidentified
-    said = [{_whole_axis(name) for name in s.parameters} for s in found]
+    results = () if findings is None else findings.unidentified
+    text = [{_whole_axis(name) for name in s.parameters} for s in results]
     pairs = [
         (names[i], names[j], rho)
         for i, j, rho in tight_pairs(estimate)
-        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in said)
+        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in text)
     ]
     return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_TIGHT_PAIRS])
 
@@ -260,23 +265,23 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
 def correlations_part(estimate: Estimate) -> Part | None:
     """What is known together; None where nothing was estimated, or too much to be drawn."""
     table = estimate.machine.parameters
-    shown, rho, pairs = correlations(estimate)
-    if not 1 < len(shown) <= MOST_SHOWN:
+    display, rho, pairs = correlations(estimate)
+    if not 1 < len(display) <= MOST_CORRELATIONS:
         return None
-    names = [table.in_words(table.names[k]) for k in shown]
+    names = [table.in_words(table.names[k]) for k in display]
     off = np.abs(rho) * pairs
     a, b = np.unravel_index(np.argmax(off), off.shape)
-    said = (
+    text = (
         f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
         f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
     ).replace("-", "−")
-    if np.count_nonzero(pairs) < len(shown) * (len(shown) - 1) // 2:
-        said += " Components of one axis, which its length binds, are not counted."
+    if np.count_nonzero(pairs) < len(display) * (len(display) - 1) // 2:
+        text += " Components of one axis, which its length binds, are not counted."
     plot = Plot(
         "correlations",
         "Correlations of the parameters",
         "Point at a cell for its two parameters.",
-        f"A square of {len(shown)} by {len(shown)} cells, coloured by the correlation of two"
+        f"A square of {len(display)} by {len(display)} cells, coloured by the correlation of two"
         " parameters each.",
         _heat_map(rho, names),
         height=600,
@@ -285,7 +290,7 @@ def correlations_part(estimate: Estimate) -> Part | None:
     return Part(
         "correlations",
         "What is known together",
-        (f"{said} {HOW_TOGETHER}",),
+        (f"{text} {HOW_TOGETHER}",),
         plots=(plot,),
         menu="Correlations",
     )

@@ -19,9 +19,10 @@ from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tu
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
-from pkmcal.pages.drawn import (
+from pkmcal.pages.jpegs import small_and_large
+from pkmcal.pages.overlays import (
     EDGE_CURVE_POINTS,
-    KEPT_EDGE_WEIGHT,
+    INLIER_WEIGHT,
     Arrow,
     Drawn,
     Picture,
@@ -32,17 +33,16 @@ from pkmcal.pages.drawn import (
     residual_words,
     straightened,
 )
-from pkmcal.pages.jpegs import small_and_large
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Links, Place
+from pkmcal.session.image_files import Photograph
 from pkmcal.session.load import Session, Station
-from pkmcal.session.photographs import Photograph
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-MOST_PHOTOGRAPHS_SHOWN = 400
+MOST_PAGE_IMAGES = 400
 """Photographs on a page: browsers take a second to lay out as many."""
 JPEG_CHARACTERS_A_PAGE = 8_000_000
 """Characters of all their JPEGs."""
@@ -65,16 +65,16 @@ class Album:
     corners: BoardCorners
 
 
-def section(session: Session, shown: Album) -> Part:
+def section(session: Session, display: Album) -> Part:
     """The section."""
     html = page.filled_template(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
-        album=shown,
-        legs=any(p.edges or p.missed or p.spots for p in shown.pictures),
-        boards=any(p.corners for p in shown.pictures),
-        missed=any(p.missed for p in shown.pictures),
-        large=sum(bool(p.large) for p in shown.pictures),
+        album=display,
+        legs=any(p.edges or p.missed or p.spots for p in display.pictures),
+        boards=any(p.corners for p in display.pictures),
+        missed=any(p.missed for p in display.pictures),
+        large=sum(bool(p.large) for p in display.pictures),
     )
     return Part("photographs", "Photographs", html=html)
 
@@ -95,24 +95,24 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     }
     files = [
         (images[s], session.stations[s].photographs.index(photo))
-        for s, photo in ordered[:MOST_PHOTOGRAPHS_SHOWN]
+        for s, photo in ordered[:MOST_PAGE_IMAGES]
     ]
     shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
-    found = _Found(calibration, shifts, centres, chosen)
+    count = _ImageOverlays(calibration, shifts, centres, chosen)
     room = JPEG_CHARACTERS_A_PAGE - sum(len(small) + len(large) for small, large in shots)
     return Album(
         tuple(
-            found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
+            count.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
             for place in [(s, photo.configuration)]
         ),
         tuple(_rejected(session, room)),
         len(every),
-        found.factor,
+        count.factor,
         links,
-        found.corners,
+        count.corners,
     )
 
 
@@ -123,7 +123,7 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
     lost = [(one, photo) for one in session.rejected for photo in one.station.photographs]
     files = [
         (_decoded(one.station), one.station.photographs.index(photo))
-        for one, photo in lost[:MOST_PHOTOGRAPHS_SHOWN]
+        for one, photo in lost[:MOST_PAGE_IMAGES]
     ]
     shots = list(small_and_large(files, room))
     shots += [("", "")] * (len(lost) - len(shots))
@@ -169,7 +169,7 @@ def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
     return {(s, k): float(m) ** 0.5 for (s, k), m in zip(each.tolist(), mean, strict=True)}
 
 
-class _Found:
+class _ImageOverlays:
     """What is drawn over the chosen photographs, worked out for all of a station at once.
 
     factor : enlarges the corners' residuals.
@@ -219,8 +219,10 @@ class _Found:
         mine = c.select((c.station == s) & (c.photograph == p))
         width, height = station.camera.image_size
         edges, missed = self.edges[s, k], self.missed[s, k]
-        told = [
-            count(len(edges), "edge") + _aside(sum(e.quiet for e in edges)) if edges else "",
+        captions = [
+            count(len(edges), "edge") + _rejected_words(sum(e.quiet for e in edges))
+            if edges
+            else "",
             f"{len(missed)} not used" if missed else "",
             f"{count(len(mine), 'corner')}, {_size(mine)}" if len(mine) else "",
             f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
@@ -238,7 +240,7 @@ class _Found:
             missed=tuple(missed),
             spots=tuple(self.spots[s, k]),
             corners=tuple(self._corner(mine, n) for n in range(len(mine))),
-            caption="; ".join(text for text in told if text),
+            caption="; ".join(text for text in captions if text),
             anchor=anchor,
         )
 
@@ -265,7 +267,7 @@ class _Found:
                 f" {number(float(shifts[n]), 2, signed=True)} px outward;"
                 f" {residual_words(across, tilt, weight)}"
             )
-            drawn = polyline(leg, points, weight < KEPT_EDGE_WEIGHT, tip)
+            drawn = polyline(leg, points, weight < INLIER_WEIGHT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
@@ -300,16 +302,16 @@ class _Found:
         after = self.calibration.machine.ends_at(joints, pose)
         old_pose = inverse(base) @ pose @ platform
         before = session.machine.ends_at(joints, old_pose)
-        seen = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
+        visible = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
         drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
-        inside = camera.in_image(seen)
+        inside = camera.in_image(visible)
         for n, k in enumerate(configurations.tolist()):
             labelled: set[int] = set()
             for side, end in enumerate(("base", "platform")):
                 for j in np.flatnonzero(inside[side, n]).tolist():
                     old = drawn[side, n, j]
                     cross = _pair(old) if np.isfinite(old).all() else None
-                    new = _pair(seen[side, n, j])
+                    new = _pair(visible[side, n, j])
                     self.spots[s, k].append(Spot(j + 1, end, new, cross, j not in labelled))
                     labelled.add(j)
 
@@ -329,7 +331,7 @@ def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
     )
 
 
-def _aside(n: int) -> str:
+def _rejected_words(n: int) -> str:
     return f", {n} of them put aside" if n else ""
 
 

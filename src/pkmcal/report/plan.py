@@ -20,13 +20,13 @@ from pkmcal.pages.plots import (
     frustum,
     line,
     markers,
-    seen_whole,
-    way_between_cameras,
+    path_between_cameras,
+    uncropped,
 )
 from pkmcal.planning.plan import WORTHWHILE_ACCURACY_GAIN, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
 from pkmcal.simulation.placement import StationPlace
-from pkmcal.wording import SHOWN_UNITS, amount, brief, count, listed, number
+from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
 PLAN_TABLE_FILE, PLAN_PLACES_FILE = "plan.csv", "stations.yaml"
 PLAN_FORMAT = 1
@@ -53,63 +53,63 @@ PLAN_METHOD_TEXT = (
 )
 
 
-def outcome_of(found: MeasurementPlan) -> Outcome:
+def outcome_of(plan: MeasurementPlan) -> Outcome:
     """Everything that ``pkmcal plan`` tells and writes."""
     texts: dict[str, str | bytes] = {
         PLAN_TABLE_FILE: csv_text(
-            found.subject.columns, found.names, found.joints.round(PLAN_READING_DECIMALS)
+            plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
         )
     }
-    parts = [_order(found), _curve(found)]
-    if found.tried:
-        texts[PLAN_PLACES_FILE] = yaml_text(stations_document(found))
-        parts.append(_places(found))
-    if _cameras(found):
-        parts.append(_where(found))
-    parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *found.subject.words)))
-    machine = found.subject.rig.machine
-    gain = found.by_chance.position / found.promised.position
+    parts = [_order(plan), _curve(plan)]
+    if plan.tried:
+        texts[PLAN_PLACES_FILE] = yaml_text(stations_document(plan))
+        parts.append(_places(plan))
+    if _cameras(plan):
+        parts.append(_where(plan))
+    parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
+    machine = plan.subject.rig.machine
+    gain = plan.by_chance.position / plan.promised.position
     return Outcome(
         command="plan",
         title=f"What to measure next on {machine.name}",
-        subject=_asked(found),
+        subject=_purpose(plan),
         verdict=Verdict(
             usable=True,
-            headline=f"These {count(len(found.names), 'configuration')} will tell the tool's"
-            f" {_known_to(found.promised)}, standard deviations, mean over the workspace.",
-            findings=(_paying(found), *_carefully(found)),
+            headline=f"These {count(len(plan.names), 'configuration')} will tell the tool's"
+            f" {_accuracy_cells(plan.promised)}, standard deviations, mean over the workspace.",
+            findings=(_paying(plan), *_carefully(plan)),
         ),
         stamp="Plan",
         figures=(
             Figure(
                 "How well will the tool be known?",
                 (
-                    (brief(found.promised.position * 1e3), "mm"),
-                    (brief(np.rad2deg(found.promised.orientation)), "°"),
+                    (brief(plan.promised.position * 1e3), "mm"),
+                    (brief(np.rad2deg(plan.promised.orientation)), "°"),
                 ),
-                f"now {amount(found.now.position, 'm')} and {amount(found.now.orientation, 'rad')}",
+                f"now {amount(plan.now.position, 'm')} and {amount(plan.now.orientation, 'rad')}",
             ),
             Figure(
                 "How much better than by chance?",
                 ((number(gain, 1), "×"),),
                 "configurations spread evenly over the joints' ranges, as many, would tell it to"
-                f" {amount(found.by_chance.position, 'm')}",
+                f" {amount(plan.by_chance.position, 'm')}",
             ),
             Figure(
                 "How long is the way?",
-                ((number(found.travel[0], 1), "ranges"),),
+                ((number(plan.travel[0], 1), "ranges"),),
                 "moved by the slowest motor in this order, from home; in an order by chance"
-                f" {number(found.travel[1], 1)}",
+                f" {number(plan.travel[1], 1)}",
             ),
         ),
         parts=tuple(parts),
-        findings=tuple(note("plan.source", text=text) for text in found.subject.words),
-        document=plan_document(found),
+        findings=tuple(note("plan.source", text=text) for text in plan.subject.words),
+        document=plan_document(plan),
         texts=texts,
     )
 
 
-def _known_to(accuracy: Accuracy) -> str:
+def _accuracy_cells(accuracy: Accuracy) -> str:
     """Position and orientation; a platform that does not turn has no orientation to be known."""
     words = f"position to {amount(accuracy.position, 'm')}"
     if not accuracy.orientation:
@@ -117,19 +117,19 @@ def _known_to(accuracy: Accuracy) -> str:
     return f"{words} and its orientation to {amount(accuracy.orientation, 'rad')}"
 
 
-def _asked(found: MeasurementPlan) -> str:
+def _purpose(plan: MeasurementPlan) -> str:
     """What the plan is for, in a sentence."""
     where = ""
-    if len({name for names in found.stations for name in names}) > 1:
-        where = " seen by all stations" if found.together else " from each place"
-    each = count(found.promised.count, "configuration") + where
-    return f"{each}, chosen for {INDEX_NAMES[found.index]}; workspace: {found.region}."
+    if len({name for names in plan.stations for name in names}) > 1:
+        where = " seen by all stations" if plan.together else " from each place"
+    each = count(plan.promised.count, "configuration") + where
+    return f"{each}, chosen for {INDEX_NAMES[plan.index]}; workspace: {plan.region}."
 
 
-def _paying(found: MeasurementPlan) -> Finding:
+def _paying(plan: MeasurementPlan) -> Finding:
     """Where more photographs stop paying."""
-    last, until = found.promised, found.pays_until
-    twice = next(a for a in found.curve if a.count > last.count)
+    last, until = plan.promised, plan.pays_until
+    twice = next(a for a in plan.curve if a.count > last.count)
     facts = {
         "tool_sigma": twice.position,
         "gain": 1 - twice.position / last.position,
@@ -140,18 +140,18 @@ def _paying(found: MeasurementPlan) -> Finding:
     return note("plan.pays_until", number=until, **facts)
 
 
-def _carefully(found: MeasurementPlan) -> tuple[Finding, ...]:
+def _carefully(plan: MeasurementPlan) -> tuple[Finding, ...]:
     """Configurations to which the straight way is blocked."""
-    names = [name for name, bad in zip(found.names, found.blocked, strict=True) if bad]
+    names = [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]
     return (note("plan.blocked", listed(names), names=names),) if names else ()
 
 
-def _order(found: MeasurementPlan) -> Part:
+def _order(plan: MeasurementPlan) -> Part:
     """The configurations, in their order."""
-    units = found.subject.rig.machine.joint_units
+    units = plan.subject.rig.machine.joint_units
     columns = [
-        f"{name}, {SHOWN_UNITS[unit][1]}"
-        for name, unit in zip(found.subject.columns, units, strict=True)
+        f"{name}, {DISPLAY_UNITS[unit][1]}"
+        for name, unit in zip(plan.subject.columns, units, strict=True)
     ]
     rows = [
         Row(
@@ -159,11 +159,11 @@ def _order(found: MeasurementPlan) -> Part:
             (
                 listed(who, 3),
                 str(int(rank)),
-                *(number(q * SHOWN_UNITS[u][0], 2) for q, u in zip(joints, units, strict=True)),
+                *(number(q * DISPLAY_UNITS[u][0], 2) for q, u in zip(joints, units, strict=True)),
             ),
         )
         for name, who, rank, joints in zip(
-            found.names, found.stations, found.rank, found.joints.tolist(), strict=True
+            plan.names, plan.stations, plan.rank, plan.joints.tolist(), strict=True
         )
     ]
     table = Table(
@@ -179,11 +179,11 @@ def _order(found: MeasurementPlan) -> Part:
     return Part("order", "Configurations", tables=(table,))
 
 
-def _curve(found: MeasurementPlan) -> Part:
+def _curve(plan: MeasurementPlan) -> Part:
     """How the tool's deviation falls with the number of configurations."""
-    x = [a.count for a in found.curve]
-    y = [a.position * 1e3 for a in found.curve]
-    here, axis = found.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
+    x = [a.count for a in plan.curve]
+    y = [a.position * 1e3 for a in plan.curve]
+    here, axis = plan.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
     figure = {
         "data": [
             {
@@ -201,7 +201,7 @@ def _curve(found: MeasurementPlan) -> Part:
                 "mode": "markers",
                 "name": "by chance",
                 "x": [here.count],
-                "y": [found.by_chance.position * 1e3],
+                "y": [plan.by_chance.position * 1e3],
                 "marker": {"color": "--drawing", "size": 9, "symbol": "x"},
                 "hovertemplate": "%{x} by chance: %{y:.3g} mm<extra></extra>",
             },
@@ -228,7 +228,7 @@ def _curve(found: MeasurementPlan) -> Part:
     )
     wanted = {3, 5, 8, 10, 15, 20, 30, 50}
     turns = here.orientation > 0
-    few = [a for a in found.curve if a.count in wanted or a.count >= here.count]
+    few = [a for a in plan.curve if a.count in wanted or a.count >= here.count]
     rows = [
         Row(
             f"{a.count:g}",
@@ -256,10 +256,10 @@ def _ticks(values: Sequence[float]) -> dict[str, Any]:
     return {"tickvals": places, "ticktext": [f"{p:g}" for p in places]}
 
 
-def _cameras(found: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
+def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
     """Cameras of the plan: station, camera and T_camera_base."""
     out: dict[str, tuple[str, Camera, Array]] = {}
-    rig = found.subject.rig
+    rig = plan.subject.rig
     for one in rig.instruments:
         if isinstance(one, LegsFrom | BoardFrom):
             name = rig.names[one.station]
@@ -267,9 +267,9 @@ def _cameras(found: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
     return list(out.values())
 
 
-def _places(found: MeasurementPlan) -> Part:
+def _places(plan: MeasurementPlan) -> Part:
     """Where to put the camera, and what the best places would do alone."""
-    order = sorted(found.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
+    order = sorted(plan.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
     rows = [
         Row(
             "[" + ", ".join(f"{x:.3g}" for x in tried.place.position) + "]",
@@ -293,15 +293,15 @@ def _places(found: MeasurementPlan) -> Part:
     return Part("places", "Where to put the camera", tables=(table,))
 
 
-def _where(found: MeasurementPlan) -> Part:
+def _where(plan: MeasurementPlan) -> Part:
     """The drawing: the machine, its configurations, the cameras, and the places tried."""
-    rig, home = found.subject.rig, found.subject.rig.machine.home()[None]
+    rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
     machine = rig.machine
     ends = machine.ends_at(machine.inverse(home), home)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     legs = [np.stack([a, b]) for a, b in zip(ends.a[0], ends.b[0], strict=True)]
-    places = found.T_base_platform[:, :3, 3]
-    hover = [f"{n} (from {listed(s, 3)})" for n, s in zip(found.names, found.stations, strict=True)]
+    places = plan.T_base_platform[:, :3, 3]
+    hover = [f"{n} (from {listed(s, 3)})" for n, s in zip(plan.names, plan.stations, strict=True)]
     data = [
         line("The machine at home", "--drawing", 5, legs),
         markers(
@@ -310,29 +310,29 @@ def _where(found: MeasurementPlan) -> Part:
         ),
     ]  # fmt: skip
     eyes: list[Array] = []
-    for name, camera, T_camera_base in _cameras(found):
+    for name, camera, T_camera_base in _cameras(plan):
         T = inverse(T_camera_base)
         eye = T[:3, 3]
         view = frustum(camera, T, FRUSTUM_LENGTH_SHARE * float(np.linalg.norm(middle - eye)))
         eyes.append(eye)
-        look = {"size": 4, "color": "--ink", "symbol": "square"}
+        style = {"size": 4, "color": "--ink", "symbol": "square"}
         data += [
             line(name, "--ink", 3, view, showlegend=False),
             markers(
-                name, eye[None], look, mode="markers+text", text=[name],
+                name, eye[None], style, mode="markers+text", text=[name],
                 textposition="top center", textfont={"color": "--ink"}, showlegend=False,
                 hoverinfo="skip",
             ),
         ]  # fmt: skip
-    if found.tried:
-        data.append(_tried(found.tried))
-    layout = seen_whole(data, way_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
+    if plan.tried:
+        data.append(_tried(plan.tried))
+    layout = uncropped(data, path_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",
         "Cameras and configurations",
         "Drag to turn, wheel or pinch to come nearer."
-        + (" Dots: places that were tried, the darker the better alone." if found.tried else ""),
+        + (" Dots: places that were tried, the darker the better alone." if plan.tried else ""),
         "The machine, the platform's places in the plan, and the cameras, in three dimensions",
         {"data": data, "layout": layout, "config": {"scrollZoom": True}},
         height=520,
@@ -344,20 +344,20 @@ def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
     """Dots at the places that were tried, by what each tells alone."""
     at = np.array([one.place.position for one in tried])
     value = np.array([one.alone for one in tried]) * 1e3
-    look = {
+    style = {
         "size": 4,
         "color": np.log10(value).round(3).tolist(),
         "colorscale": "Blues",
         "opacity": 0.7,
     }
     hover = [f"alone {brief(v)} mm" for v in value]
-    return markers("Places tried", at, look, hovertext=hover, hoverinfo="text")
+    return markers("Places tried", at, style, hovertext=hover, hoverinfo="text")
 
 
-def stations_document(found: MeasurementPlan) -> dict[str, Any]:
+def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
     """The chosen places as entries of session.yaml."""
-    rig, out = found.subject.rig, dict[str, Any]()
-    for name, _, T_camera_base in _cameras(found):
+    rig, out = plan.subject.rig, dict[str, Any]()
+    for name, _, T_camera_base in _cameras(plan):
         observe = [
             word
             for word, kind in (("legs", LegsFrom), ("board", BoardFrom))
@@ -372,29 +372,29 @@ def stations_document(found: MeasurementPlan) -> dict[str, Any]:
     return {"stations": out}
 
 
-def plan_document(found: MeasurementPlan) -> dict[str, Any]:
+def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
     """Plain data for JSON: m and rad."""
-    rig = found.subject.rig
+    rig = plan.subject.rig
     joined = zip(
-        found.names, found.stations, found.rank, found.joints, found.T_base_platform,
-        found.blocked, strict=True,
+        plan.names, plan.stations, plan.rank, plan.joints, plan.T_base_platform,
+        plan.blocked, strict=True,
     )  # fmt: skip
     return json_value(
         {
             "pkmcal_plan": PLAN_FORMAT,
             "machine": rig.machine.name,
-            "index": {"name": found.index, "value": found.value, "by_chance": found.at_random},
+            "index": {"name": plan.index, "value": plan.value, "by_chance": plan.at_random},
             "workspace": {
-                "x": found.region.x, "y": found.region.y, "z": found.region.z,
-                "turn": found.region.turn,
+                "x": plan.region.x, "y": plan.region.y, "z": plan.region.z,
+                "turn": plan.region.turn,
             },
-            "together": found.together,
-            "now": _told(found.now),
-            "promised": _told(found.promised),
-            "by_chance": _told(found.by_chance),
-            "pays_until": found.pays_until,
-            "curve": [_told(a) for a in found.curve],
-            "columns": list(found.subject.columns),
+            "together": plan.together,
+            "now": _progress_text(plan.now),
+            "promised": _progress_text(plan.promised),
+            "by_chance": _progress_text(plan.by_chance),
+            "pays_until": plan.pays_until,
+            "curve": [_progress_text(a) for a in plan.curve],
+            "columns": list(plan.subject.columns),
             "configurations": [
                 {
                     "name": name,
@@ -408,7 +408,7 @@ def plan_document(found: MeasurementPlan) -> dict[str, Any]:
             ],
             "stations": [
                 {"name": name, "T_base_camera": inverse(T), "camera": camera.document()}
-                for name, camera, T in _cameras(found)
+                for name, camera, T in _cameras(plan)
             ],
             "places_tried": [
                 {
@@ -417,16 +417,16 @@ def plan_document(found: MeasurementPlan) -> dict[str, Any]:
                     "tool_alone": one.alone,
                     "chosen": one.chosen,
                 }
-                for one in found.tried
+                for one in plan.tried
             ],
-            "assumptions": list(found.subject.words),
-            "board": found.subject.board,
+            "assumptions": list(plan.subject.words),
+            "board": plan.subject.board,
             "mechanism": rig.machine.to_document(),
         }
     )  # fmt: skip
 
 
-def _told(accuracy: Accuracy) -> dict[str, float]:
+def _progress_text(accuracy: Accuracy) -> dict[str, float]:
     return {
         "configurations": accuracy.count,
         "position": accuracy.position,

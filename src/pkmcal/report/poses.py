@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.calibration.doubts import turning
+from pkmcal.calibration.faults import turning
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import charts
-from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT
+from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report.links import Links
 from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
 from pkmcal.session.load import Session
@@ -54,30 +54,33 @@ def errors(poses: PoseSet, estimate: Estimate) -> Array:
     """Predicted less measured (N, 6): rad and m, station frame; NaN for what was not measured."""
     white = estimate.pose_residuals * estimate.statistics.pose_scale
     error = (np.linalg.pinv(poses.whiten) @ white[..., None])[..., 0]
-    known = np.any(poses.whiten != 0, axis=-2)
-    return np.where(known, error, np.nan)
+    reference_values = np.any(poses.whiten != 0, axis=-2)
+    return np.where(reference_values, error, np.nan)
 
 
 def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...]:
-    kept = estimate.pose_weights >= KEPT_EDGE_WEIGHT
+    inliers = estimate.pose_weights >= INLIER_WEIGHT
     s = estimate.statistics
-    aside = "" if kept.all() else f", {int(np.sum(~kept))} put aside"
-    seen = count(len(np.unique(poses.configuration)), "configuration")
-    sizes = [_length(error[kept, 3:]) * 1e3, float(np.rad2deg(_length(error[kept, :3])))]
-    told = [f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)]
+    n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} put aside"
+    in_view = count(len(np.unique(poses.configuration)), "configuration")
+    sizes = [_length(error[inliers, 3:]) * 1e3, float(np.rad2deg(_length(error[inliers, :3])))]
+    sizes_text = [
+        f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)
+    ]
     # the factor itself is never below one
     times = s.pose_scale if s.pose_scale > 1 else np.sqrt(s.chi2_poses / max(s.dof_poses, 1))
     return (
-        f"{count(len(poses), 'pose')} measured in {seen}{aside}.",
-        f"They are {' and '.join(told)} off the calibrated machine (root mean square), which is"
+        f"{count(len(poses), 'pose')} measured in {in_view}{n_rejected}.",
+        f"They are {' and '.join(sizes_text)} off the calibrated machine (root mean"
+        " square), which is"
         f" {number(times, 2)} times their stated noise.",
     )
 
 
 def _length(values: Array) -> float:
     """Root mean square length of vectors (n, 3), what was not measured left out."""
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return float("nan")
     return float(np.sqrt(np.mean(np.nansum(values**2, axis=-1))))
 
@@ -87,9 +90,9 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
     state, rows = estimate.state, list[Row]()
     for m, name in enumerate(mount_names(session, len(state.T_mount))):
         T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
-        known = identified(estimate.machine, estimate.mount_covariance[m])
-        place = _texts(T[:3, 3], sigma[3:], known[3:], 1e3)
-        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], known[:3], 180 / np.pi)
+        reference = identified(estimate.machine, estimate.mount_covariance[m])
+        place = _texts(T[:3, 3], sigma[3:], reference[3:], 1e3)
+        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], reference[:3], 180 / np.pi)
         rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
     return Table(
         "Where it sits",
@@ -108,10 +111,10 @@ def mount_names(session: Session, n: int) -> list[str]:
     return ["board"] * (n - len(others)) + others
 
 
-def _texts(values: Array, sigma: Array, known: Booleans, factor: float) -> list[str]:
+def _texts(values: Array, sigma: Array, valid: Booleans, factor: float) -> list[str]:
     """Numbers with their deviations, ``open`` where the data do not determine them."""
     out: list[str] = []
-    for value, spread, sure in zip(values.tolist(), sigma.tolist(), known, strict=True):
+    for value, spread, sure in zip(values.tolist(), sigma.tolist(), valid, strict=True):
         text = number(value * factor, decimals(spread * factor))
         text = f"{text} ± {brief(spread * factor)}" if spread else text
         out.append(text if sure else "open")
@@ -190,7 +193,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
             brief(_length(error[k : k + 1, 3:]) * 1e3),
             brief(turn),
             number(float(level[k]), 1),
-            "put aside" if estimate.pose_weights[k] < KEPT_EDGE_WEIGHT else "used",
+            "put aside" if estimate.pose_weights[k] < INLIER_WEIGHT else "used",
         )
         rows.append(Row(session.station_names[poses.station[k]], cells))
     columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")

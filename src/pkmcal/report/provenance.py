@@ -18,7 +18,7 @@ from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
-from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
+from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.wording import amount, brief, count, decimals, number
@@ -42,18 +42,18 @@ def used_photographs(
     """How many of each station's photographs show something that is in use: a board that was not
     rejected, or edges of which most were not. Those that were held out do not.
     """
-    seen = set[tuple[int, int]]()
-    for found, weights in (
+    names_so_far = set[tuple[int, int]]()
+    for item, weights in (
         (observation.edges, estimate.edge_weights),
         (observation.poses, estimate.pose_weights),
     ):
-        pairs = np.stack([found.station, found.configuration], axis=1)
+        pairs = np.stack([item.station, item.configuration], axis=1)
         pairs, own = np.unique(pairs, axis=0, return_inverse=True)
-        kept = np.bincount(own.ravel(), weights >= KEPT_EDGE_WEIGHT, len(pairs))
-        most = 2 * kept >= np.bincount(own.ravel(), minlength=len(pairs))
-        seen |= {(s, c) for s, c in pairs[most].tolist()}
+        inliers = np.bincount(own.ravel(), weights >= INLIER_WEIGHT, len(pairs))
+        most = 2 * inliers >= np.bincount(own.ravel(), minlength=len(pairs))
+        names_so_far |= {(s, c) for s, c in pairs[most].tolist()}
     return tuple(
-        sum((s, photo.configuration) in seen for photo in station.photographs)
+        sum((s, photo.configuration) in names_so_far for photo in station.photographs)
         for s, station in enumerate(session.stations)
     )
 
@@ -82,7 +82,7 @@ def stations(
         cells = (
             *_place(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
-            _moved(station.T_camera_base, estimate.state.T_camera_base[s]),
+            _shift_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
             f"{station.camera_file}, {station.camera.model}, {photographs}",
         )
         rows.append(Row(station.name, cells))
@@ -103,26 +103,26 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     """A station's place with its deviations (mm), and the deviation of its turn (degrees); what the
     data do not determine is open.
     """
-    found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
-    place = inverse(found)[:3, 3] * 1e3
-    covariance = base_camera_covariance(found, covariance)
-    known = identified(estimate.machine, covariance)
+    value, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
+    place = inverse(value)[:3, 3] * 1e3
+    covariance = base_camera_covariance(value, covariance)
+    reference = identified(estimate.machine, covariance)
     # rounding may leave less than none
     sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
         f"{number(v, decimals(d))} ± {brief(d)}" if sure else "open"
-        for v, d, sure in zip(place.tolist(), sigma.tolist(), known[3:], strict=True)
+        for v, d, sure in zip(place.tolist(), sigma.tolist(), reference[3:], strict=True)
     )
-    return x, y, z, amount(turn, "rad") if known[:3].all() else "open"
+    return x, y, z, amount(turn, "rad") if reference[:3].all() else "open"
 
 
-def _moved(rough: Array | None, found: Array) -> str:
+def _shift_cell(rough: Array | None, values: Array) -> str:
     if rough is None:
         return "–"
-    turn = np.rad2deg(np.linalg.norm(pose_difference(found, rough)[:3]))
-    way = np.linalg.norm(inverse(found)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
-    return f"{number(float(way), 0)} mm, {number(float(turn), 1)}°"
+    turn = np.rad2deg(np.linalg.norm(pose_difference(values, rough)[:3]))
+    direction = np.linalg.norm(inverse(values)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
+    return f"{number(float(direction), 0)} mm, {number(float(turn), 1)}°"
 
 
 def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
@@ -144,7 +144,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
-    tubes = zip(noise.scale, noise.shading, noise.tails, strict=True)
+    tubes = zip(noise.scale, noise.shading, noise.dof, strict=True)
     units = dict.fromkeys(session.machine.joint_units)
     linked = link_labels(session)
     return (

@@ -17,12 +17,12 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.images import decode
-from pkmcal.pages.drawn import KEPT_EDGE_WEIGHT, edge_name, machine_laid_over, residual_words
 from pkmcal.pages.jpegs import coded
+from pkmcal.pages.overlays import INLIER_WEIGHT, edge_name, machine_laid_over, residual_words
 from pkmcal.report import poses
 from pkmcal.report.pictures import edge_curves
 from pkmcal.report.residuals import weighted_edge_rms
-from pkmcal.session.photographs import label_of
+from pkmcal.session.image_files import label_of
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -141,9 +141,9 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
             else RECORDED_GREY
             for j in legs
         ]
-        told = {"strips": strips, "radii": radii, "colours": colours}
+        static = {"strips": strips, "radii": radii, "colours": colours}
         labels = [f"leg {j + 1}" for j in legs]
-        yield Logged(("machine", name), "lines3d", {**told, "labels": labels}, at)
+        yield Logged(("machine", name), "lines3d", {**static, "labels": labels}, at)
     ends = machine.ends_at(joints, pose)
     points = np.concatenate([ends.a, ends.b])
     labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
@@ -154,8 +154,8 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     if len(c.observation.poses):
         points, configuration = poses.target_places(c.observation, c.estimate)
         points = points[configuration == k]
-        told = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
-        yield Logged(("machine", "measured"), "points3d", told, at)
+        static = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
+        yield Logged(("machine", "measured"), "points3d", static, at)
 
 
 def _tubes(
@@ -164,15 +164,15 @@ def _tubes(
     """Axes (2, 3), m, and radii of all tubes, with their legs from 0; thin lines for the others."""
     ends = machine.ends_at(joints, T_base_platform)
     strips, radii, legs = list[Array](), list[float](), list[int]()
-    for j, known in enumerate(machine.radii()):
+    for j, reference in enumerate(machine.radii()):
         line = ends.b[j] - ends.a[j]
         length = float(np.linalg.norm(line))
-        for radius, tube in zip(known, machine.document.legs[j].tubes, strict=True):
+        for radius, tube in zip(reference, machine.document.legs[j].tubes, strict=True):
             share = np.array([tube.start, min(tube.stop, length)]) / length
             strips.append(ends.a[j] + share[:, None] * line)
             radii.append(float(radius))
             legs.append(j)
-        if not len(known):
+        if not len(reference):
             strips.append(np.stack([ends.a[j], ends.b[j]]))
             radii.append(TUBELESS_LEG_RADIUS)
             legs.append(j)
@@ -201,14 +201,14 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
     curves = edge_curves(c, mine, s)
-    used = estimate.edge_weights[mine] >= KEPT_EDGE_WEIGHT
+    used = estimate.edge_weights[mine] >= INLIER_WEIGHT
     for part, chosen in (("edges", used), ("aside", ~used)):
         rows = np.flatnonzero(chosen)
         strips = [
             curves[n][np.isfinite(curves[n]).all(axis=-1)] + VIEWER_PIXEL_CORNER for n in rows
         ]
         own = edges.select(mine[rows])
-        told = {
+        logged = {
             "strips": strips,
             "colours": [
                 RECORDED_LEG_COLOURS[j % len(RECORDED_LEG_COLOURS)]
@@ -218,7 +218,7 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
             ],
             "labels": [_tip(c, int(n)) for n in mine[rows]],
         }
-        yield Logged((*path, part), "lines2d", told, at)
+        yield Logged((*path, part), "lines2d", logged, at)
     if estimate.configurations[k]:
         drawn, _ = machine_laid_over(
             estimate.machine,
@@ -229,8 +229,8 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
         )
         strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in drawn]
         labels = [edge.tip for edge in drawn]
-        told = {"strips": strips, "colours": [RECORDED_WHITE] * len(strips), "labels": labels}
-        yield Logged((*path, "contour"), "lines2d", told, at)
+        logged = {"strips": strips, "colours": [RECORDED_WHITE] * len(strips), "labels": labels}
+        yield Logged((*path, "contour"), "lines2d", logged, at)
     if len(mine):
         level = weighted_edge_rms(estimate.edge_residuals[mine], estimate.edge_weights[mine])
         yield Logged(("residuals", "edges", station.name), "numbers", {"value": level}, at)

@@ -14,7 +14,7 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import charts
-from pkmcal.pages.drawn import EDGE_SIDE_NAMES, KEPT_EDGE_WEIGHT
+from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
@@ -47,7 +47,7 @@ def section(
     shifts : (N,) px, of :func:`outward_shift`. links : to the photographs on the page. poses : a
     chart of the poses' residuals.
     """
-    shown = charts.panels(
+    display = charts.panels(
         by_leg(session, edges, estimate, links),
         _edge_boxes("station", session.station_names, edges.station, edges, estimate, links),
         _joints(session, estimate, links),
@@ -57,7 +57,7 @@ def section(
         _outward(edges, shifts, links),
         remarks=remarks(session, edges, estimate, shifts),
     )
-    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=shown)
+    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=display)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:
@@ -213,13 +213,13 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowCha
     motor = session.machine.layout.actuated
     used = np.flatnonzero(estimate.configurations)
     white = estimate.joint_residuals[used]
-    moved = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
-    worst = used[np.abs(white).argmax(axis=0)] if len(white) else np.zeros(len(moved), dtype=int)
+    shifted = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
+    worst = used[np.abs(white).argmax(axis=0)] if len(white) else np.zeros(len(shifted), dtype=int)
     boxes = [
         charts.box(
             named(legs), white[:, column], "σ", 2, legs[0] + 1, links.to_configuration(int(k))
         )
-        for column, (legs, k) in enumerate(zip(moved, worst, strict=True))
+        for column, (legs, k) in enumerate(zip(shifted, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
     # readings that poses follow are near zero whatever their noise: few freedoms say so
@@ -246,7 +246,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
             f"Edges that lie off in the same way in every photograph, {joined(shaded)}: shading, a "
             "surface that is not round, or a neighbour taken for the edge."
         )
-    if scatter := estimate.statistics.look_scatter:
+    if scatter := estimate.statistics.imputation_scatter:
         out.append(
             "Which border is a leg's depends on where it is looked for: from machines as likely as"
             f" this one, results scatter by {number(scatter, 1)} of the deviations that noise gives"
@@ -266,24 +266,24 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     if len(level) < 3:
         return []
     middle = float(np.median(list(level.values())))
-    found = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
-    found = sorted(found, key=lambda g: -level[g])[:4]
+    results = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
+    results = sorted(results, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
         "middle one: look at its pictures first."
-        for g in found
+        for g in results
     ]
 
 
 def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
     """Legs' edges whose mean shift is large and sure, the largest first, in words."""
-    found: list[tuple[float, str]] = []
+    results: list[tuple[float, str]] = []
     for (leg, tube, side), mine in _edge_kinds(edges):
-        values = shifts[mine & (estimate.edge_weights >= KEPT_EDGE_WEIGHT) & np.isfinite(shifts)]
+        values = shifts[mine & (estimate.edge_weights >= INLIER_WEIGHT) & np.isfinite(shifts)]
         if len(values) < 4:
             continue
         mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
         if abs(mean) > max(SHADED_MEAN_SHIFT, 3 * error):
             where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
-            found.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
-    return [text for _, text in sorted(found, reverse=True)[:4]]
+            results.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
+    return [text for _, text in sorted(results, reverse=True)[:4]]

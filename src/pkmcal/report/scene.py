@@ -39,7 +39,7 @@ ELLIPSOID_RING_POINTS = 25
 class Joint:
     """One joint centre at home, base frame, m.
 
-    drawing, shown : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
+    drawing, displaced : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
     covariance. leg : from 1. arm : (2, k, 3) of a joint on the base, from where a motor holds its
     arm to the joint, by the drawing and enlarged; of another the joint alone.
     """
@@ -47,7 +47,7 @@ class Joint:
     leg: int
     side: str
     drawing: Array
-    shown: Array
+    displaced: Array
     spread: Array
     tip: str
     arm: Array
@@ -77,7 +77,7 @@ class JointMark:
     leg: int
     side: str
     drawing: tuple[float, float]
-    shown: tuple[float, float]
+    displaced: tuple[float, float]
     ellipse: tuple[float, float, float]
     tip: str
 
@@ -144,7 +144,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
-        shown = drawing + factor * (apply(T, side.calibrated) - drawing)
+        display = drawing + factor * (apply(T, side.calibrated) - drawing)
         spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
         for j in range(len(drawing)):
             dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
@@ -152,11 +152,11 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
                 f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
                 f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
             )
-            arm = np.stack([drawing[j], shown[j]])[:, None]
+            arm = np.stack([drawing[j], display[j]])[:, None]
             if side.side == "base":
                 old = apply(side.T_calibrated_drawing, before[j])
                 arm = np.stack([old, old + factor * (after[j] - old)])
-            joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip, arm))
+            joints.append(Joint(j + 1, side.side, drawing[j], display[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
@@ -175,9 +175,9 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     """Project the scene on two axes, the second one upwards."""
     pick = list(axes)
     drawn = np.array([joint.drawing[pick] for joint in scene.joints])
-    shown = np.array([joint.shown[pick] for joint in scene.joints])
+    visible = np.array([joint.displaced[pick] for joint in scene.joints])
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
-    corners = np.concatenate([drawn, shown, *arms])
+    corners = np.concatenate([drawn, visible, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = (CHART_WIDTH - 2 * PLANE_VIEW_MARGIN) / (high - low).max()
     width, height = CHART_WIDTH, float((high - low)[1] * scale + 2 * PLANE_VIEW_MARGIN)
@@ -192,7 +192,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         JointMark(
             j.leg, j.side, place(d), place(s), _ellipse(j.spread[np.ix_(pick, pick)], scale), j.tip
         )
-        for j, d, s in zip(scene.joints, drawn, shown, strict=True)
+        for j, d, s in zip(scene.joints, drawn, visible, strict=True)
     )
     half = len(marks) // 2  # base joints first, then the platform's
     return Projection(
@@ -267,7 +267,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
             f"Calibrated, × {scene.factor:g}",
             "--calibrated",
             4,
-            [np.stack([*a.arm[1], b.shown]) for a, b in legs],
+            [np.stack([*a.arm[1], b.displaced]) for a, b in legs],
         ),
         *(
             line(
@@ -279,7 +279,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
             )
             for side in (base, platform)
         ),
-        line("Change", "--ink", 6, [np.stack([j.drawing, j.shown]) for j in scene.joints]),
+        line("Change", "--ink", 6, [np.stack([j.drawing, j.displaced]) for j in scene.joints]),
         _ellipsoids(scene),
         _centres(base, platform),
     ]
@@ -297,14 +297,16 @@ def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
     for joint in scene.joints:
         values, axes = np.linalg.eigh(joint.spread)
         half = axes * (ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0)))
-        segments += [joint.shown + circle @ half[:, list(p)].T for p in ((0, 1), (0, 2), (1, 2))]
+        segments += [
+            joint.displaced + circle @ half[:, list(p)].T for p in ((0, 1), (0, 2), (1, 2))
+        ]
     return line(f"{ELLIPSE_SIGMAS:g}σ, × {scene.spread_factor:g}", "--calibrated", 2, segments)
 
 
 def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:
     """Markers of the drawing's centres with leg numbers and tooltips."""
     joints = (*base, *platform)
-    look = {
+    style = {
         "size": 5,
         "color": "--drawing",
         "symbol": ["square"] * len(base) + ["circle"] * len(platform),
@@ -312,7 +314,7 @@ def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, 
     return markers(
         "Joint centres, drawing",
         np.array([joint.drawing for joint in joints]),
-        look,
+        style,
         mode="markers+text",
         showlegend=False,
         text=[str(joint.leg) for joint in joints],

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, rms
+from pkmcal.control.sentences import chosen_legs, judgement
 from pkmcal.control.study import Study, Trials
-from pkmcal.control.words import chosen_legs, judgement
 from pkmcal.geometry.rigid import inverse
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.pages.page import N_COLOURS
@@ -46,33 +46,33 @@ SERVO_METHOD_TEXT = (
 )
 
 
-def outcome_of(found: Study) -> Outcome:
+def outcome_of(study: Study) -> Outcome:
     """Everything that `pkmcal servo` tells and writes."""
-    verdict, run = judgement(found), shown_run(found)
-    document = servo_document(found, verdict)
-    ends = ends_table(found)
+    verdict, run = judgement(study), example_run(study)
+    document = servo_document(study, verdict)
+    ends = ends_table(study)
     return Outcome(
         command="servo",
-        title=f"Control by the legs of {found.scene.machine.name}",
+        title=f"Control by the legs of {study.scene.machine.name}",
         verdict=verdict,
         kicker="visual servoing, simulated",
-        subject=found.scene.origin,
+        subject=study.scene.origin,
         stamp="It works in simulation" if verdict.usable else "Not to be used",
-        figures=servo_cards(found),
+        figures=servo_cards(study),
         parts=(
             Part(
                 "curves",
                 "Error curves",
-                said=(stillness(found),),
+                terminal_text=(stillness(study),),
                 plots=(
                     Plot(
                         "curves",
-                        f"Error of the {found.plan.loop.law}, as a part of its start's",
+                        f"Error of the {study.plan.loop.law}, as a part of its start's",
                         "Lines: the median; shaded: from the least to the largest; of runs that"
                         " reach the goal. Logarithmic, so that an exponential is a straight line;"
                         " [B] Fig. 10 for one run.",
                         "Norm of the error against time for four estimates of the geometry",
-                        curves(found),
+                        curves(study),
                         height=420,
                     ),
                     Plot(
@@ -81,11 +81,11 @@ def outcome_of(found: Study) -> Outcome:
                         "Distance of the platform's joints from the goal, as a part of the way,"
                         " median of runs that reach it.",
                         "Distance from the goal against time, enlarged near zero",
-                        tail(found),
+                        tail(study),
                         height=320,
                     ),
                 ),
-                tables=(outcome_table(found), *([ends] if ends else [])),
+                tables=(outcome_table(study), *([ends] if ends else [])),
             ),
             Part(
                 "run",
@@ -98,9 +98,9 @@ def outcome_of(found: Study) -> Outcome:
                         " the way of the platform's middle with the identified geometry, orange"
                         " with the one by hand.",
                         "The machine in three dimensions on its way to the goal",
-                        space(found, run),
+                        space(study, run),
                         height=560,
-                        frames=frames(found, run),
+                        frames=frames(study, run),
                     ),
                     Plot(
                         "image",
@@ -108,15 +108,15 @@ def outcome_of(found: Study) -> Outcome:
                         "Edges of the seen legs at the start (thin) and at the goal (thick), and"
                         " the way of their ends between; the frame is the image's.",
                         "The legs' edges in the camera's image and their ways from start to goal",
-                        image(found, run),
+                        image(study, run),
                         height=520,
                     ),
                 ),
             ),
-            Part("legs", "Legs", tables=(choices_table(found),)),
-            Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(found),)),
+            Part("legs", "Legs", tables=(choices_table(study),)),
+            Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(study),)),
         ),
-        findings=found.scene.findings,
+        findings=study.scene.findings,
         document=document,
         summary={name: value for name, value in document.items() if name != "curves"},
     )
@@ -165,11 +165,11 @@ def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
         },
         "equilibria": {
             "reached": s.equilibria.reached,
-            "alike": s.equilibria.alike,
+            "alike": s.equilibria.same_image,
             "cancelled": s.equilibria.cancelled,
             "outside": s.equilibria.out,
             "distance": s.equilibria.distance,
-            "looks_alike": s.equilibria.looks_alike,
+            "looks_alike": s.equilibria.same_edges,
             "T_base_platform": s.equilibria.T_base_platform,
         },
         "curves": {
@@ -179,12 +179,12 @@ def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def shown_run(found: Study) -> int:
+def example_run(study: Study) -> int:
     """The run that is drawn: the one whose estimate by hand leaves the way farthest, of those that
     all estimates bring to their goal.
     """
-    everywhere = np.all([o.runs.reached for o in found.outcomes], axis=0)
-    return int(np.argmax(np.where(everywhere, found.outcome("hand").astray, -1.0)))
+    everywhere = np.all([o.runs.reached for o in study.outcomes], axis=0)
+    return int(np.argmax(np.where(everywhere, study.outcome("hand").astray, -1.0)))
 
 
 def servo_cards(s: Study) -> tuple[Figure, ...]:
@@ -225,7 +225,7 @@ def servo_cards(s: Study) -> tuple[Figure, ...]:
     )
 
 
-def outcome_table(found: Study) -> Table:
+def outcome_table(study: Study) -> Table:
     """One row an estimate."""
     rows = [
         Row(
@@ -239,7 +239,7 @@ def outcome_table(found: Study) -> Table:
                 _seconds(o),
             ),
         )
-        for o in found.outcomes
+        for o in study.outcomes
     ]
     return Table(
         "Estimates of the geometry",
@@ -261,16 +261,16 @@ def outcome_table(found: Study) -> Table:
     )
 
 
-def ends_table(found: Study) -> Table | None:
+def ends_table(study: Study) -> Table | None:
     """How runs ended that failed; None where none did."""
-    kinds = {end for o in found.outcomes for end in o.ends if not end.good}
+    kinds = {end for o in study.outcomes for end in o.ends if not end.good}
     if not kinds:
         return None
     rows = [
-        Row(end.sentence, tuple(str(o.ends.get(end, 0)) for o in found.outcomes))
+        Row(end.sentence, tuple(str(o.ends.get(end, 0)) for o in study.outcomes))
         for end in sorted(kinds, key=lambda end: end.word)
     ]
-    columns = ("How the others ended", *(o.estimate.title for o in found.outcomes))
+    columns = ("How the others ended", *(o.estimate.title for o in study.outcomes))
     return Table("Runs that did not reach their goal", columns, tuple(rows), brief=False)
 
 
@@ -278,16 +278,16 @@ def choices_table(s: Study) -> Table:
     """Which legs must be seen."""
     useful = [c for c in s.choices if not c.blind]
     sizes = sorted({len(c.legs) for c in useful})
-    shown = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
-    if s.own not in shown:
-        shown = [s.own, *shown]
+    display = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
+    if s.own not in display:
+        display = [s.own, *display]
     rows = [
         Row(
             chosen_legs(c, s) + (", as seen" if c == s.own else ""),
             (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
              if c.fading else "yes"),
         )
-        for c in shown
+        for c in display
     ]  # fmt: skip
     return Table(
         f"Which legs must be seen, by their {s.plan.loop.law}",
@@ -300,9 +300,9 @@ def choices_table(s: Study) -> Table:
     )
 
 
-def settings_table(found: Study) -> Table:
+def settings_table(study: Study) -> Table:
     """What was simulated."""
-    s, units = _settings(found), dict.fromkeys(found.eye.true.machine.joint_units)
+    s, units = _settings(study), dict.fromkeys(study.eye.true.machine.joint_units)
     s |= {
         "hand_position": 1e3 * s["hand_position"],
         "hand_rotation": float(np.degrees(s["hand_rotation"])),
@@ -322,11 +322,11 @@ def settings_table(found: Study) -> Table:
         "runs": "Runs of every estimate",
         "seed": "Seed",
     }
-    rows = [Row(name, (_told(s[key]),)) for key, name in names.items()]
+    rows = [Row(name, (_run_words(s[key]),)) for key, name in names.items()]
     return Table("What was simulated", ("Setting", "Value"), tuple(rows), brief=False)
 
 
-def _told(value: Any) -> str:
+def _run_words(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(str(item) for item in value)
     return (
@@ -365,9 +365,9 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
         "error_rise_largest": _over(o.rise, o, np.max),
         "settling_median": _settled(o),
         "runs": [
-            {"end": end.word, "way": way, "astray": off, "overshoot": over, "settling": settling}
-            for end, way, off, over, settling in zip(
-                o.runs.end, o.runs.way[:, 0], o.astray, o.overshoot, o.settling, strict=True
+            {"end": end.word, "way": sense, "astray": off, "overshoot": over, "settling": settling}
+            for end, sense, off, over, settling in zip(
+                o.runs.end, o.runs.travel[:, 0], o.astray, o.overshoot, o.settling, strict=True
             )
         ],
     }
@@ -393,8 +393,8 @@ def _mm(values: Array, o: Trials, of: Callable[[Any], Any] = np.median) -> str:
 
 def _settled(o: Trials) -> float | None:
     """Median time (s) of the runs that came to rest at the goal, of which there may be none."""
-    known = o.settling[np.isfinite(o.settling)]
-    return float(np.median(known)) if known.size else None
+    finite = o.settling[np.isfinite(o.settling)]
+    return float(np.median(finite)) if finite.size else None
 
 
 def _seconds(o: Trials) -> str:
@@ -451,7 +451,7 @@ def tail(s: Study) -> dict[str, Any]:
     time = s.outcomes[0].runs.time
     rows = _every(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
-        values = 100 * np.median(shares(o, o.runs.way)[:, rows], axis=0)
+        values = 100 * np.median(shares(o, o.runs.travel)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
     layout = plane("time, s", "% of the way")
     layout["yaxis"] |= {"range": [0, 10]}
@@ -460,15 +460,15 @@ def tail(s: Study) -> dict[str, Any]:
 
 def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
     dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
-    look = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
-    told = {"hoverinfo": "all", "hovertemplate": hover}
-    return _flat(o.estimate.title, _rounded(time), _rounded(values), look, **told)
+    style = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
+    entries = {"hoverinfo": "all", "hovertemplate": hover}
+    return _flat(o.estimate.title, _rounded(time), _rounded(values), style, **entries)
 
 
-def _flat(name: str, x: Any, y: Any, look: dict[str, Any], **more: Any) -> dict[str, Any]:
+def _flat(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A trace of a line in the plane."""
     plain = {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": y}
-    return {**plain, "line": look, "hoverinfo": "skip", **more}
+    return {**plain, "line": style, "hoverinfo": "skip", **more}
 
 
 def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
@@ -497,15 +497,15 @@ def _moving(s: Study, pose: Array) -> list[dict[str, Any]]:
 
 def space(s: Study, run: int) -> dict[str, Any]:
     """The machine on its way; what moves comes first, so that frames name it by its place."""
-    shown = s.outcome("identified").runs
-    start, goal = shown.T_base_platform[run, 0], shown.goals[run]
-    seen = set(s.eye.true.legs.tolist())
+    run_numbers = s.outcome("identified").runs
+    start, goal = run_numbers.T_base_platform[run, 0], run_numbers.goals[run]
+    in_view = set(s.eye.true.legs.tolist())
     *legs, platform = _moving(s, start)
     data = [
         line(
-            f"leg {j + 1}" + ("" if j in seen else ", not seen"),
-            f"--leg{j % N_COLOURS + 1}" if j in seen else "--quiet",
-            8 if j in seen else 4,
+            f"leg {j + 1}" + ("" if j in in_view else ", not seen"),
+            f"--leg{j % N_COLOURS + 1}" if j in in_view else "--quiet",
+            8 if j in in_view else 4,
             (),
             **leg,
         )

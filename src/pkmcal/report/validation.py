@@ -7,13 +7,13 @@ import numpy as np
 from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, finite_rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
+from pkmcal.judge.sentences import against, better, factor
 from pkmcal.judge.validate import Validation
-from pkmcal.judge.words import against, better, factor
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table
 from pkmcal.pages import charts
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import SHOWN_UNITS, amount, brief, count, decimals, number
+from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
 
 VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
@@ -32,13 +32,13 @@ VALIDATION_METHOD_TEXT = (
 
 def outcome_of(v: Validation) -> Outcome:
     """Everything that ``pkmcal validate`` tells and writes."""
-    known = [n for n, flag in zip(v.session.configurations, v.known, strict=True) if flag]
+    prior = [n for n, flag in zip(v.session.configurations, v.calibrated, strict=True) if flag]
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
-    told = (
-        ("Left out, for the calibration had seen them", known),
+    sentences = (
+        ("Left out, for the calibration had seen them", prior),
         ("At poses that the calibration used, photographed anew", again),
     )
-    notes = tuple(f"{what}: {', '.join(names)}." for what, names in told if names)
+    notes = tuple(f"{what}: {', '.join(names)}." for what, names in sentences if names)
     parts = (
         _readings(v.judged, v.session) if v.judged else None,
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
@@ -80,7 +80,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
         Figure(
             "Where is the tool, by the readings?",
             tuple(
-                (_size(value, unit), SHOWN_UNITS[unit][1])
+                (_size(value, unit), DISPLAY_UNITS[unit][1])
                 for value, unit in ((new.position, "m"), (new.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
@@ -174,8 +174,8 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
 def paths_table(paths: tuple[LinePath, ...]) -> Table:
     """Straight paths, [C] Table 4."""
 
-    def text(found: Straightness | None) -> str:
-        return f"{_size(found.rms, 'm')} ({_size(found.largest, 'm')})" if found else "–"
+    def text(value: Straightness | None) -> str:
+        return f"{_size(value.rms, 'm')} ({_size(value.largest, 'm')})" if value else "–"
 
     rows = [
         Row(path.name, (str(path.n), *map(text, (path.seen, path.drawing, path.calibrated))))
@@ -197,14 +197,14 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
     if unit:
         amounts = f": {against(out.after, out.before, unit)}"
         inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
-    kept = "" if out.promise.kept else " That is more than the deviations promise."
+    retained = "" if out.promise.holds else " That is more than the deviations promise."
     held = count(len(out.rows), "configuration")
     poses = len(np.unique(same_pose(session.joints[out.rows], session.joint_noise)))
     if poses < len(out.rows):
         held += f" of {count(poses, 'pose')}"
     sentence = (
         f"On {held} held out, the calibrated machine predicts the"
-        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{kept}"
+        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{retained}"
     )
     in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
     drawn = out.figures(out.drawing)
@@ -233,13 +233,13 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         " each was seen; their noise is in all columns.",
         brief=False,
     )
-    return Part("heldout", "Held out", said=(sentence,), tables=(table,))
+    return Part("heldout", "Held out", terminal_text=(sentence,), tables=(table,))
 
 
 def _joints(session: Session) -> list[tuple[str, str]]:
     """Name with unit for a table's row, and m or rad, of each reading."""
     names, units = session.document["joints"]["columns"], session.machine.joint_units
-    return [(f"{n}, {SHOWN_UNITS[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
+    return [(f"{n}, {DISPLAY_UNITS[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
 
 
 def _unit(session: Session) -> str | None:
@@ -248,21 +248,21 @@ def _unit(session: Session) -> str | None:
     return units[0] if len(set(units)) == 1 else None
 
 
-def _mean_rms(found: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
+def _mean_rms(value: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
     """A joint's mean with the digits of its root mean square, and that."""
-    root = found.joint_rms[k]
-    return _signed(found.joint_mean[k], root, unit), _size(root, unit)
+    root = value.joint_rms[k]
+    return _signed(value.joint_mean[k], root, unit), _size(root, unit)
 
 
 def _signed(value: float, sigma: float, unit: str) -> str:
     """A number with the digits that ``sigma`` deserves."""
-    scale = SHOWN_UNITS[unit][0]
+    scale = DISPLAY_UNITS[unit][0]
     return number(value * scale, decimals(sigma * scale), signed=True)
 
 
 def _size(value: float, unit: str) -> str:
     """A magnitude in the unit that people read, two significant digits."""
-    return brief(value * SHOWN_UNITS[unit][0])
+    return brief(value * DISPLAY_UNITS[unit][0])
 
 
 def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
@@ -272,7 +272,7 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
     unit = _unit(session)
     if unit is None:
         return None
-    scale, name = SHOWN_UNITS[unit]
+    scale, name = DISPLAY_UNITS[unit]
     bars = [
         charts.UprightBar(
             session.configurations[row],

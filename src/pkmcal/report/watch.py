@@ -6,13 +6,13 @@ import numpy as np
 
 from pkmcal.identify.score import Score
 from pkmcal.judge.changes import DETECTION_POWER, LegTest
+from pkmcal.judge.sentences import cause_words, least_size, signed
 from pkmcal.judge.watch import Watch, names_of
-from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.pages import charts
-from pkmcal.wording import SHOWN_UNITS, amount, brief, count, listed, named, number
+from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, named, number
 
-NOTHING_KNOWN_SIGN = "–"
+NO_VALUE_SIGN = "–"
 LARGE_RESIDUAL_SIGMAS = 2.0
 """Standard deviations from which on a configuration's residuals stand out."""
 WATCH_METHOD_TEXT = (
@@ -29,7 +29,7 @@ WATCH_METHOD_TEXT = (
 )
 
 
-LEFT_IN_PLACE_TEXT = (
+FIXED_STATION_TEXT = (
     "Where the calibration had a camera is known as well as its covariance with the machine tells,"
     " most of which the photographs of both share. Whether such a camera was moved is tested as"
     " well; a base that moved against its camera looks the same."
@@ -38,7 +38,7 @@ LEFT_IN_PLACE_TEXT = (
 
 def outcome_of(w: Watch) -> Outcome:
     """Everything that ``pkmcal watch`` tells and writes."""
-    found, bars = _findings_table(w), _by_configuration(w)
+    value, bars = _findings_table(w), _by_configuration(w)
     parts = (
         Part(
             "legs",
@@ -46,7 +46,7 @@ def outcome_of(w: Watch) -> Outcome:
             html=charts.panels(_statistics(w), _zeros(w)),
             tables=(legs_table(w), _others_table(w)),
         ),
-        Part("causes", "Causes", tables=(found,)) if found else None,
+        Part("causes", "Causes", tables=(value,)) if value else None,
         Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
         _how(w),
     )
@@ -74,11 +74,11 @@ def _how(w: Watch) -> Part:
         + (f" and {w.pose_scale:.2f} times that of poses" if poses else "")
         + ": the larger of the calibration's and these data's."
     )
-    known = [n for n, k in zip(w.session.configurations, w.known, strict=True) if k]
-    left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
-    stayed = f"Left in place: {listed(w.same_place, 8)}. {LEFT_IN_PLACE_TEXT}"
-    said = (*WATCH_METHOD_TEXT, stayed, allowed) if w.same_place else (*WATCH_METHOD_TEXT, allowed)
-    return Part("how", "How it was computed", said, notes=(left_out,) if known else ())
+    prior = [n for n, k in zip(w.session.configurations, w.calibrated, strict=True) if k]
+    left_out = f"Left out, for the calibration had seen them: {', '.join(prior)}."
+    stayed = f"Left in place: {listed(w.same_place, 8)}. {FIXED_STATION_TEXT}"
+    text = (*WATCH_METHOD_TEXT, stayed, allowed) if w.same_place else (*WATCH_METHOD_TEXT, allowed)
+    return Part("how", "How it was computed", text, notes=(left_out,) if prior else ())
 
 
 def stamp(w: Watch) -> str:
@@ -94,8 +94,8 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
     judged = w.judged
     named_tests = [(named(leg.legs), leg.chance) for leg in judged.legs]
     named_tests += [("all legs together", judged.machine.adjusted)]
-    seen = [(name, chance) for name, chance in named_tests if np.isfinite(chance)]
-    who, least = min(seen, key=lambda item: item[1], default=("nothing", 1.0))
+    finite = [(name, chance) for name, chance in named_tests if np.isfinite(chance)]
+    who, least = min(finite, key=lambda item: item[1], default=("nothing", 1.0))
     out = [
         Figure(
             "How likely by chance alone?",
@@ -109,7 +109,7 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
         out.append(
             Figure(
                 "What would have been found?",
-                (found_from(sizes),),
+                (least_size(sizes),),
                 f"of the zero of a leg's reading, depending on the leg, with {DETECTION_POWER:.0%}"
                 " probability",
             )
@@ -117,7 +117,7 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
     out.append(
         Figure(
             "What is it based on?",
-            ((str(int(w.seen.sum())), "configurations"),),
+            ((str(int(w.observed.sum())), "configurations"),),
             "seen by the session, not used by the calibration",
         )
     )
@@ -136,7 +136,7 @@ def legs_table(w: Watch) -> Table:
                 _zero(leg),
                 amount(leg.detects_zero, leg.unit)
                 if np.isfinite(leg.detects_zero)
-                else NOTHING_KNOWN_SIGN,
+                else NO_VALUE_SIGN,
                 _span(leg.detects_base),
                 _span(leg.detects_platform),
             ),
@@ -164,7 +164,7 @@ def _others_table(w: Watch) -> Table:
     """Tests of all legs together."""
     j = w.judged
     scale = j.scale_change
-    text = NOTHING_KNOWN_SIGN
+    text = NO_VALUE_SIGN
     if j.scale.dof:
         text = (
             f"{number(scale.value[0] * 1e6, 0, signed=True)} µm/m"
@@ -191,7 +191,7 @@ def _findings_table(w: Watch) -> Table | None:
     names = names_of(w.session)
     rows = [
         Row(
-            f"{mark} {said(suspect, names)}",
+            f"{mark} {cause_words(suspect, names)}",
             (number(suspect.chi2, 1), str(len(suspect.cause.sizes))),
         )
         for place, finding in enumerate(w.judged.findings, start=1)
@@ -213,42 +213,36 @@ def _findings_table(w: Watch) -> Table | None:
 def chance_text(chance: float) -> str:
     """A probability with one or two digits, never zero."""
     if not np.isfinite(chance):
-        return NOTHING_KNOWN_SIGN
+        return NO_VALUE_SIGN
     if chance < 1e-4:
         return "< 0.0001"
     return f"{chance:.2g}" if chance < 0.995 else "1"
 
 
 def _cells(test: Score) -> tuple[str, str, str]:
-    told = (
+    cells = (
         (number(test.chi2, 1), chance_text(test.adjusted))
         if test.dof
-        else (NOTHING_KNOWN_SIGN, NOTHING_KNOWN_SIGN)
+        else (NO_VALUE_SIGN, NO_VALUE_SIGN)
     )
-    return told[0], str(test.dof), told[1]
+    return cells[0], str(test.dof), cells[1]
 
 
 def _statistic(test: Score | None) -> str:
     return (
-        f"{number(test.chi2, 1)} / {test.dof}"
-        if test is not None and test.dof
-        else NOTHING_KNOWN_SIGN
+        f"{number(test.chi2, 1)} / {test.dof}" if test is not None and test.dof else NO_VALUE_SIGN
     )
 
 
 def _zero(leg: LegTest) -> str:
     if leg.change is None or leg.zero is None or not leg.zero.dof:
-        return NOTHING_KNOWN_SIGN
+        return NO_VALUE_SIGN
     return signed(float(leg.change.value[0]), float(leg.change.sigma[0]), leg.unit)
 
 
 def _span(sizes: tuple[float, float]) -> str:
-    texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NOTHING_KNOWN_SIGN for v in sizes]
-    return (
-        NOTHING_KNOWN_SIGN
-        if texts == [NOTHING_KNOWN_SIGN, NOTHING_KNOWN_SIGN]
-        else " to ".join(texts)
-    )
+    texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NO_VALUE_SIGN for v in sizes]
+    return NO_VALUE_SIGN if texts == [NO_VALUE_SIGN, NO_VALUE_SIGN] else " to ".join(texts)
 
 
 def _statistics(w: Watch) -> charts.BarChart | None:
@@ -286,7 +280,7 @@ def _zeros(w: Watch) -> charts.RowChart | None:
     legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
     if not legs or len({leg.unit for leg in legs}) > 1:
         return None
-    factor, name = SHOWN_UNITS[legs[0].unit]
+    factor, name = DISPLAY_UNITS[legs[0].unit]
     boxes: list[charts.Spread] = []
     for leg in legs:
         if leg.change is None or not np.isfinite(leg.change.sigma[0]):
@@ -309,7 +303,7 @@ def _zeros(w: Watch) -> charts.RowChart | None:
 
 def _by_configuration(w: Watch) -> charts.BarChart | None:
     """Residuals of each configuration with the machine held, root mean square."""
-    rows = np.flatnonzero(w.seen)
+    rows = np.flatnonzero(w.observed)
     values = [float(w.residuals[k]) for k in rows]
     names = [w.session.configurations[k] for k in rows]
     bars = [

@@ -26,7 +26,7 @@ from pkmcal.wording import brief, count, number
 
 SLICE_ROW_HEIGHT = 170
 """Height of a row of slices, px."""
-SLICES_LEFT_MARGIN, SLICES_RIGHT_MARGIN, SLICES_TOP_MARGIN, SLICES_BOTTOM_MARGIN = 92, 74, 26, 40
+SLICES_MARGIN, SLICES_RIGHT_MARGIN, SLICES_TOP_MARGIN, SLICES_BOTTOM_MARGIN = 92, 74, 26, 40
 """Margins round the slices, px, in which their names, the legend and the axes' numbers stand."""
 SLICE_GAP_SHARE = 0.045
 """Between slices, as a part of the width."""
@@ -49,51 +49,51 @@ NO_UNTURNED_SLICES_TEXT = (
 TOO_NARROW_TEXT = "The workspace has an extent along one axis at most, so there are no slices."
 
 
-def section(session: Session, estimate: Estimate, found: ToolMap | str, links: Links) -> Part:
+def section(session: Session, estimate: Estimate, tool_map: ToolMap | str, links: Links) -> Part:
     """The section; of a machine without a map the sentence that says why."""
     name, title, menu = "workspace", "The tool over the workspace", "Workspace"
-    if isinstance(found, str):
-        return Part(name, title, (found,), menu=menu)
-    slices = _slices(session, estimate, found, links)
+    if isinstance(tool_map, str):
+        return Part(name, title, (tool_map,), menu=menu)
+    slices = _slices(session, estimate, tool_map, links)
     how = (
         SLICES_READING_TEXT
         if slices
         else TOO_NARROW_TEXT
-        if _narrow(found)
+        if _narrow(tool_map)
         else NO_UNTURNED_SLICES_TEXT
     )
     return Part(
         name,
         title,
-        (_said(found), how),
-        plots=tuple(plot for plot in (slices, _space(session, estimate, found)) if plot),
-        tables=(_table(found),),
+        (_headline(tool_map), how),
+        plots=tuple(plot for plot in (slices, _space(session, estimate, tool_map)) if plot),
+        tables=(_table(tool_map),),
         menu=menu,
     )
 
 
-def _narrow(found: ToolMap) -> bool:
+def _narrow(tool_map: ToolMap) -> bool:
     """Whether the region itself, and not the machine, leaves no plane to cut."""
-    named = any(side is not None and side[0] == side[1] for side in found.region.sides)
-    wide = np.ptp(found.evenly[1].T_base_platform[:, :3, 3], axis=0)
+    named = any(side is not None and side[0] == side[1] for side in tool_map.region.sides)
+    wide = np.ptp(tool_map.evenly[1].T_base_platform[:, :3, 3], axis=0)
     return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
-def _quantities(found: ToolMap) -> tuple[tuple[str, Array], ...]:
+def _quantities(tool_map: ToolMap) -> tuple[tuple[str, Array], ...]:
     """What is shown of each pose, m, with its name."""
     return (
-        ("By the drawing, σ", found.before.position),
-        ("Drawing's error", found.after.off_position),
-        ("Calibrated, σ", found.after.position),
+        ("By the drawing, σ", tool_map.before.position),
+        ("Drawing's error", tool_map.after.off_position),
+        ("Calibrated, σ", tool_map.after.position),
     )
 
 
-def _said(found: ToolMap) -> str:
+def _headline(tool_map: ToolMap) -> str:
     """The main figures in a sentence."""
-    _, after = found.evenly
+    _, after = tool_map.evenly
     sigma, off = (x[np.isfinite(x)] * 1e3 for x in (after.position, after.off_position))
     text = (
-        f"Over {found.region}, {count(found.spread, 'pose')} spread evenly, the calibrated"
+        f"Over {tool_map.region}, {count(tool_map.spread, 'pose')} spread evenly, the calibrated"
         f" platform's place is known to {brief(float(np.median(sigma)))} mm (1σ, median), at worst"
         f" to {brief(float(sigma.max()))} mm"
     )
@@ -105,9 +105,9 @@ def _said(found: ToolMap) -> str:
     )
 
 
-def _table(found: ToolMap) -> Table:
+def _table(tool_map: ToolMap) -> Table:
     """Medians and largest over the evenly spread poses."""
-    before, after = found.evenly
+    before, after = tool_map.evenly
     rows: list[Row] = []
     turns = float(np.nanmax(before.orientation)) > NO_TURN
     kinds = (
@@ -125,33 +125,33 @@ def _table(found: ToolMap) -> Table:
 
 def middle_and_worst(values: Array) -> tuple[str, str]:
     """Median and largest of what is known."""
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return "–", "–"
-    return brief(float(np.median(known))), brief(float(known.max()))
+    return brief(float(np.median(finite))), brief(float(finite.max()))
 
 
 # ------------------------------------------------------------------ slices
 
 
-def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) -> Plot | None:
+def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Links) -> Plot | None:
     """Every quantity in every slice, one under the other; a single slice's beside each other."""
-    if not found.slices:
+    if not tool_map.slices:
         return None
-    quantities = _quantities(found)
-    single = len(found.slices) == 1
-    across, down = (len(quantities), 1) if single else (len(found.slices), len(quantities))
-    extent = _extent(found)
+    quantities = _quantities(tool_map)
+    single = len(tool_map.slices) == 1
+    across, down = (len(quantities), 1) if single else (len(tool_map.slices), len(quantities))
+    extent = _extent(tool_map)
     data: list[dict[str, Any]] = []
     layout: dict[str, Any] = {**COMMON_PLOT_LAYOUT, "annotations": [], "showlegend": False}
     for row, (name, values) in enumerate(quantities):
-        for column, cut in enumerate(found.slices):
+        for column, cut in enumerate(tool_map.slices):
             place = (row, 0) if single else (column, row)
             nth = place[1] * across + place[0]
             panel = str(nth + 1) if nth else ""  # Plotly calls axes x, x2, x3
             axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
             data.append(_heat(cut, values * 1e3, name, axes))
-            data.append(_crosses(session, estimate, found, cut, axes, links))
+            data.append(_crosses(session, estimate, tool_map, cut, axes, links))
             _place_axes(layout, cut, panel, place, (across, down), extent)
             if single or row == 0:
                 layout["annotations"].append(_label(name if single else _title(cut), panel, "top"))
@@ -159,7 +159,7 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
                 layout["annotations"].append(_label(name, panel, "left"))
     layout["coloraxis"] = _colours(np.concatenate([v for _, v in quantities]) * 1e3)
     layout["margin"] = {
-        "l": 46 if single else SLICES_LEFT_MARGIN,
+        "l": 46 if single else SLICES_MARGIN,
         "r": SLICES_RIGHT_MARGIN,
         "t": SLICES_TOP_MARGIN,
         "b": SLICES_BOTTOM_MARGIN,
@@ -176,13 +176,13 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) 
         " has the figures over all of it.",
         {"data": data, "layout": layout, "config": {}},
         height=height,
-        width=640 if single else 150 * across + SLICES_LEFT_MARGIN + SLICES_RIGHT_MARGIN,
+        width=640 if single else 150 * across + SLICES_MARGIN + SLICES_RIGHT_MARGIN,
     )
 
 
-def _extent(found: ToolMap) -> Array:
+def _extent(tool_map: ToolMap) -> Array:
     """Lowest and highest coordinate of all slices' poses, (3, 2) mm, and a little more."""
-    places = found.after.T_base_platform[found.spread :, :3, 3] * 1e3
+    places = tool_map.after.T_base_platform[tool_map.spread :, :3, 3] * 1e3
     low, high = places.min(axis=0), places.max(axis=0)
     more = 0.06 * float((high - low).max())
     return np.round(np.stack([low - more, high + more], axis=1), 1)
@@ -194,9 +194,9 @@ def _title(cut: Slice) -> str:
 
 def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[str, Any]:
     """A slice's cells, by the logarithm of values (n,), mm."""
-    shown = np.where(cut.rows >= 0, values[cut.rows], np.nan)
+    visible = np.where(cut.rows >= 0, values[cut.rows], np.nan)
     with np.errstate(divide="ignore"):
-        level = np.log10(shown)
+        level = np.log10(visible)
     one, other = "xyz"[cut.across], "xyz"[cut.up]
     return {
         "type": "heatmap",
@@ -204,7 +204,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "x": np.round(cut.u * 1e3, 1).tolist(),
         "y": np.round(cut.v * 1e3, 1).tolist(),
         "z": np.round(level, 4),
-        "customdata": _significant(shown, 4),
+        "customdata": _significant(visible, 4),
         "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
         "hoverongaps": False,
@@ -224,7 +224,7 @@ def _significant(values: Array, digits: int) -> Array:
 def _crosses(
     session: Session,
     estimate: Estimate,
-    found: ToolMap,
+    tool_map: ToolMap,
     cut: Slice,
     axes: dict[str, str],
     links: Links,
@@ -232,7 +232,7 @@ def _crosses(
     """Measured poses near a slice, each of which leads to its photograph."""
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
-    even = found.evenly[1].T_base_platform[:, cut.normal, 3]
+    even = tool_map.evenly[1].T_base_platform[:, cut.normal, 3]
     near = np.abs(place[:, cut.normal] - cut.level) <= POSE_NEAR_SLICE_SHARE * np.ptp(even) + 1e-6
     used, place = used[near], place[near]
     return {
@@ -301,15 +301,15 @@ def _label(text: str, panel: str, side: str) -> dict[str, Any]:
             "font": font,
         }  # fmt: skip
     return {
-        **at, "text": text, "xref": "paper", "x": 0, "xshift": -SLICES_LEFT_MARGIN + 4, "y": 0.5,
+        **at, "text": text, "xref": "paper", "x": 0, "xshift": -SLICES_MARGIN + 4, "y": 0.5,
         "textangle": -90, "xanchor": "left", "yanchor": "middle", "font": font,
     }  # fmt: skip
 
 
 def _colours(values: Array) -> dict[str, Any]:
     """One scale for all values (n,), mm, by their logarithms."""
-    known = values[np.isfinite(values) & (values > 0)]
-    low, high = np.log10(np.quantile(known, (0.01, 0.995)))
+    finite = values[np.isfinite(values) & (values > 0)]
+    low, high = np.log10(np.quantile(finite, (0.01, 0.995)))
     high = max(high, low + 0.3)
     steps = [m * 10.0**k for k in range(-5, 5) for m in (1, 2, 5)]
     ticks = [s for s in steps if low - 0.02 <= np.log10(s) <= high + 0.02]
@@ -355,11 +355,11 @@ def _drawn(poses: Array, home: Array, which: Integers) -> Array:
     return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
 
 
-def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
+def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | None:
     """The evenly spread poses, coloured by what is left, and the measured ones; None of a machine
     that moves in a plane.
     """
-    _, after = found.evenly
+    _, after = tool_map.evenly
     poses = after.T_base_platform
     axes = _axes(poses)
     if axes is None:

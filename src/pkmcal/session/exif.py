@@ -12,7 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import read_exif
-from pkmcal.session.photographs import photograph_header
+from pkmcal.session.image_files import photograph_header
 
 EXIF_CAMERA_WORD = "exif"
 """The word in place of a camera's file."""
@@ -38,7 +38,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
     photographs : paths, and names for messages. Raises `InputError` where one does not tell its
     focal length, or they do not tell the same.
     """
-    told: dict[tuple[float, tuple[int, int]], str] = {}
+    entries: dict[tuple[float, tuple[int, int]], str] = {}
     sizes: list[tuple[int, int]] = []
     for path, label in photographs:
         width, height = photograph_header(path, label)
@@ -53,9 +53,9 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
                 next_step="Calibrate the camera with pkmcal camera, and name its file",
             )
         sizes.append((width, height))
-        told.setdefault((focal, (max(width, height), min(width, height))), label)
-    if len(told) > 1:
-        (one, first), (other, second) = list(told.items())[:2]
+        entries.setdefault((focal, (max(width, height), min(width, height))), label)
+    if len(entries) > 1:
+        (one, first), (other, second) = list(entries.items())[:2]
         raise InputError(
             "the photographs of one camera tell different focal lengths or sizes",
             where=second,
@@ -64,7 +64,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
             next_step="Give photographs by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # others were turned by a quarter
-    return _camera(next(iter(told))[0] / FILM_DIAGONAL * hypot(*size), size)
+    return _camera(next(iter(entries))[0] / FILM_DIAGONAL * hypot(*size), size)
 
 
 def _described(focal: float, size: tuple[int, int]) -> str:

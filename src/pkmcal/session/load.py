@@ -33,10 +33,10 @@ from pkmcal.files import (
     closest,
     json_text,
     no_such,
+    quoted,
     read_csv,
     read_yaml,
     resolved,
-    shown,
     validated_document,
     wanted_file,
     written_unit,
@@ -49,7 +49,7 @@ from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanis
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
-from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
+from pkmcal.session.image_files import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
@@ -81,7 +81,7 @@ class Station:
     observe : legs, board, or both, in this order. entry : its name in session.yaml, which is that
     of many stations where the camera was held by hand, each of one photograph. handheld : whether.
     from_exif : whether no more is known of the camera than what EXIF tells. response : how the
-    photographs code light; response_told : whether session.yaml says so, or their edges did, else
+    photographs code light; response_given : whether session.yaml says so, or their edges did, else
     it is what is usual for files of their kind.
     """
 
@@ -95,7 +95,7 @@ class Station:
     handheld: bool = False
     from_exif: bool = False
     response: Response = "linear"
-    response_told: bool = False
+    response_given: bool = False
 
     __repr__ = short_repr
 
@@ -387,7 +387,7 @@ def _read(folder: Path) -> tuple[Path, Document]:
         raise InputError(
             "this version of the session's format is not known",
             where=document.where("pkmcal"),
-            found=shown(version),
+            found=quoted(version),
             expected=str(SESSION_FILE_VERSION),
             next_step="Use the pkmcal that wrote it, or a newer one",
         )
@@ -664,10 +664,10 @@ def _check_noise(document: Document, schema: SessionDocument, machine: Machine) 
 
 def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:
     """Straight paths lead through configurations that the readings' table has."""
-    known = set(table.names)
+    names = set(table.names)
     for name, members in (schema.paths or {}).items():
         for k, member in enumerate(members):
-            if member not in known:
+            if member not in names:
                 guess = closest(member, table.names)
                 raise InputError(
                     "there is no such configuration",
@@ -766,7 +766,7 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
 
     Of what the files say, not of their bytes: comments and the user's notes leave it as it is.
     """
-    said = {name: value for name, value in session.document.items() if name != "notes"}
+    words = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
         s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
         for s in session.stations
@@ -774,6 +774,6 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
     tables += [[one.configuration, one.value, one.sigma] for one in session.links]
     board = session.board.read_bytes() if session.board else b""
-    all_of_it = [said, session.machine.to_document(), session.model, cameras, tables, photographs]
+    all_of_it = [words, session.machine.to_document(), session.model, cameras, tables, photographs]
     text = json_text(all_of_it) + blake2b(board).hexdigest()
     return blake2b(text.encode("utf-8"), digest_size=8).hexdigest()

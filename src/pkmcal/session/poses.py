@@ -144,14 +144,14 @@ def read_poses(
 
 def _kind(table: CsvTable) -> type[TargetKind]:
     """Which kind of measurement it is, by its header."""
-    found, kinds = set(table.columns), kinds_of(TargetKind)
+    actual_names, kinds = set(table.columns), kinds_of(TargetKind)
     for kind in kinds.values():
-        if any(found == set(columns) for columns in kind.headers):
+        if any(actual_names == set(columns) for columns in kind.headers):
             return kind
     headers = sorted((h for kind in kinds.values() for h in kind.headers), key=len, reverse=True)
-    known = sorted({name for columns in headers for name in columns})
-    strange = [name for name in table.columns if name not in known]
-    guess = closest(strange[0], known) if strange else None
+    names = sorted({name for columns in headers for name in columns})
+    strange = [name for name in table.columns if name not in names]
+    guess = closest(strange[0], names) if strange else None
     raise InputError(
         "this column is not known" if strange else "these columns together mean nothing",
         where=f"{table.label}, line 1",
@@ -196,15 +196,15 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
     T_base_platform : (K, 4, 4) by the drawing, NaN where it has none.
     """
     there = T_base_platform[table.configuration, :3, 3]
-    moved = float(np.nanmax(np.nanstd(there, axis=0)))
+    shifted = float(np.nanmax(np.nanstd(there, axis=0)))
     measured = table.target.lengths(table.T)
     spread = float(np.max(np.std(measured, axis=0)))
-    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(moved, 1e-6):
+    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(shifted, 1e-6):
         return
     raise InputError(
         "the table's lengths look like millimetres",
         where=table.label,
         found=f"positions that vary by {spread:.4g}",
-        expected=f"metres; the platform itself moves by {moved:.3g} by its readings",
+        expected=f"metres; the platform itself moves by {shifted:.3g} by its readings",
         next_step="Divide x, y and z by 1000, or head them x [mm], y [mm], z [mm]",
     )

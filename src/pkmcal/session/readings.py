@@ -13,16 +13,16 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
-from pkmcal.measurements import Departure, Effect
+from pkmcal.measurements import Effect, ModelViolation
 from pkmcal.outcome.finding import Finding, doubtful
-from pkmcal.wording import SHOWN_UNITS, listed, number
+from pkmcal.wording import DISPLAY_UNITS, listed, number
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.
 _MARGIN = 0.05
 # Largest difference within K equal readings, in standard deviations: below 6 for any K under
 # a million, so more than this is movement.
-_ALIKE = 6.0
+_SAME_SIGMAS = 6.0
 _UNITS = {
     "m": (
         1e-3,
@@ -64,17 +64,17 @@ def check_readings(
 
 
 def _check_columns(table: CsvTable, n_joints: int) -> None:
-    found = len(table.columns)
-    if found != n_joints:
+    names = len(table.columns)
+    if names != n_joints:
         raise InputError(
             "another number of joint columns than the machine has actuated legs",
             where=f"{table.label}, line 1",
-            found=f"{found} ({', '.join(table.columns)})",
+            found=f"{names} ({', '.join(table.columns)})",
             expected=str(n_joints),
         )
     numbers = [re.fullmatch(r"leg(\d+)", name) for name in table.columns]
     order = [int(match[1]) for match in numbers if match]
-    if len(order) == found and order != sorted(order):
+    if len(order) == names and order != sorted(order):
         raise InputError(
             "the columns are not in the order of the machine's legs",
             where=f"{table.label}, line 1",
@@ -88,11 +88,11 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
     """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
-        known = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
-        if not known.any() or _inside(table.values, ranges)[:, known].mean() > 0.5:
+        finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
+        if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
             continue
-        if _inside(table.values * factor, ranges)[:, known].mean() > 0.5:
-            column = int(np.flatnonzero(known)[0])
+        if _inside(table.values * factor, ranges)[:, finite].mean() > 0.5:
+            column = int(np.flatnonzero(finite)[0])
             low, high = ranges[column]
             raise InputError(
                 f"the readings look like {unit}",
@@ -133,8 +133,8 @@ def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
         return
     few = inside.mean(axis=0) < 0.5
     for unit in dict.fromkeys(units):
-        alike = np.array(units) == unit
-        for which in (alike, alike & few):
+        same = np.array(units) == unit
+        for which in (same, same & few):
             if not which.any() or inside[:, which].mean() > 0.5 or not loosely[:, ~which].all():
                 continue
             low, high = ranges[which].T
@@ -152,7 +152,7 @@ def _shifted(
     """The error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
     column = int(np.flatnonzero(which)[0])
     low, high = ranges[column]
-    scale, name = SHOWN_UNITS[unit]
+    scale, name = DISPLAY_UNITS[unit]
     least, most = (number(end * scale, 0 if unit == "m" else 1, signed=True) for end in shift)
     return InputError(
         f"the readings of {listed([table.columns[k] for k in np.flatnonzero(which)], 7)} are off by"
@@ -175,13 +175,13 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
         low, high = ranges[column]
         more = f"It is one of {len(far)} such readings. " if len(far) > 1 else ""
         alone = len(set(far[:, 1])) == 1 and np.ptp(table.values[:, column]) <= high - low
-        way = ", the motor's direction if it counts the other way" if alone else ""
+        direction = ", the motor's direction if it counts the other way" if alone else ""
         raise InputError(
             "this reading is outside the machine's range",
             where=table.where(row, column),
             found=f"{table.values[row, column]:g}",
             expected=f"{low:g} to {high:g}, the range in the mechanism file",
-            next_step=f"{more}Correct the reading{way}, or the mechanism's range",
+            next_step=f"{more}Correct the reading{direction}, or the mechanism's range",
             code="readings.outside_range",
         )
     near = np.argwhere(~_inside(table.values, ranges, margin=0.0))
@@ -203,7 +203,7 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
 
 def unmoved_readings(joints: Array, noise: float) -> Booleans:
     """(m,) which of the readings (K, m) never move by more than their noise."""
-    return np.ptp(joints, axis=0) <= _ALIKE * noise
+    return np.ptp(joints, axis=0) <= _SAME_SIGMAS * noise
 
 
 def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
@@ -224,9 +224,9 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
     )
 
 
-def reading_departures(
+def reading_violations(
     joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
-) -> tuple[list[Departure], list[Departure]]:
+) -> tuple[list[ModelViolation], list[ModelViolation]]:
     """What may be otherwise with readings (K, m): of each its scale, beyond its tolerance, and its
     play, by which it differs with the way from which its motor came, in the order of the table.
 
@@ -234,9 +234,9 @@ def reading_departures(
     free beside its tolerance leaves that one to the drawing again, so the value that fits is all of
     the difference, as the present scale counts it.
     """
-    way = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
-    scales: list[Departure] = []
-    plays: list[Departure] = []
+    direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
+    scales: list[ModelViolation] = []
+    plays: list[ModelViolation] = []
     for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
         one = np.eye(len(columns))[m]
 
@@ -249,13 +249,13 @@ def reading_departures(
         def play(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
             return {"column": name, "value": value[0], "sigma": sigma[0], "unit": unit}
 
-        by_scale, by_way = ((x * one)[..., None] for x in (joints, way))
-        scales.append(Departure("readings.scale", name, scale, Effect(readings=by_scale)))
-        plays.append(Departure("readings.play", name, play, Effect(readings=by_way)))
+        by_scale, by_path = ((x * one)[..., None] for x in (joints, direction))
+        scales.append(ModelViolation("readings.scale", name, scale, Effect(readings=by_scale)))
+        plays.append(ModelViolation("readings.play", name, play, Effect(readings=by_path)))
     return scales, plays
 
 
-def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
+def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
     """A single reading that is wrong."""
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
@@ -267,7 +267,7 @@ def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
             "unit": unit,
         }
 
-    return Departure("readings.single", f"{column}, {configuration}", facts)
+    return ModelViolation("readings.single", f"{column}, {configuration}", facts)
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
@@ -283,7 +283,7 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
         )
     if not still.any():
         return []
-    names = [name for name, alike in zip(table.columns, still, strict=True) if alike]
+    names = [name for name, similar in zip(table.columns, still, strict=True) if similar]
     return [doubtful("readings.unmoved", table.label, columns=names)]
 
 
@@ -295,12 +295,14 @@ def same_pose(joints: Array, noise: float) -> Integers:
     # by the reading that spreads most, so that each row is held against few others
     spread = joints[:, np.argmax(np.ptp(joints, axis=0))]
     order = np.argsort(spread, kind="stable")
-    far = np.searchsorted(spread[order], spread + noise * np.array([[-1.0], [1.0]]) * (_ALIKE + 1))
+    far = np.searchsorted(
+        spread[order], spread + noise * np.array([[-1.0], [1.0]]) * (_SAME_SIGMAS + 1)
+    )
     for row in range(len(owner)):
         if owner[row] < 0:
             near = order[far[0, row] : far[1, row]]
-            alike = (np.abs(joints[near] - joints[row]) <= _ALIKE * noise).all(axis=1)
-            owner[near[alike & (owner[near] < 0)]] = row
+            same = (np.abs(joints[near] - joints[row]) <= _SAME_SIGMAS * noise).all(axis=1)
+            owner[near[same & (owner[near] < 0)]] = row
     return owner
 
 
@@ -323,7 +325,7 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
         values=total / np.bincount(group)[:, None],
         lines=tuple(table.lines[row] for row in first),
     )
-    rows = {"number": len(group), "poses": len(first), "apart": _ALIKE}
+    rows = {"number": len(group), "poses": len(first), "apart": _SAME_SIGMAS}
     return merged, [doubtful("readings.repeated_poses", table.label, **rows)]
 
 

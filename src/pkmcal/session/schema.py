@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, create_model
 
 from pkmcal.cameras.response import Response
-from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema, closest, shown
+from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema, closest, quoted
 from pkmcal.measurements.contract import NOISE_FIELD_RANGE, LinkKind, kinds_of
 
 BoardBody = Literal["base", "platform"]
@@ -44,9 +44,11 @@ def _words(value: Any) -> tuple[str, ...]:
         if word not in OBSERVE_WORDS:
             guess = closest(word, OBSERVE_WORDS) if isinstance(word, str) else None
             wanted = guess or "legs, board, or [legs, board]"
-            raise ValueError(f"no station can observe this; found {shown(word)}, expected {wanted}")
+            raise ValueError(
+                f"no station can observe this; found {quoted(word)}, expected {wanted}"
+            )
     if len(set(words)) < len(words):
-        raise ValueError(f"the same word stands twice; found {shown(words)}")
+        raise ValueError(f"the same word stands twice; found {quoted(words)}")
     return tuple(word for word in OBSERVE_WORDS if word in words)
 
 
@@ -164,8 +166,8 @@ class SessionDocument(Schema):
 
     def links(self) -> dict[str, Schema]:
         """What stands under the keys of measurements that link configurations, by their kinds."""
-        found = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
-        return {code: node for code, node in found.items() if node is not None}
+        results = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
+        return {code: node for code, node in results.items() if node is not None}
 
 
 @cache

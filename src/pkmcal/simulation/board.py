@@ -48,9 +48,9 @@ SLANTED_BOARD_COSINE = 0.6
 """Cosine of the angle between normal and line of sight below which a board is read less well."""
 STANDING_BOARD_LEAN = 0.25
 """rad; by which a standing board leans, and turns, from the middle of the cameras."""
-LEAST_CORNERS_SEEN = 0.4
+LEAST_VISIBLE_CORNERS = 0.4
 """Share of a board's corners that every station has to see, on average."""
-BETTER_SEEN = {
+VISIBILITY_ADVICE = {
     "base": "put the stations higher, or use a wider lens",
     "platform": "put the stations on one side of the machine, or use one",
 }
@@ -204,11 +204,11 @@ def place_board(
     )
     scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
     there = np.stack(places)
-    seen = np.min(
+    visible = np.min(
         [
             np.mean(
                 [
-                    _shares_seen(board, T, parts, eye, T_base_body @ there)
+                    _visible_shares(board, T, parts, eye, T_base_body @ there)
                     for parts, T_base_body in zip(scenes, carried, strict=True)
                 ],
                 axis=0,
@@ -217,13 +217,13 @@ def place_board(
         ],
         axis=0,
     )
-    best = int(np.argmax(seen))
-    if seen[best] < LEAST_CORNERS_SEEN:
+    best = int(np.argmax(visible))
+    if visible[best] < LEAST_VISIBLE_CORNERS:
         raise GeometryError(
             f"there is no place on the {on} where all stations see the board",
-            found=f"{seen[best]:.0%} of its corners at most",
-            expected=f"{LEAST_CORNERS_SEEN:.0%}",
-            next_step=BETTER_SEEN[on],
+            found=f"{visible[best]:.0%} of its corners at most",
+            expected=f"{LEAST_VISIBLE_CORNERS:.0%}",
+            next_step=VISIBILITY_ADVICE[on],
         )
     return places[best]
 
@@ -236,8 +236,10 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
     # below a plate, the board would stand in its shadow
     out_of = discs.platform_radius if discs.platform_side < 0 else 0.0
     out: list[Array] = []
-    for way, lean in product(2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)):
-        side = np.array([np.cos(way), np.sin(way), 0.0])
+    for direction, lean in product(
+        2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)
+    ):
+        side = np.array([np.cos(direction), np.sin(direction), 0.0])
         into = -(np.cos(lean) * up + np.sin(lean) * side)
         right = cross(up, into)
         right = right / np.linalg.norm(right)
@@ -273,30 +275,30 @@ def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
 
 def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator) -> list[Array]:
     """Upright behind the machine, higher and higher, its face to the middle of the cameras."""
-    way = (eyes - discs.base).mean(axis=0)[:2]
-    if np.linalg.norm(way) < 0.4 * np.linalg.norm((eyes - discs.base)[:, :2], axis=1).mean():
+    direction = (eyes - discs.base).mean(axis=0)[:2]
+    if np.linalg.norm(direction) < 0.4 * np.linalg.norm((eyes - discs.base)[:, :2], axis=1).mean():
         return []  # cameras all round: none would see its back
-    way = np.append(way / np.linalg.norm(way), 0.0)
+    direction = np.append(direction / np.linalg.norm(direction), 0.0)
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     out: list[Array] = []
-    for depth, aside, height in product(
+    for depth, lateral, height in product(
         (0.6, 1.2), (-1.2, -0.6, 0.0, 0.6, 1.2), np.arange(0.2, 2.6, 0.15)
     ):
         # x to the right of who looks at it, y down, z into it
-        right = np.cross([0.0, 0.0, 1.0], way)
-        flat = np.stack([right, [0.0, 0.0, -1.0], -way], axis=-1)
+        right = np.cross([0.0, 0.0, 1.0], direction)
+        flat = np.stack([right, [0.0, 0.0, -1.0], -direction], axis=-1)
         # seen straight on, a board hardly tells its tilt
         slant = rotation(STANDING_BOARD_LEAN * right) @ rotation(
             np.array([0.0, 0.0, STANDING_BOARD_LEAN])
         )
         rot = rotation(rng.normal(0, 0.05, 3)) @ slant @ flat
-        centre = discs.base + discs.base_radius * (aside * right - depth * way)
+        centre = discs.base + discs.base_radius * (lateral * right - depth * direction)
         centre = centre + discs.side * height * discs.base_radius * np.array([0, 0, 1])
         out.append(pose(rot, centre - rot @ ((low + high) / 2)))
     return out
 
 
-def _shares_seen(
+def _visible_shares(
     board: Board, T_camera_base: Array, parts: list[ScenePart], camera: Camera, T_base_board: Array
 ) -> Array:
     """Share (P,) of a board's corners that a camera sees past a machine's parts, less on a slant,
@@ -311,9 +313,9 @@ def _shares_seen(
     facing = np.clip(
         np.sum(T_base_board[:, None, :3, 2] * rays, axis=-1) / SLANTED_BOARD_COSINE, 0, 1
     )
-    seen = camera.in_image(pixels, margin=10.0)
+    visible = camera.in_image(pixels, margin=10.0)
     # all places' rays at once: a part is asked in microseconds a call, and in few a corner
-    ways = np.ascontiguousarray(rays[seen].T)
+    ways = np.ascontiguousarray(rays[visible].T)
     hit = np.min([part.shape.enter(eye[:, None], ways) for part in parts], axis=0)
-    seen[seen] = hit > distance[seen] - 1e-4
-    return np.mean(seen * facing, axis=-1)
+    visible[visible] = hit > distance[visible] - 1e-4
+    return np.mean(visible * facing, axis=-1)

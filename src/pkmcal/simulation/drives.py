@@ -67,7 +67,7 @@ class Drives:
     @cached_property
     def ends(self) -> Array:
         """(L, 2, 3) the leg's end at both ends of a guide; elsewhere the foot twice."""
-        return np.stack([way[[0, -1]] for way in self.ways])
+        return np.stack([direction[[0, -1]] for direction in self.ways])
 
 
 def drives_of(machine: Machine) -> Drives:
@@ -89,9 +89,9 @@ def drives_of(machine: Machine) -> Drives:
     for j in np.flatnonzero(guides):
         steps = np.linspace(low[j], high[j], BENT_GUIDE_PIECES + 1)[:, None]
         values = np.where(np.arange(machine.n_legs) == j, steps, 0.0)
-        way, along = (x[:, j] for x in _placed(machine, values))
-        ways[j] = way if _is_bent(way) else way[[0, -1]]
-        foot[j] = way[BENT_GUIDE_PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
+        attempt, along = (x[:, j] for x in _placed(machine, values))
+        ways[j] = attempt if _is_bent(attempt) else attempt[[0, -1]]
+        foot[j] = attempt[BENT_GUIDE_PIECES // 2] if _is_bent(attempt) else ways[j].mean(axis=0)
         axis[j] = _unit(along[BENT_GUIDE_PIECES // 2], by_value[j])
     away = _away(machine, foot, axis, guides)
     return Drives(arms, guides, foot, axis, arm, tuple(ways), away)
@@ -107,16 +107,21 @@ def _placed(machine: Machine, joint_value: Array) -> tuple[Array, Array]:
     return a, by_value
 
 
-def _is_bent(way: Array) -> bool:
+def _is_bent(direction: Array) -> bool:
     """Whether a way (n, 3) leaves the line between its ends."""
-    u = (way[-1] - way[0]) / max(float(np.linalg.norm(way[-1] - way[0])), 1e-300)
-    return float(np.linalg.norm(np.cross(way - way[0], u), axis=1).max()) > STRAIGHT_GUIDE_DEVIATION
+    u = (direction[-1] - direction[0]) / max(
+        float(np.linalg.norm(direction[-1] - direction[0])), 1e-300
+    )
+    return (
+        float(np.linalg.norm(np.cross(direction - direction[0], u), axis=1).max())
+        > STRAIGHT_GUIDE_DEVIATION
+    )
 
 
 def _unit(v: Array, otherwise: Array) -> Array:
     """Vectors (..., 3) of length one; where they are none, some direction square to another."""
-    aside = np.cross(otherwise, np.eye(3)[np.abs(otherwise).argmin(axis=-1)])
-    v = np.where(dot(v, v)[..., None] > 1e-12 * dot(otherwise, otherwise)[..., None], v, aside)
+    lateral = np.cross(otherwise, np.eye(3)[np.abs(otherwise).argmin(axis=-1)])
+    v = np.where(dot(v, v)[..., None] > 1e-12 * dot(otherwise, otherwise)[..., None], v, lateral)
     size = np.linalg.norm(v, axis=-1, keepdims=True)
     # what is a unit vector stays what it is, to the last digit
     return v / np.where(np.abs(size - 1) < 1e-12, 1.0, np.maximum(size, 1e-300))
@@ -131,9 +136,9 @@ def _guide_ranges(machine: Machine, by_value: Array) -> Array:
     spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1) / np.where(speed > 0, speed, 1.0)
     theta, ranges = machine.values, machine.joint_ranges
     middle = joint_values(layout, theta, readings)
-    told = np.stack([joint_values(layout, theta, ranges[:, k]) for k in (0, 1)], axis=-1)
+    values = np.stack([joint_values(layout, theta, ranges[:, k]) for k in (0, 1)], axis=-1)
     guess = np.stack([middle - spare, middle + spare], axis=-1)
-    return np.where(np.isfinite(told).all(axis=1, keepdims=True), told, guess)
+    return np.where(np.isfinite(values).all(axis=1, keepdims=True), values, guess)
 
 
 def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array:
@@ -145,8 +150,8 @@ def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array
     back = foot - np.array(b).mean(axis=0)
     back = back - dot(back, axis)[:, None] * axis
     # a guide through the platform's middle may stand back to any side
-    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
-    back = np.where((dot(back, back) > 1e-6)[:, None], back, aside)
+    lateral = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    back = np.where((dot(back, back) > 1e-6)[:, None], back, lateral)
     size = np.linalg.norm(back, axis=1, keepdims=True)
     return np.where(guides[:, None], back / np.maximum(size, 1e-300), 0.0)
 
@@ -163,9 +168,9 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
     if any(g.carrier.driven for g in machine.layout.base) and np.isfinite(ranges).all():
         share = np.array([[MOTOR_STOP_MARGIN], [1 - MOTOR_STOP_MARGIN]])
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
-        found = machine.forward_result(wanted)
-        poses += list(found.T_base_platform[found.converged])
-        readings += list(wanted[found.converged])
+        fk = machine.forward_result(wanted)
+        poses += list(fk.T_base_platform[fk.converged])
+        readings += list(wanted[fk.converged])
     ends = machine.ends_at(np.stack(readings), np.stack(poses))
     return np.array(ends.a), np.array(ends.b)
 

@@ -16,7 +16,7 @@ from pkmcal.geometry.cylinders import (
     SIDE_SIGNS,
     contour_point,
     edge_normal,
-    leg_is_seen,
+    has_silhouette,
     line_through,
     tangent_basis,
 )
@@ -34,7 +34,7 @@ JOINT_HOUSING = 0.005
 """Metres at both ends of a tube that are never measured."""
 HIDING_LEG_CLEARANCE = 2.0
 """Pixels between an edge and a leg in front of it, nearer than which the two are one edge."""
-LEAST_PLACES_SEEN = 8
+LEAST_VISIBLE_SAMPLES = 8
 """Places in a row that an edge needs; shorter stretches say little about the tilt."""
 
 
@@ -112,11 +112,11 @@ def visible_edges(
         a_e[..., None, :], u[..., None, :], normal[..., None, :], radius[:, None], along
     )
     with np.errstate(invalid="ignore"):
-        seen = camera.in_image(camera.project(points))
-        seen &= (leg_is_seen(m, radius) & (last > first))[..., None]
-    seen &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
-    begin, count = _longest_run(seen)
-    photo, edge = np.nonzero(count >= LEAST_PLACES_SEEN)
+        prediction = camera.in_image(camera.project(points))
+        prediction &= (has_silhouette(m, radius) & (last > first))[..., None]
+    prediction &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
+    begin, count = _longest_run(prediction)
+    photo, edge = np.nonzero(count >= LEAST_VISIBLE_SAMPLES)
     begin, count = begin[photo, edge], count[photo, edge]
     span = np.stack([along[photo, edge, begin], along[photo, edge, begin + count - 1]], axis=-1)
     normal = normal[photo, edge]
@@ -175,12 +175,12 @@ def pixel_angle(camera: Camera) -> float:
     return float(np.linalg.norm(rays[1] - rays[0]))
 
 
-def _longest_run(seen: Booleans) -> tuple[Integers, Integers]:
+def _longest_run(visible: Booleans) -> tuple[Integers, Integers]:
     """First place and number of places of the longest run of True along the last axis."""
-    index = np.arange(seen.shape[-1])
-    gap = np.where(seen, -1, index)
+    index = np.arange(visible.shape[-1])
+    gap = np.where(visible, -1, index)
     # places since the last gap, by a running maximum
-    run = np.where(seen, index - np.maximum.accumulate(gap, axis=-1), 0)
+    run = np.where(visible, index - np.maximum.accumulate(gap, axis=-1), 0)
     last = np.argmax(run, axis=-1)
     count = np.take_along_axis(run, last[..., None], axis=-1)[..., 0]
     return last - count + 1, count
@@ -243,8 +243,8 @@ def disturbed(
     """
     error = rng.standard_normal((*by_shift.shape[:-1], 2)) * (noise.shift, noise.tilt)
     turn = by_shift * (error[..., :1] + noise.outward) + by_tilt * error[..., 1:]
-    moved = normal + (basis @ turn[..., None])[..., 0]
-    return moved / np.sqrt(dot(moved, moved))[..., None]
+    shifted = normal + (basis @ turn[..., None])[..., 0]
+    return shifted / np.sqrt(dot(shifted, shifted))[..., None]
 
 
 def _with_wrong_ones(edges: EdgeSet, fraction: float, rng: np.random.Generator) -> EdgeSet:

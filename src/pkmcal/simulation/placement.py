@@ -87,19 +87,19 @@ def draw_configurations(
     extreme : share with every leg near one of its ends, which measure offsets best; the other
     configurations are spread evenly over the ranges.
     """
-    found, tried = 0, 0
+    value, tried = 0, 0
     for attempt in range(6):
         tried = 8 * count * 3**attempt + 60
         poses, joints = _candidates(machine, tried, extreme, rng)
         keep = usable(machine, poses, joints)
-        found = int(np.count_nonzero(keep))
-        if found >= count:
+        value = int(np.count_nonzero(keep))
+        if value >= count:
             return poses[keep], joints[keep]
-        if attempt and not found:  # a thousand in vain: more would only keep the user waiting
+        if attempt and not value:  # a thousand in vain: more would only keep the user waiting
             break
     raise InputError(
         what=f"mechanism {machine.name!r} has too few usable configurations in its joint ranges",
-        found=f"{found} of {tried} tried",
+        found=f"{value} of {tried} tried",
         expected=f"{count}",
         next_step="check the ranges and centres in the mechanism file",
     )
@@ -139,10 +139,10 @@ def _candidates(
         share = np.where(rng.random((n, 1)) < extreme, ends, share)
     if ranges.size and np.isfinite(ranges).all():
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
-        found = machine.forward_result(wanted)
+        fk = machine.forward_result(wanted)
         # no pose has the readings wanted of more than its freedoms: what comes nearest to them
-        near = found.converged | machine.layout.overdetermined
-        poses = found.T_base_platform[near]
+        near = fk.converged | machine.layout.overdetermined
+        poses = fk.T_base_platform[near]
     else:
         poses = _around_home(machine, n, rng)
     joints = machine.inverse(poses)
@@ -162,8 +162,8 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
     scale = np.array([0.26, 0.26, 0.26, *np.full(3, 0.125 * size)])
     motion = machine.layout.motion
     delta = rng.uniform(-1, 1, (n, 6)) * scale @ motion @ motion.T
-    found = on_manifold(machine.layout, machine.values, perturb(machine.home(), delta))
-    return found.T_base_platform[found.converged]
+    value = on_manifold(machine.layout, machine.values, perturb(machine.home(), delta))
+    return value.T_base_platform[value.converged]
 
 
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
@@ -291,8 +291,8 @@ def places_by_hand(
         elevation = rng.uniform(*HANDHELD_ELEVATIONS)
         away = fitting_distance(machine, camera) * rng.uniform(*HANDHELD_DISTANCES)
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        way = np.cos(elevation) * level + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
-        position = centre + away * radius * way
+        direction = np.cos(elevation) * level + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+        position = centre + away * radius * direction
         target = centre + rng.uniform(-0.08, 0.08, 3) * radius
         forward = (target - position) / np.linalg.norm(target - position)
         roll = rng.uniform(-MOST_HANDHELD_ROLL, MOST_HANDHELD_ROLL)
@@ -336,8 +336,8 @@ def _clearest(
     points = edge_points(machine, camera, legs, tubes, 12)
     # legs move: what comes near another one at home is behind it elsewhere
     clear = HOME_LEG_GAP * camera.image_size[0]
-    seen = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
-    share = np.stack([seen[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
+    visible = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
+    share = np.stack([visible[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
     return poses[int(np.argmax(share.min(axis=0)))]
 
 
@@ -366,9 +366,9 @@ def rough_pose(
     distance : from the camera to what it looks at, m.
     """
     T_base_camera = inverse(T_camera_base)
-    axis, way = rng.normal(size=(2, 3))
+    axis, direction = rng.normal(size=(2, 3))
     rot = rotation(turn * axis / np.linalg.norm(axis)) @ T_base_camera[:3, :3]
-    position = T_base_camera[:3, 3] + shift * way / np.linalg.norm(way)
+    position = T_base_camera[:3, 3] + shift * direction / np.linalg.norm(direction)
     # nobody writes more digits than a tenth of a millimetre by hand
     return StationPlace(
         _rounded(position), _rounded(position + distance * rot[:, 2]), _rounded(-rot[:, 1])
@@ -391,12 +391,12 @@ def _outside(
     centre, radius = ball_of(points)
     usual = np.deg2rad(rng.uniform(42, 55) if _is_flat(points) else rng.uniform(7, 17))
     above = usual if elevation is None else elevation
-    way = np.array(
+    direction = np.array(
         [np.cos(azimuth) * np.cos(above), np.sin(azimuth) * np.cos(above), np.sin(above)]
     )  # fmt: skip
     target = centre + rng.uniform(-0.03, 0.03, 3) * radius
     up = np.array([*rng.normal(0, 0.04, 2), 1.0])
-    position = centre + distance * radius * way
+    position = centre + distance * radius * direction
     return StationPlace(_rounded(position), _rounded(target), _rounded(up))
 
 

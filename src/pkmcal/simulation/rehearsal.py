@@ -16,7 +16,7 @@ from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
 from pkmcal.simulation.placement import StationPlace
-from pkmcal.simulation.truth import Asked
+from pkmcal.simulation.truth import RequestedConfigurations
 
 PLAN_FILE = "plan.json"
 
@@ -55,7 +55,7 @@ class Rehearsal(NamedTuple):
     machine: Machine
     cameras: tuple[Camera, ...]
     places: tuple[StationPlace, ...]
-    asked: Asked
+    requested: RequestedConfigurations
     board: Board | None
 
 
@@ -69,28 +69,28 @@ def rehearsal_of(plan: Path | str) -> Rehearsal:
             expected=f"a folder that pkmcal plan wrote, or its {PLAN_FILE}",
         )
     document = read_json(path, label=str(path))
-    found = validated_document(document, _Plan)
-    number = {station.name: k for k, station in enumerate(found.stations)}
+    results = validated_document(document, _Plan)
+    number = {station.name: k for k, station in enumerate(results.stations)}
     pairs = [
         (number[name], k)
-        for k, one in enumerate(found.configurations)
+        for k, one in enumerate(results.configurations)
         for name in one.stations
         if name in number
     ]
-    machine = checked_machine(found.mechanism, document, "mechanism")
-    if any(len(one.joints) != machine.n_joints for one in found.configurations):
+    machine = checked_machine(results.mechanism, document, "mechanism")
+    if any(len(one.joints) != machine.n_joints for one in results.configurations):
         raise InputError(
             "the plan's readings are not those of its machine",
             where=f"{path}, configurations",
             expected=f"{machine.n_joints} a configuration",
         )
-    joints = np.array([one.joints for one in found.configurations])
+    joints = np.array([one.joints for one in results.configurations])
     return Rehearsal(
         machine,
-        tuple(camera_from_document(_inside(document, s.camera)) for s in found.stations),
-        tuple(StationPlace.of(inverse(np.array(s.T_base_camera))) for s in found.stations),
-        Asked(joints, np.array(pairs, dtype=int).reshape(-1, 2)),
-        None if found.board is None else board_from_document(_inside(document, found.board)),
+        tuple(camera_from_document(_inside(document, s.camera)) for s in results.stations),
+        tuple(StationPlace.of(inverse(np.array(s.T_base_camera))) for s in results.stations),
+        RequestedConfigurations(joints, np.array(pairs, dtype=int).reshape(-1, 2)),
+        None if results.board is None else board_from_document(_inside(document, results.board)),
     )
 
 

@@ -106,15 +106,15 @@ def first_hits(
         rows = np.flatnonzero(reached[:, k])
         if not rows.size:
             continue
-        found = shape.enter(origin[:, None], _flat(rays, rows)).reshape(rows.size, -1)
+        value = shape.enter(origin[:, None], _flat(rays, rows)).reshape(rows.size, -1)
         before = distance[rows]
-        closer = found < before
-        distance[rows] = np.where(closer, found, before)
+        closer = value < before
+        distance[rows] = np.where(closer, value, before)
         owner[rows] = np.where(closer, np.int16(k), owner[rows])
     return distance, owner
 
 
-def lamp_seen(
+def lamp_visibility(
     parts: Sequence[ScenePart], bounds: Bounds, lamp: Lamp, points: Array, owner: Integers
 ) -> Array:
     """Part of the lamp (bundles, rays) that surface points (3, bundles, rays) see.
@@ -125,7 +125,7 @@ def lamp_seen(
     rays = points - lamp.place[:, None, None]
     distance = np.sqrt(np.einsum("ibr,ibr->br", rays, rays))
     rays /= distance
-    seen = np.ones(distance.shape)
+    visible = np.ones(distance.shape)
     reached = bounds.reached(lamp.place, rays, lamp.radius)
     for k, part in enumerate(parts):
         rows = np.flatnonzero(reached[:, k])
@@ -135,8 +135,8 @@ def lamp_seen(
             lamp.place, _flat(rays, rows), distance[rows].ravel(), lamp.radius
         ).reshape(rows.size, -1)
         # overlapping parts of one leg hide the same piece of the lamp: the larger share counts
-        seen[rows] = np.minimum(seen[rows], np.where(owner[rows] == k, 1.0, 1.0 - hidden))
-    return seen
+        visible[rows] = np.minimum(visible[rows], np.where(owner[rows] == k, 1.0, 1.0 - hidden))
+    return visible
 
 
 class RayHits(NamedTuple):
@@ -147,7 +147,7 @@ class RayHits(NamedTuple):
 
     light: Array
     label: Integers
-    seen: Array
+    visible: Array
 
 
 def ray_hits(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHits:
@@ -155,25 +155,25 @@ def ray_hits(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHit
     distance, owner = first_hits([part.shape for part in scene.parts], bounds, origin, rays)
     lost = owner < 0
     points = origin[:, None, None] + np.where(lost, 1.0, distance) * rays
-    seen = np.ones(distance.shape)
+    visible = np.ones(distance.shape)
     for lamp in scene.lighting.lamps:
         if lamp.shadows:
-            seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
+            visible = lamp_visibility(scene.parts, bounds, lamp, points, owner)
     flat, face = points.reshape(3, -1), np.zeros(owner.size, dtype=np.int16)
     for k, at in _by_owner(owner):
         face[at] = scene.parts[k].shape.face(flat[:, at])
-    light = light_of(scene, origin, rays, distance, owner, seen)
-    label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
-    return RayHits(light, np.where(lost, -1, label).astype(np.int16), seen)
+    light = light_of(scene, origin, rays, distance, owner, visible)
+    label = 6 * owner + 2 * face.reshape(owner.shape) + (visible < 0.5)
+    return RayHits(light, np.where(lost, -1, label).astype(np.int16), visible)
 
 
 def light_of(
-    scene: Scene, origin: Array, rays: Array, distance: Array, owner: Integers, seen: Array
+    scene: Scene, origin: Array, rays: Array, distance: Array, owner: Integers, visibility: Array
 ) -> Array:
-    """Light (bundles, rays) along rays (3, bundles, rays) from what each meets first; seen : of the
-    lamp.
+    """Light (bundles, rays) along rays (3, bundles, rays) from what each meets first; visibility :
+    of the lamp.
     """
-    flat, far, lit = rays.reshape(3, -1), distance.ravel(), seen.ravel()
+    flat, far, lit = rays.reshape(3, -1), distance.ravel(), visibility.ravel()
     light = np.zeros(owner.size)
     for k, at in _by_owner(owner):
         part, along = scene.parts[k], flat[:, at]
@@ -188,8 +188,8 @@ def _by_owner(owner: Integers) -> Iterator[tuple[int, Integers]]:
     """Each shape that any ray meets, and those rays, by their numbers in a row."""
     numbers = owner.ravel()
     order = np.argsort(numbers, kind="stable")
-    found, starts = np.unique(numbers[order], return_index=True)
-    for k, at in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
+    values, starts = np.unique(numbers[order], return_index=True)
+    for k, at in zip(values.tolist(), np.split(order, starts[1:]), strict=True):
         if k >= 0:
             yield k, at
 
@@ -203,9 +203,9 @@ def _mirrored(scene: Scene, number: int, points: Array, to_camera: Array) -> Arr
     nearest, owner = np.full(points.shape[1], np.inf), np.full(points.shape[1], -1)
     for k, part in enumerate(scene.parts):
         if k != number:  # it is convex
-            found = part.shape.enter(points, d)
-            owner = np.where(found < nearest, k, owner)
-            nearest = np.minimum(found, nearest)
+            values = part.shape.enter(points, d)
+            owner = np.where(values < nearest, k, owner)
+            nearest = np.minimum(values, nearest)
     light, lit = np.zeros(points.shape[1]), np.ones(points.shape[1])
     for k in np.unique(owner[owner >= 0]):
         at, part = np.flatnonzero(owner == k), scene.parts[k]
@@ -297,17 +297,17 @@ def _through_centres(
     """One ray a pixel, (H, W); meaningless in blind pixels."""
     shape = blind.shape
     light, label = np.zeros(blind.size), np.full(blind.size, -2, dtype=np.int16)
-    seen = np.ones(blind.size)
+    visible = np.ones(blind.size)
     pixels = _tiles(*shape)
     seeing = ~blind.ravel()[pixels].all(axis=1)
     rays = view.centre.reshape(3, -1)
     for rows in _chunks(pixels[seeing]):
         d = _seeing(rays[:, rows])
-        light[rows], label[rows], seen[rows] = ray_hits(
+        light[rows], label[rows], visible[rows] = ray_hits(
             scene, bounds, origin, turned_components(rot, d)
         )
     label[blind.ravel()] = -2
-    return RayHits(light.reshape(shape), label.reshape(shape), seen.reshape(shape))
+    return RayHits(light.reshape(shape), label.reshape(shape), visible.reshape(shape))
 
 
 def _over_area(
@@ -335,10 +335,10 @@ def _over_area(
     bend = (around.mean(axis=1) - out) / 3
     out += bend
     whole = np.all(label == hits.label.ravel()[at, None], axis=1) & (np.abs(bend) < LEAST_STEP)
-    seen = hits.seen
-    alike = (maximum_filter(seen, 3) == minimum_filter(seen, 3)).ravel()[at]
-    for known in (True, False):
-        part = np.flatnonzero(~whole & (alike == known))
+    visible = hits.visible
+    same = (maximum_filter(visible, 3) == minimum_filter(visible, 3)).ravel()[at]
+    for valid in (True, False):
+        part = np.flatnonzero(~whole & (same == valid))
         for rows in _chunks(_grouped(part, RAY_BUNDLE_SIDE)):
             fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
             c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
@@ -349,8 +349,8 @@ def _over_area(
                 d = np.where(np.isfinite(d).all(axis=0), d, centre)
             d /= np.sqrt(np.einsum("i...,i...->...", d, d))
             d = turned_components(rot, d.reshape(3, rows.shape[0], -1))
-            if known:
-                lit = np.repeat(seen.ravel()[at[rows]], BORDER_PIXEL_SAMPLES, axis=1)
+            if valid:
+                lit = np.repeat(visible.ravel()[at[rows]], BORDER_PIXEL_SAMPLES, axis=1)
                 light = light_of(scene, origin, d, *first_hits(shapes, bounds, origin, d), lit)
             else:
                 light = ray_hits(scene, bounds, origin, d).light
@@ -376,8 +376,8 @@ def _through_corners(
     seeing = order[np.isfinite(corner[:, numbers[order]]).all(axis=0)]
     label, light = np.full(numbers.size, -2, dtype=np.int16), np.zeros(numbers.size)
     for rows in _chunks(_grouped(seeing, RAY_BUNDLE_SIDE * RAY_BUNDLE_SIDE)):
-        found = ray_hits(scene, bounds, origin, turned_components(rot, corner[:, numbers[rows]]))
-        label[rows], light[rows] = found.label, found.light
+        value = ray_hits(scene, bounds, origin, turned_components(rot, corner[:, numbers[rows]]))
+        label[rows], light[rows] = value.label, value.light
     which = which.reshape(-1, 4)
     return label[which], light[which]
 

@@ -58,7 +58,7 @@ KINDS_OF_LIGHT: dict[Light, tuple[float, float, float]] = {
 }
 """How wide and how strong the lamps are, and how strong the light from everywhere, in kinds of
 light: under a white ceiling, and in the sun or under a spot."""
-BOARD_LAMP_ASIDE = 1.2
+BOARD_LAMP_ANGLE = 1.2
 """rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
 MOTOR_SHARE, RING_AT, CABLE_PIECES = 0.5, 0.7, 8
 """Length of a leg's motor and place of its ring, in the length of its first tube; straight pieces
@@ -214,10 +214,10 @@ def _platform(
 
 
 def _joint(
-    centre: Array, way: Array, height: float, radius: float, finish: Finish
+    centre: Array, direction: Array, height: float, radius: float, finish: Finish
 ) -> list[ScenePart]:
     """A ball, and the post from it to its plate."""
-    post = Cylinder(centre, way, 0.6 * radius, height)
+    post = Cylinder(centre, direction, 0.6 * radius, height)
     return [ScenePart(Ball(centre, radius), finish.joint), ScenePart(post, finish.joint)]
 
 
@@ -298,17 +298,17 @@ def arm_parts(
     foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
     wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
     length = min(2.4 * wide, 0.6 * _room(drives.foot, j))
-    way = _motor_side(drives, j) * v
-    first = foot + 1.1 * ball * way
+    sense = _motor_side(drives, j) * v
+    first = foot + 1.1 * ball * sense
     post = float((foot - plate) @ up)
-    middle = first + 0.5 * length * way
+    middle = first + 0.5 * length * sense
     return [
         *(
             ScenePart(_web(start, stop, v, ball), finish.platform)
             for start, stop in pairwise(chain)
         ),
         ScenePart(Cylinder(foot - 1.1 * ball * v, v, 1.7 * ball, 2.2 * ball), finish.steel),
-        ScenePart(Cylinder(first, way, wide, length), finish.joint),
+        ScenePart(Cylinder(first, sense, wide, length), finish.joint),
         ScenePart(Cylinder(middle, -up, 0.6 * wide, max(post, 1e-4)), finish.joint),
         ScenePart(Ball(chain[-1], ball), finish.joint),
     ]
@@ -353,11 +353,11 @@ def guide_parts(
     along, across, deep = (ball * size for size in CARRIAGE_HALF_SIZE)
     width, spare = RAIL_HALF_WIDTH * ball, 1.2 * along
     back = ball + 2 * deep + width
-    way = drives.ways[j]
+    attempt = drives.ways[j]
     rails: list[Box] = []
-    if len(way) == 2:
+    if len(attempt) == 2:
         v = drives.axis[j]
-        low, high = (float((end - foot) @ v) for end in way)
+        low, high = (float((end - foot) @ v) for end in attempt)
         low, high = min(low, high) - spare, max(low, high) + spare
         if drives.upright[j]:
             base = float(plate[2] - foot[2]) / v[2]
@@ -366,15 +366,15 @@ def guide_parts(
         centre = foot + (low + high) / 2 * v + back * away
         rails.append(Box(centre, rot, np.array([(high - low) / 2, width, width])))
     else:
-        for start, stop in pairwise(way):
+        for start, stop in pairwise(attempt):
             rot = _turned_along(stop - start, away)
             half = (float(np.linalg.norm(stop - start)) + width) / 2
             rails.append(
                 Box((start + stop) / 2 + back * rot[2], rot, np.array([half, width, width]))
             )
-        middles = (way[1:] + way[:-1]) / 2
+        middles = (attempt[1:] + attempt[:-1]) / 2
         nearest = int(np.argmin(np.linalg.norm(middles - a, axis=1)))
-        rot = _turned_along(way[nearest + 1] - way[nearest], away)
+        rot = _turned_along(attempt[nearest + 1] - attempt[nearest], away)
     block = Box(a + (ball + deep) * rot[2], rot, np.array([along, across, deep]))
     return [
         *(ScenePart(rail, finish.platform) for rail in rails),
@@ -572,7 +572,7 @@ def _lamps(
     """A key lamp with shadows, a weaker one across, one from above and behind."""
     azimuth = rng.uniform(0, 2 * np.pi)
     if lit_from is not None:
-        azimuth = lit_from + BOARD_LAMP_ASIDE * (azimuth / np.pi - 1)
+        azimuth = lit_from + BOARD_LAMP_ANGLE * (azimuth / np.pi - 1)
     share = SOFT_LAMP_SHARE if soft else 1.0
     lamps: list[Lamp] = []
     for turn, elevation, distance, power in (
@@ -581,10 +581,10 @@ def _lamps(
         (rng.uniform(200, 260), rng.uniform(55, 75), 2.2, 0.45),
     ):
         a, e = azimuth + np.deg2rad(turn), np.deg2rad(elevation)
-        way = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+        direction = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
         lamps.append(
             Lamp(
-                middle + (distance * reach) * way + size * Z_AXIS,
+                middle + (distance * reach) * direction + size * Z_AXIS,
                 0.16 * size,
                 share * power,
                 distance * reach,

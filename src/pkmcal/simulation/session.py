@@ -102,9 +102,9 @@ class Studio:
         discs = discs_of(truth.machine)
         places = np.array([pose.position for pose in truth.rough])
         reach = float(np.linalg.norm(places - discs.base, axis=1).max())
-        way = (places - discs.base).mean(axis=0)
+        sense = (places - discs.base).mean(axis=0)
         read = truth.T_platform_board is not None and discs.drives.any
-        lit_from = float(np.arctan2(way[1], way[0])) if read else None
+        lit_from = float(np.arctan2(sense[1], sense[0])) if read else None
         rng = np.random.default_rng(seeds[1])
         room = room_of(discs, reach, noise, rng, lit_from, settings.light)
         views: dict[int, PixelRays] = {}
@@ -131,8 +131,8 @@ class Studio:
         if not any(shake):
             light = self._light(index, still, rngs[0])
             return [photograph(light, self.sensor, rng) for rng in rngs]
-        moved = [_shaken(shake, rng) @ still for rng in rngs]
-        lights = [self._light(index, T, rng) for T, rng in zip(moved, rngs, strict=True)]
+        shifted = [_shaken(shake, rng) @ still for rng in rngs]
+        lights = [self._light(index, T, rng) for T, rng in zip(shifted, rngs, strict=True)]
         return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
 
     def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:

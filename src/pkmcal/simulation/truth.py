@@ -49,7 +49,7 @@ HANDHELD_STATION_NAME = "phone"
 
 
 @dataclass(frozen=True)
-class Asked:
+class RequestedConfigurations:
     """Configurations that somebody asks for, as a plan does.
 
     joints : (n, m) readings. pairs : (M, 2) stations and the configurations that they photograph.
@@ -98,7 +98,7 @@ class Settings:
     as_built: bool = False
     handheld: bool = False
     breathing: float = BREATHING_SIGMA
-    asked: Asked | None = None
+    asked: RequestedConfigurations | None = None
 
     @property
     def n_stations(self) -> int:
@@ -166,8 +166,8 @@ def draw_truth(
     if settings.handheld:
         poses = places_by_hand(drawing, cameras, rngs["stations"])
     elif isinstance(poses, int):
-        seen = settings.board_on if settings.board is not None else None
-        poses = default_stations(drawing, cameras, rngs["stations"], seen)
+        in_view = settings.board_on if settings.board is not None else None
+        poses = default_stations(drawing, cameras, rngs["stations"], in_view)
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     rough = tuple(
         rough_pose(
@@ -236,22 +236,22 @@ def _configurations(
     A controller that moves the machine by its drawing only goes where that closes.
     """
     if settings.asked is not None:
-        return _as_asked(drawing, machine, settings.asked)
+        return _at_requested(drawing, machine, settings.asked)
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
     by_drawing = drawing.forward_result(joints)
     reached = by_drawing.converged & platform_unfolded(drawing, by_drawing.T_base_platform)
     poses, joints = poses[reached], joints[reached]
-    seen = np.stack(
+    in_view = np.stack(
         [
             in_picture(machine, camera, T, poses, joints)
             for camera, T in zip(cameras, T_camera_base, strict=True)
         ]
     )
-    groups = [np.asarray(seen.all(axis=0))] if settings.shared else list(seen)
+    groups = [np.asarray(in_view.all(axis=0))] if settings.shared else list(in_view)
     if settings.handheld:  # each configuration by its own photographs
-        n, groups = 1, list(np.all(seen.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
+        n, groups = 1, list(np.all(in_view.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
     taken = np.zeros(len(poses), dtype=bool)
     chosen: list[Integers] = []
     for k, good in enumerate(groups):
@@ -305,18 +305,20 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
     return rows
 
 
-def _as_asked(drawing: Machine, machine: Machine, asked: Asked) -> tuple[Array, Array, Integers]:
+def _at_requested(
+    drawing: Machine, machine: Machine, request: RequestedConfigurations
+) -> tuple[Array, Array, Integers]:
     """Poses that the true machine takes at the readings that are asked for."""
-    by_drawing = drawing.forward_result(asked.joints)
-    found = machine.forward_result(asked.joints, by_drawing.T_base_platform)
-    bad = np.flatnonzero(~(found.converged & by_drawing.converged))
+    by_drawing = drawing.forward_result(request.joints)
+    fk = machine.forward_result(request.joints, by_drawing.T_base_platform)
+    bad = np.flatnonzero(~(fk.converged & by_drawing.converged))
     if bad.size:
         raise GeometryError(
             what="the machine cannot take a configuration that was asked for",
-            found=", ".join(f"{q:.4g}" for q in asked.joints[bad[0]]),
+            found=", ".join(f"{q:.4g}" for q in request.joints[bad[0]]),
             expected="readings at which all legs reach the platform",
         )
-    return found.T_base_platform, asked.joints, asked.pairs
+    return fk.T_base_platform, request.joints, request.pairs
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:
@@ -372,10 +374,10 @@ def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))
     drawing = drawing or load_session(folder).machine
-    known = data["parameters"]
+    reference_values = data["parameters"]
     # a truth from before readings had scales has readings that are what they say
     values = [
-        known[name] if name in known or not name.endswith(".scale") else 1.0
+        reference_values[name] if name in reference_values or not name.endswith(".scale") else 1.0
         for name in drawing.parameters.names
     ]
     stations, configurations = tuple(data["stations"]), tuple(data["configurations"])

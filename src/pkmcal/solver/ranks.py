@@ -46,7 +46,7 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
     """
     s, vt, scale = scaled_directions(rows)
     limit = least * s[..., :1]
-    inverse = 1 / np.maximum(s, limit + SINGULAR_VALUE_FLOOR) if loose else _of_known(s, limit)
+    inverse = 1 / np.maximum(s, limit + SINGULAR_VALUE_FLOOR) if loose else _safe_inverse(s, limit)
     return vt.mT * inverse[..., None, :] / scale[..., None]
 
 
@@ -62,7 +62,9 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     limit = least * values[..., -1:]
     inverse = (
-        1 / np.maximum(values, limit + SINGULAR_VALUE_FLOOR) if loose else _of_known(values, limit)
+        1 / np.maximum(values, limit + SINGULAR_VALUE_FLOOR)
+        if loose
+        else _safe_inverse(values, limit)
     )
     return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
 
@@ -81,10 +83,10 @@ def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
     return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(DOUBLE_EPSILON)
 
 
-def _of_known(values: Array, limit: Array) -> Array:
+def _safe_inverse(values: Array, limit: Array) -> Array:
     """1 / values where they are above the limit, else 0."""
-    known = values > limit
-    return np.where(known, 1 / np.where(known, values, 1.0), 0.0)
+    above_limit = values > limit
+    return np.where(above_limit, 1 / np.where(above_limit, values, 1.0), 0.0)
 
 
 def unit_diagonal(normal: Array) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ REFUSED_STEP_TOLERANCE = 1e-3
 little is their rounding, where a direction is a millionth as well known as the others."""
 COST_ROUNDING = 1e-13
 """Of the cost, relative."""
-KEPT_PROBLEM_PARTS = 16
+CACHED_PROBLEM_PARTS = 16
 """Parts of a problem of which is kept what their residuals took, so that the next step goes on from
 it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
 
@@ -93,7 +93,7 @@ class LeastSquares(Protocol):
         """Residuals and exact Jacobian; rows that cannot be predicted are zero."""
         ...
 
-    def moved(self, state: Any, shared: Array, own: Array) -> Any:
+    def retract(self, state: Any, shared: Array, own: Array) -> Any:
         """The state moved by steps (B, na) and (B, K, d)."""
         ...
 
@@ -208,17 +208,17 @@ def minimise(
     cuts = divisions(n_runs, prod(rows))
     if len(cuts) < 2:
         return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps, tolerance)
-    found: list[Solution] = []
+    results: list[Solution] = []
     for cut in cuts:
         runs = np.arange(cut.start, cut.stop)
         part = _Divided.of(problem.select(runs), len(runs), *rows)
-        found.append(_minimised(part, take(start, runs), None, max_steps, tolerance))
+        results.append(_minimised(part, take(start, runs), None, max_steps, tolerance))
     return Solution(
-        _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
-        np.concatenate([one.cost for one in found]),
-        np.concatenate([one.steps for one in found]),
-        tuple(reason for one in found for reason in one.stop),
-        np.concatenate([one.normal for one in found]),
+        _each(lambda *states: np.concatenate(states), *(one.state for one in results)),
+        np.concatenate([one.cost for one in results]),
+        np.concatenate([one.steps for one in results]),
+        tuple(reason for one in results for reason in one.stop),
+        np.concatenate([one.normal for one in results]),
     )
 
 
@@ -246,9 +246,9 @@ class _Divided(NamedTuple):
         they are known.
         """
         for k, (cut, part) in enumerate(self.parts):
-            known = values[k].rows if values else None
-            if known:
-                yield known()
+            reference_values = values[k].rows if values else None
+            if reference_values:
+                yield reference_values()
             elif _is_divisible(part):
                 yield part.compact(part.state_among(state, cut))
             else:
@@ -256,12 +256,12 @@ class _Divided(NamedTuple):
 
     def residuals(self, state: Any) -> list[Values]:
         """Residuals of each part; those of shared unknowns only in the first."""
-        found = [self.parts[0][1].residuals(self._state_among(state, 0))]
+        results = [self.parts[0][1].residuals(self._state_among(state, 0))]
         for k in range(1, len(self.parts)):
             values = self.parts[k][1].residuals(self._state_among(state, k))
             values = values._replace(shared_value=values.shared_value[:, :0])
-            found.append(values if k < KEPT_PROBLEM_PARTS else values._replace(rows=None))
-        return found
+            results.append(values if k < CACHED_PROBLEM_PARTS else values._replace(rows=None))
+        return results
 
     def _state_among(self, state: Any, k: int) -> Any:
         """What a part needs of a state."""
@@ -288,7 +288,7 @@ def _minimised(
     for _ in range(max_steps):
         new, gain = _try(part, here, at, search, tolerance)
         steps[active] += 1
-        here, at = _kept(here, new, gain)
+        here, at = _accepted_state(here, new, gain)
         if active.size == n_runs:
             state, normal = here, gain.normal
         else:
@@ -307,7 +307,7 @@ def _minimised(
     return Solution(state, cost, steps, final, cast(Array, normal))
 
 
-def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
+def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
     """The state with the steps that were accepted, and the residuals there where they are known."""
     if gain.accepted.all():
         return new, gain.values
@@ -346,13 +346,13 @@ class _Search(NamedTuple):
         """Whether the next step is a full one."""
         return self.damping <= LEAST_DAMPING
 
-    def left(self, size: Array) -> Array:
+    def remaining(self, size: Array) -> Array:
         """How much is left to go after a full step of this size. Steps that shrink by a factor q
         each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
         Equations II, IV.8).
         """
-        told = self.undamped & np.isfinite(self.size) & (size < self.size)
-        return np.where(told, size**2 / np.where(told, self.size - size, 1.0), np.inf)
+        shrinking = self.undamped & np.isfinite(self.size) & (size < self.size)
+        return np.where(shrinking, size**2 / np.where(shrinking, self.size - size, 1.0), np.inf)
 
 
 class _Gain(NamedTuple):
@@ -385,10 +385,10 @@ def _try(
     size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small = (size < tolerance * unit) | (np.abs(promised) < COST_ROUNDING * cost)
-    last = search.left(size) < tolerance * unit
+    last = search.remaining(size) < tolerance * unit
     usable = [part.usable for part in normal.parts]
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
-    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    trial = problem.problem.retract(state, shared, np.concatenate(own, axis=1))
     if np.all(search.undamped & any_usable & (small | last)):
         # full steps as short as these keep what they promise: nothing is left to be tried
         every = np.ones(len(cost), dtype=bool)

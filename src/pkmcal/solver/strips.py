@@ -155,7 +155,7 @@ class Eliminated(NamedTuple):
     damped: Array
     q: Array
     rows: Array
-    left: Array
+    residual: Array
     normal: Array
     slope: Array
     along_strips: Array
@@ -281,19 +281,21 @@ class NormalPart(NamedTuple):
 
 def _part(rows: Compact, damping: Array) -> NormalPart:
     """A part's normal equations."""
-    found = eliminated(rows, damping)
-    taken_up = flat(found.along_strips).mT @ flat(found.fitted[..., None])
-    left = flat(rows.by_shared).mT @ flat(found.left[..., None])
-    gradient = found.slope + (left - taken_up)[..., 0]
+    eliminated_part = eliminated(rows, damping)
+    taken_up = flat(eliminated_part.along_strips).mT @ flat(eliminated_part.fitted[..., None])
+    residual = flat(rows.by_shared).mT @ flat(eliminated_part.residual[..., None])
+    gradient = eliminated_part.slope + (residual - taken_up)[..., 0]
     return NormalPart(
-        found.strips_normal + found.rows_normal + rows.shared_by.T @ rows.shared_by,
+        eliminated_part.strips_normal
+        + eliminated_part.rows_normal
+        + rows.shared_by.T @ rows.shared_by,
         gradient + rows.shared_value @ rows.shared_by,
         cost_of(rows.value, rows.shared_value, rows.usable),
         rows.usable,
-        found.along,
-        found.fitted,
-        found.inverse,
-        found.damped,
+        eliminated_part.along,
+        eliminated_part.fitted,
+        eliminated_part.inverse,
+        eliminated_part.damped,
     )
 
 

@@ -31,7 +31,6 @@ from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
 from pkmcal.identify.estimate import State
-from pkmcal.identify.found import ROUNDING_SIGMA
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
@@ -41,11 +40,12 @@ from pkmcal.identify.gauge import (
     in_gauge,
     transformation,
 )
+from pkmcal.identify.parameter_estimates import ROUNDING_SIGMA
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
-from pkmcal.measurements import OWN_SHADING, SHADING_ALIKE_ANGLE, SHADING_SIGMA
+from pkmcal.measurements import OWN_SHADING, SHADING_CORRELATION_ANGLE, SHADING_SIGMA
 from pkmcal.measurements.edges import EdgeData
 from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
@@ -114,12 +114,12 @@ class SimulatedCalibrations:
     @cached_property
     def gauge(self) -> Gauge:
         """Frames of the result, as a calibration chooses them."""
-        return default_gauge(self.design.seen_machine)
+        return default_gauge(self.design.machine_with_cylinders)
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """Names and units of the parameters that errors are told of, (P,)."""
-        table = self.design.seen_machine.parameters
+        table = self.design.machine_with_cylinders.parameters
         return tuple(zip(table.names, table.units, strict=True))
 
     def populations(self, runs: int) -> list[Population]:
@@ -136,10 +136,10 @@ class SimulatedCalibrations:
         )
         one = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
         problem = one.problem
-        data = replace(problem.data, joints=readings[:, one.seen])
+        data = replace(problem.data, joints=readings[:, one.observed])
         if len(capture.edges):
             data = _measured_edges(design, capture, one, theta, poses, internal, rng)
-            data = replace(data, joints=readings[:, one.seen])
+            data = replace(data, joints=readings[:, one.observed])
         pose_data = problem.pose_data
         if len(capture.views):
             pose_data = _measured_boards(design, capture, one, poses, rng)
@@ -157,44 +157,46 @@ class SimulatedCalibrations:
     def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
         """The joint estimate, told in the result's frames."""
         problem = data.assembled.problem
-        found = solve_batch(problem, data.start)
+        value = solve_batch(problem, data.start)
         n, own = batch.runs, problem.layout.own_motion.shape[1]
-        used = sum(counts(problem, found.weight))
-        k = int(data.assembled.seen.sum())
+        used = sum(counts(problem, value.weight))
+        k = int(data.assembled.observed.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(found.noise_scale, found.scale.poses)
-        good = np.array([stop is Stop.CONVERGED for stop in found.solution.stop])
-        told = [self._told(data, found, run) for run in range(n)]
+        scale = np.maximum(value.noise_scale, value.scale.poses)
+        good = np.array([stop is Stop.CONVERGED for stop in value.solution.stop])
+        parameters = [self._in_gauge(data, value, run) for run in range(n)]
         return {
             JOINT_ESTIMATE_KEY: Fitted(
-                np.array([theta for theta, _ in told]),
-                told={
-                    "chi2": found.solution.cost / dof,
+                np.array([theta for theta, _ in parameters]),
+                extra={
+                    "chi2": value.solution.cost / dof,
                     "scale": scale,
-                    "steps": found.solution.steps.astype(float),
+                    "steps": value.solution.steps.astype(float),
                     "failed": 1.0 - (good & (scale <= TOO_NOISY)),
                 },
-                covariance=np.array([covariance for _, covariance in told]),
+                covariance=np.array([covariance for _, covariance in parameters]),
             )
         }
 
-    def _told(self, data: SimulatedSessions, found: BatchResult, run: int) -> tuple[Array, Array]:
+    def _in_gauge(
+        self, data: SimulatedSessions, value: BatchResult, run: int
+    ) -> tuple[Array, Array]:
         """Parameters (P,) in the result's frames, and their covariance (P, P)."""
         machine, p = data.capture.machine, data.theta.shape[1]
         state = state_of(
-            data.assembled, take(found.solution.state, np.array([run])), _truth(data, run)
+            data.assembled, take(value.solution.state, np.array([run])), _truth(data, run)
         )
-        shared = found.covariance[run]
+        shared = value.covariance[run]
         full = machine_covariance(data.assembled.problem, machine, state, shared, self.gauge)
         theta = machine.parameters.unit_axes(in_gauge(machine, state, self.gauge).theta)
         return theta, full[:p, :p]
 
     def judge(
-        self, batch: Batch, data: SimulatedSessions, found: Mapping[Key, Fitted]
+        self, batch: Batch, data: SimulatedSessions, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of parameters and tool, and what is stated of them."""
-        machine, fit = data.capture.machine, found[JOINT_ESTIMATE_KEY]
+        machine, fit = data.capture.machine, fits[JOINT_ESTIMATE_KEY]
         by_board = "legs" not in self.design.observe
         joints = draw_configurations(
             machine, TOOL_ERROR_POSES, 0.0, batch.generator(TOOL_POSES_STREAM)
@@ -213,12 +215,12 @@ class SimulatedCalibrations:
         machine, true = data.capture.machine, _truth(data, run)
         theta = fit.theta[run]
         covariance = np.zeros((len(theta),) * 2) if fit.covariance is None else fit.covariance[run]
-        told = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
+        values = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
         sigma[_along_axes(machine)] = np.nan
         off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
-        return np.stack([theta - told, sigma]), np.stack(off)
+        return np.stack([theta - values, sigma]), np.stack(off)
 
 
 def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
@@ -235,7 +237,7 @@ def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
         "position_sigma": stated[1], "orientation_sigma": stated[0],
         "covered": covered(*parameters), "covered_tool": covered(*tool),
     }  # fmt: skip
-    return Sample(values | fit.told, {"parameters": parameters[1], "tool": tool[1]})
+    return Sample(values | fit.extra, {"parameters": parameters[1], "tool": tool[1]})
 
 
 def tool_error_and_sigma(
@@ -256,20 +258,20 @@ def tool_error_and_sigma(
     """
     n = len(theta)
     # the best fit is that of the truth on the result, not on the drawing
-    found = replace(machine, parameters=replace(machine.parameters, drawing=theta), values=theta)
-    over = changed_frames(machine.layout, true, *alignment(found, true, BestFit()))
+    value = replace(machine, parameters=replace(machine.parameters, drawing=theta), values=theta)
+    over = changed_frames(machine.layout, true, *alignment(value, true, BestFit()))
     there = replace(true, theta=theta)
-    keep = transformation(found, there, BestFit())[:n, :n]
+    keep = transformation(value, there, BestFit())[:n, :n]
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
     drawn = forward(machine.layout, machine.parameters.drawing, joints, home)
     one = forward(machine.layout, theta, joints, drawn.T_base_platform, drawn.internal)
     other = forward(machine.layout, over.theta, joints, one.T_base_platform, one.internal)
     good = one.converged & other.converged
     poses = one.T_base_platform[good]
-    by = pose_by_parameters(found, joints[good], poses) @ keep
-    by = without_frames(found, poses, by, every=every)
+    by = pose_by_parameters(value, joints[good], poses) @ keep
+    by = without_frames(value, poses, by, every=every)
     off = pose_difference(poses, other.T_base_platform[good])[..., None]
-    off = without_frames(found, poses, off, every=every)[..., 0]
+    off = without_frames(value, poses, off, every=every)[..., 0]
     variance = np.einsum("kip,pq,kiq->ki", by, covariance, by)
     out = np.full((2, len(joints), 6), np.nan)
     out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
@@ -322,20 +324,24 @@ def _machines(
     theta = np.empty((runs, len(table)))
     poses = np.empty((runs, *start.T_base_platform.shape))
     internal = np.empty((runs, *start.internal.shape))
-    left = np.arange(runs)
+    remaining = np.arange(runs)
     for _ in range(TIMES_MACHINES_REDRAWN):
-        step = tolerance * rng.standard_normal((len(left), len(tolerance)))
-        theta[left] = table.unit_axes(table.drawing + step @ free.T)
-        found = forward(
-            machine.layout, theta[left, None], capture.joints, start.T_base_platform, start.internal
+        step = tolerance * rng.standard_normal((len(remaining), len(tolerance)))
+        theta[remaining] = table.unit_axes(table.drawing + step @ free.T)
+        fk = forward(
+            machine.layout,
+            theta[remaining, None],
+            capture.joints,
+            start.T_base_platform,
+            start.internal,
         )
-        poses[left], internal[left] = found.T_base_platform, found.internal
-        left = left[~found.converged.all(axis=1)]
-        if not left.size:
+        poses[remaining], internal[remaining] = fk.T_base_platform, fk.internal
+        remaining = remaining[~fk.converged.all(axis=1)]
+        if not remaining.size:
             return theta, poses, internal
     raise ResultError(
         "machines within the drawing's tolerances cannot take the readings of the plan",
-        found=f"{left.size} of {runs} machines, drawn {TIMES_MACHINES_REDRAWN} times",
+        found=f"{remaining.size} of {runs} machines, drawn {TIMES_MACHINES_REDRAWN} times",
         next_step="Look at the tolerances and ranges in the mechanism file",
     )
 
@@ -416,7 +422,8 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
         out[:, own] = (
             out[:, own]
             @ np.linalg.cholesky(
-                np.exp(-angle / SHADING_ALIKE_ANGLE) + UNSHARED_SHADING_VARIANCE * np.eye(len(own))
+                np.exp(-angle / SHADING_CORRELATION_ANGLE)
+                + UNSHARED_SHADING_VARIANCE * np.eye(len(own))
             ).T
         )
     return out
@@ -443,7 +450,7 @@ def _measured_boards(
     covariance = np.linalg.inv(information)
     covariance = 0.5 * (covariance + covariance.mT)
     root = np.linalg.cholesky(covariance)
-    seen = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
+    in_view = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
 
     def placed(values: Array, empty: Array) -> Array:
         out = np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
@@ -451,7 +458,7 @@ def _measured_boards(
 
     return replace(
         one.problem.pose_data,
-        T_station_target=placed(seen, np.eye(4)),
+        T_station_target=placed(in_view, np.eye(4)),
         whiten=placed(np.linalg.inv(root), np.zeros((6, 6))),
     )
 
@@ -463,23 +470,23 @@ def _start(
     machine, problem = capture.machine, assembled.problem
     runs, u = len(readings), problem.unknowns
     reached = machine.forward_result(capture.joints, capture.T_base_platform)
-    found = forward(
+    fk = forward(
         machine.layout, machine.values, readings, reached.T_base_platform, reached.internal
     )
-    seen = assembled.seen
+    observed = assembled.observed
     mounts = np.zeros((runs, 0, 4, 4))
     if len(capture.views):
         station, row = capture.views.T
         target = assembled.places.poses
         measured = problem.pose_data.T_station_target[:, target.row, target.place]
-        each = inverse(T_camera_base[:, station] @ found.T_base_platform[:, row]) @ measured
+        each = inverse(T_camera_base[:, station] @ fk.T_base_platform[:, row]) @ measured
         mounts = np.stack([middle_pose(poses) for poses in each])[:, None]
     return BatchState(
         np.zeros((runs, u.n_free)),
         T_camera_base,
-        found.T_base_platform[:, seen],
+        fk.T_base_platform[:, observed],
         np.zeros((runs, u.n_cameras, u.n_optics)),
         mounts,
-        found.internal[:, seen],
+        fk.internal[:, observed],
         np.zeros((runs, u.n_lines)),
     )

@@ -26,7 +26,7 @@ from pkmcal.simulation.edges import visible_edges
 from pkmcal.simulation.placement import default_stations, draw_configurations, in_picture
 from pkmcal.simulation.truth import Settings
 
-LEAST_BOARD_SHARE_SHOWN = 0.5
+LEAST_BOARD_SHARE_IN_IMAGE = 0.5
 """Share of a board's corners that a photograph has to show."""
 LEAST_FACING = 0.2
 """Cosine of the angle between a board's normal and the line of sight below which it shows nothing:
@@ -70,7 +70,7 @@ class Design:
     extreme: float = field(default=Settings.extreme)
 
     @property
-    def seen_machine(self) -> Machine:
+    def machine_with_cylinders(self) -> Machine:
         """The drawing with a cylinder a rod where legs are observed and it gives them none."""
         return with_forearms(self.machine) if "legs" in self.observe else self.machine
 
@@ -125,7 +125,7 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
 
     Raises InputError where a station does not see enough.
     """
-    machine, cameras = design.seen_machine, design.camera_of_station
+    machine, cameras = design.machine_with_cylinders, design.camera_of_station
     by_board = "board" in design.observe
     T_camera_base = design.T_camera_base
     if T_camera_base is None:
@@ -140,23 +140,23 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
         machine, 2 * wanted + SPARE_CONFIGURATIONS_DRAWN, design.extreme, rng
     )
     board = T_platform_board = None
-    seen = np.ones((design.stations, len(joints)), dtype=bool)
+    visible = np.ones((design.stations, len(joints)), dtype=bool)
     if by_board:
         whole = with_forearms(machine)
         board = design.board or board_for(whole, "platform")
         T_platform_board = place_board(
             whole, board, "platform", cameras, T_camera_base, poses, whole.inverse(poses), rng
         )
-        shown = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        seen &= shown.mean(axis=-1) >= LEAST_BOARD_SHARE_SHOWN
+        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        visible &= display.mean(axis=-1) >= LEAST_BOARD_SHARE_IN_IMAGE
     if "legs" in design.observe:
-        seen &= np.stack(
+        visible &= np.stack(
             [
                 in_picture(machine, camera, T, poses, joints)
                 for camera, T in zip(cameras, T_camera_base, strict=True)
             ]
         )
-    rows, photographs = _chosen(seen, n, shared=design.shared)
+    rows, photographs = _chosen(visible, n, shared=design.shared)
     poses, joints = poses[rows], joints[rows]
     edges = EdgeSet.empty()
     if "legs" in design.observe:
@@ -164,21 +164,21 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
     views, corners = np.zeros((0, 2), dtype=int), np.zeros((0, 0), dtype=bool)
     if board is not None and T_platform_board is not None:
         views = photographs
-        shown = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        corners = shown[views[:, 0], views[:, 1]]
+        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        corners = display[views[:, 0], views[:, 1]]
     return Capture(
         machine, cameras, T_camera_base, poses, joints, edges, views, corners, board,
         T_platform_board,
     )  # fmt: skip
 
 
-def _chosen(seen: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integers]:
+def _chosen(visible: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integers]:
     """Candidates (K,) that are taken, and pairs (M, 2) of station and configuration.
 
-    seen : (S, candidates).
+    visible : (S, candidates).
     """
-    taken, rows, pairs = np.zeros(seen.shape[1], dtype=bool), list[Integers](), list[Integers]()
-    for number, good in enumerate([np.asarray(seen.all(axis=0))] if shared else list(seen)):
+    taken, rows, pairs = np.zeros(visible.shape[1], dtype=bool), list[Integers](), list[Integers]()
+    for number, good in enumerate([np.asarray(visible.all(axis=0))] if shared else list(visible)):
         own = np.flatnonzero(good & ~taken)[:n]
         if len(own) < n:
             raise InputError(
@@ -191,7 +191,7 @@ def _chosen(seen: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integers
         first = sum(map(len, rows))
         taken[own] = True
         rows.append(own)
-        for station in range(len(seen)) if shared else (number,):
+        for station in range(len(visible)) if shared else (number,):
             pairs.append(np.stack([np.full(n, station), first + np.arange(n)], axis=1))
     return np.concatenate(rows), np.concatenate(pairs)
 

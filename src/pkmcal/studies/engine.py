@@ -54,23 +54,23 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-def run(setting: S, runs: int, seed: int, told: StudyProgress | None = None) -> StudyResult[S]:
-    """The whole study of one setting. told : called with what is done and the share of it."""
-    return run_all([setting], runs, seed, told)[0]
+def run(setting: S, runs: int, seed: int, progress: StudyProgress | None = None) -> StudyResult[S]:
+    """The whole study of one setting. progress : called with what is done and the share of it."""
+    return run_all([setting], runs, seed, progress)[0]
 
 
 def run_all(
     settings: Sequence[S],
     runs: int,
     seed: int,
-    told: StudyProgress | None = None,
+    progress: StudyProgress | None = None,
     runner: Runner | None = None,
-    kept: Store | None = None,
+    store: Store | None = None,
     names: Sequence[str] = (),
 ) -> list[StudyResult[S]]:
     """Several settings with the same seeds: what they differ by is theirs, and not the draws'.
 
-    runner : all cores of this machine unless given. kept : batches that are finished already are
+    runner : all cores of this machine unless given. store : batches that are finished already are
     taken from there, and new ones put there at once. names : of the settings, for errors.
     Raises what a setting raises, with its name.
     """
@@ -84,24 +84,24 @@ def run_all(
     parts.sort(key=lambda part: (part[1], part[0]))
     done: dict[int, SolvedBatch] = {}
     for k, part in enumerate(parts):
-        found = kept.load(*part) if kept else None
-        if found is not None:
-            done[k] = found
-    left = [k for k in range(len(parts)) if k not in done]
-    if told and done:
-        told(settings[0].doing, len(done) / len(parts))
+        value = store.load(*part) if store else None
+        if value is not None:
+            done[k] = value
+    remainder = [k for k in range(len(parts)) if k not in done]
+    if progress and done:
+        progress(settings[0].doing, len(done) / len(parts))
 
     def finished(task: int, result: SolvedBatch) -> None:
-        k = left[task]
+        k = remainder[task]
         cell, number, _ = parts[k]
-        if kept:
-            kept.save(cell, number, result)
+        if store:
+            store.save(cell, number, result)
         done[k] = result
-        if told:
-            told(settings[cell].doing, len(done) / len(parts))
+        if progress:
+            progress(settings[cell].doing, len(done) / len(parts))
 
     jobs = [Job(settings[cell], batch, names[cell] if names else "")
-            for cell, _, batch in (parts[k] for k in left)]  # fmt: skip
+            for cell, _, batch in (parts[k] for k in remainder)]  # fmt: skip
     workers = (runner or on_cores)(jobs, finished) if jobs else 1
     wall = time.perf_counter() - began
     out: list[StudyResult[S]] = []

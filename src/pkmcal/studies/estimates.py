@@ -32,7 +32,7 @@ FREE_TOOL_FRAME_SIGMA = 1e3
 @dataclass(frozen=True)
 class Fitted:
     """An estimate of B runs. theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only ones.
-    told : what the method says of itself, (B,) or (B, n) by name, such as chi2 per degree of
+    extra : what the method says of itself, (B,) or (B, n) by name, such as chi2 per degree of
     freedom. sigma : the standard deviations that it states, by quantity. covariance : (B, P, P)
     that it states of theta, where it does.
     """
@@ -40,12 +40,12 @@ class Fitted:
     theta: Array
     T_camera_base: Array | None = None
     T_mount: Array | None = None
-    told: dict[str, Array] = field(default_factory=dict[str, Array])
+    extra: dict[str, Array] = field(default_factory=dict[str, Array])
     sigma: dict[str, Array] = field(default_factory=dict[str, Array])
     covariance: Array | None = None
 
 
-def drawing(machine: Machine, runs: int) -> Fitted:
+def nominal_estimate(machine: Machine, runs: int) -> Fitted:
     """The drawing's values as an estimate."""
     values = machine.parameters.drawing
     return Fitted(np.broadcast_to(values, (runs, len(values))))
@@ -56,13 +56,13 @@ def joint(problem: Problem, start: BatchState) -> BatchResult:
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
-def freedom(data: SimulatedRuns, layout: LimbLayout, known: int) -> int:
-    """Degrees of freedom of the joint problem. known : the rank of what all configurations share,
-    less what is known of it beforehand.
+def freedom(data: SimulatedRuns, layout: LimbLayout, reference_values: int) -> int:
+    """Degrees of freedom of the joint problem. reference_values : the rank of what all
+    configurations share, less what is known of it beforehand.
     """
     boards = 0 if data.view.T_platform_board is None else 6
     rows = 4 * data.axis.shape[2] + boards + layout.n_equations
-    return data.count * (rows - layout.own_motion.shape[1]) - known
+    return data.count * (rows - layout.own_motion.shape[1]) - reference_values
 
 
 def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generator) -> Array:
@@ -72,8 +72,8 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     s, vt, scale = scaled_directions(rows)
-    known = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
-    spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+    above_limit = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
+    spread = np.where(above_limit, 1 / np.where(above_limit, s, 1.0), 0.0)
     # the symmetric root, as singular vectors' signs are rounding's
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
     return (vt.mT @ draw)[..., 0] / scale
@@ -109,10 +109,10 @@ def tool_errors(
     Base and tool frames are those that fit best, since a calibration gives them too. turn, shift :
     rad and m that count alike in that.
     """
-    found = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
-    still = np.broadcast_to(np.eye(4), (len(found), 4, 4))
-    weight = np.ones(found.shape[:2])
-    problem = PairProblem(found, at.poses, weight, turn, shift, FREE_TOOL_FRAME_SIGMA)
+    fk = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
+    still = np.broadcast_to(np.eye(4), (len(fk), 4, 4))
+    weight = np.ones(fk.shape[:2])
+    problem = PairProblem(fk, at.poses, weight, turn, shift, FREE_TOOL_FRAME_SIGMA)
     pair: Pair = minimise(problem, Pair(still, still)).state
     off = problem.differences(pair) * np.repeat([turn, shift], 3)
     size = np.sqrt(np.mean(np.square(off).reshape(*off.shape[:2], 2, 3).sum(axis=-1), axis=1))

@@ -135,9 +135,10 @@ class SweepResult:
         """
         lines = [f"{self.subject.name}, {count(self.runs, 'calibration')} a combination"]
         for cell in self.found:
-            found, error, stated = (1e3 * value for value in (*cell.position, cell.position_sigma))
+            result, error, stated = (1e3 * value for value in (*cell.position, cell.position_sigma))
             lines.append(
-                f"  {in_words(cell.values) or 'as it is'}: tool {brief(found)} ± {brief(error)} mm,"
+                f"  {in_words(cell.values) or 'as it is'}: tool {brief(result)} ±"
+                f" {brief(error)} mm,"
                 f" stated {brief(stated)} mm, {number(100 * cell.covered.value, 1)} % of the 95 %"
                 f" intervals hold, {number(100 * cell.failed.value, 1)} % failed"
             )
@@ -158,8 +159,8 @@ class SweepResult:
         """Names of which two values or more have calibrations that can be used, the one with most
         gain first.
         """
-        found = (self._gain(name) for name in self.varied)
-        return sorted((gain for gain in found if gain), key=lambda g: -g.times)
+        item = (self._gain(name) for name in self.varied)
+        return sorted((gain for gain in item if gain), key=lambda g: -g.times)
 
     def _gain(self, name: str) -> Gain | None:
         """Of one name."""
@@ -214,7 +215,7 @@ def study(
     Returns
     -------
     SweepResult
-        ``found``, one entry a combination; ``summary()``.
+        ``value``, one entry a combination; ``summary()``.
 
     Raises
     ------
@@ -234,16 +235,16 @@ def study(
     varied = parsed(begun, vary)
     cells = cells_of(begun, varied)
     settings = [cell.setting for cell in cells]
-    told = " ".join([subject, *vary])
+    title = " ".join([subject, *vary])
     names = [in_words(cell.values) for cell in cells]
-    opened = nullcontext() if out is None else Store.opened(Path(out), told, settings, seed)
+    opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
     with opened as store:
         results = run_all(settings, runs, seed, progress, runner, store, names)
-    found = tuple(found_of(cell, result) for cell, result in zip(cells, results, strict=True))
-    return SweepResult(begun, varied, tuple(cells), tuple(results), found, runs, seed)
+    value = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
+    return SweepResult(begun, varied, tuple(cells), tuple(results), value, runs, seed)
 
 
-def found_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
+def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
     """One combination's runs summed up; NaN where all of them failed."""
     sample = result.samples[JOINT_ESTIMATE_KEY]
     values, sigma = sample.values, sample.sigma
@@ -308,8 +309,8 @@ def _by_chance(one: float, other: float, freedom: int, pairs: int) -> float:
     variance = one**2 + other**2
     if not variance > 0:  # NaN where a single run tells no scatter
         return 0.0 if variance == 0 else np.inf
-    told = freedom * variance**2 / (one**4 + other**4)
-    return float(stdtrit(told, 1 - 0.025 / pairs) * np.sqrt(variance))
+    dof = freedom * variance**2 / (one**4 + other**4)
+    return float(stdtrit(dof, 1 - 0.025 / pairs) * np.sqrt(variance))
 
 
 def _percentile(values: Array) -> float:

@@ -39,7 +39,7 @@ from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.studies.calibrations import CALIBRATED_QUANTITIES as CALIBRATED
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, judged
 from pkmcal.studies.engine import StudyResult
-from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
+from pkmcal.studies.estimates import Fitted, freedom, joint, nominal_estimate
 from pkmcal.studies.simulated import (
     Noise,
     SimulatedRuns,
@@ -122,7 +122,7 @@ class HexapodByAxes:
     """
 
     poses: int = 15
-    legs_seen: int = 4
+    legs_observed: int = 4
     noise: AxisNoise = field(default_factory=AxisNoise)
     joint_noise: float = 3e-6
     drawing_error: float = 0.002
@@ -180,7 +180,7 @@ class HexapodByAxes:
             ]
         )
         depth = apply(T_camera_base[:, None], machine.base_centers())[..., 2]
-        legs = np.sort(np.argsort(depth, axis=1)[:, : self.legs_seen], axis=1)
+        legs = np.sort(np.argsort(depth, axis=1)[:, : self.legs_observed], axis=1)
         station: Integers = np.repeat(np.arange(PAPER_A_STATIONS), self.poses)
         return Viewpoints(T_camera_base, station, legs[station])
 
@@ -193,7 +193,7 @@ class HexapodByAxes:
             method: solve_from_centres(machine, axes, a_camera, centres, form)
             for method, form in FOUR_STEP_FORMS.items()
         }
-        out = {(method,): Fitted(parameters_of(machine, found)) for method, found in steps.items()}
+        out = {(method,): Fitted(parameters_of(machine, fit)) for method, fit in steps.items()}
         start = Start(out[FOUR_STEPS_CORRECTED,].theta, steps[FOUR_STEPS_CORRECTED].T_camera_base)
         if self.start_error is not None:
             draws = batch.generator(START_ERROR_STREAM).uniform(
@@ -203,7 +203,7 @@ class HexapodByAxes:
         return {**out, (PAPER_A_JOINT,): joint_from_readings(data, start)}
 
     def judge(
-        self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
+        self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of every method, at the same poses; of the bound its standard deviations, and the
         end-effector's errors by draws from it.
@@ -214,15 +214,17 @@ class HexapodByAxes:
             return effector_errors(data, theta, batch.generator(END_EFFECTOR_STREAM))
 
         out: dict[Key, Sample] = {}
-        for key, fit in {(PAPER_A_DRAWING,): drawing(machine, batch.runs), **found}.items():
+        for key, fit in {(PAPER_A_DRAWING,): nominal_estimate(machine, batch.runs), **fits}.items():
             errors = (fit.theta - data.theta) @ rows.T
             out[key] = _sample(machine, errors, effector(fit.theta), fit)
         root = root_of_bound(machine, joint_problem(machine, data, ThreeCentres()), data)
         draws = batch.generator(PAPER_A_BOUND_STREAM).normal(
             size=(DRAWS_FROM_BOUND, batch.runs, root.shape[-1], 1)
         )
-        moved = np.mean([effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0)
-        out[PAPER_A_BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), moved)
+        shifted = np.mean(
+            [effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0
+        )
+        out[PAPER_A_BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), shifted)
         return out
 
 
@@ -233,7 +235,7 @@ def _sample(
     values = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
     values |= {"parameters": errors}
     values |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
-    return Sample(values | (fit.told if fit else {}), fit.sigma if fit else {})
+    return Sample(values | (fit.extra if fit else {}), fit.sigma if fit else {})
 
 
 @dataclass(frozen=True)
@@ -264,18 +266,18 @@ class JointByAxes(HexapodByAxes):
         return {JOINT_ESTIMATE_KEY: joint_from_readings(data, start)}
 
     def judge(
-        self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
+        self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of the thirty parameters, and of the platform at random poses of the workspace,
         in frames by three centres.
         """
-        fit, machine = found[JOINT_ESTIMATE_KEY], data.machine
+        fit, machine = fits[JOINT_ESTIMATE_KEY], data.machine
         errors = (fit.theta - data.theta) @ thirty(machine).rows.T
         parameters = np.stack([errors, fit.sigma["parameters"]])
         tool = _tool(machine, data.theta, fit, batch.generator(END_EFFECTOR_STREAM))
-        told = fit.told | {"failed": (fit.told["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
-        told["scale"] = np.ones(batch.runs)
-        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, told=told))}
+        values = fit.extra | {"failed": (fit.extra["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
+        values["scale"] = np.ones(batch.runs)
+        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, extra=values))}
 
 
 def converged(study: StudyResult[HexapodByAxes]) -> int:
@@ -356,11 +358,11 @@ def measured_axes(data: SimulatedRuns) -> Axes:
     u, point, _, _ = from_coordinates(data.axis)
     n_runs, n_photos, n_legs = data.joints.shape
     k = np.arange(n_photos)[:, None]
-    seen = np.zeros((n_photos, n_legs), dtype=bool)
-    seen[k, legs] = True
+    visible = np.zeros((n_photos, n_legs), dtype=bool)
+    visible[k, legs] = True
     full_u, full_point = np.zeros((2, n_runs, n_photos, n_legs, 3))
     full_u[:, k, legs], full_point[:, k, legs] = u, point
-    return Axes(station, np.arange(n_photos), seen, full_u, full_point, data.joints)
+    return Axes(station, np.arange(n_photos), visible, full_u, full_point, data.joints)
 
 
 class Start(NamedTuple):
@@ -391,21 +393,21 @@ def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
     poses = forward(machine.layout, start.theta[:, None], data.joints, home).T_base_platform
     z = machine.parameters.to_free(start.theta)
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
-    found = joint(problem, state)
-    theta, nz = problem.theta(found.solution.state), z.shape[1]
+    solution = joint(problem, state)
+    theta, nz = problem.theta(solution.solution.state), z.shape[1]
     dof = freedom(
-        data, machine.layout, known=nz - 12 + 6 * PAPER_A_STATIONS
+        data, machine.layout, reference_values=nz - 12 + 6 * PAPER_A_STATIONS
     )  # the gauge fixes twelve
     spread = in_frames(machine, problem, theta)
-    stated = spread @ found.info.covariance[:, :nz, :nz] @ spread.mT
+    stated = spread @ solution.info.covariance[:, :nz, :nz] @ spread.mT
     rows = thirty(machine).rows
     variance = np.einsum("ip,bpq,iq->bi", rows, stated, rows)
     return Fitted(
         theta,
-        told={
-            "chi2": found.solution.cost / dof,
+        extra={
+            "chi2": solution.solution.cost / dof,
             "dof": np.full(len(theta), dof),
-            "steps": found.solution.steps.astype(float),
+            "steps": solution.solution.steps.astype(float),
         },
         sigma={"parameters": np.sqrt(variance)},
         covariance=stated,
@@ -451,9 +453,9 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
     f = register(theta[:, platform], data.theta[:, platform])[:, None]
     b1 = data.theta[:, None, platform[0]]  # the frames hold A1 and B1 at the drawing's values
     columns: list[Array] = []
-    for moved in (T, e @ T @ inverse(f)):
-        columns.append(np.linalg.norm(apply(moved, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
-        turn = moved[..., :3, :3] @ T_true[..., :3, :3].mT
+    for shifted in (T, e @ T @ inverse(f)):
+        columns.append(np.linalg.norm(apply(shifted, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
+        turn = shifted[..., :3, :3] @ T_true[..., :3, :3].mT
         columns.append(np.linalg.norm(rotation_vector(turn), axis=-1).mean(axis=1))
     return np.stack(columns, axis=-1)
 

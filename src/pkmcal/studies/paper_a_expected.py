@@ -18,7 +18,7 @@ from pkmcal.studies.paper_a import (
     converged,
 )
 from pkmcal.studies.reproduction import (
-    MONTE_CARLO_ASIDE,
+    MONTE_CARLO_NOTE,
     Compared,
     at_most,
     compared,
@@ -115,13 +115,13 @@ def paper_a_checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
         Check(
             "joint estimate over its Cramér-Rao bound, all thirty parameters",
             number(over, 3),
-            f"≤ {BOUND_TOLERANCE:g}{MONTE_CARLO_ASIDE}",
+            f"≤ {BOUND_TOLERANCE:g}{MONTE_CARLO_NOTE}",
             over <= BOUND_TOLERANCE + 2 * spread,
         ),
         Check(
             "χ² per degree of freedom of the joint estimate, mean",
             number(chi2, 3),
-            f"1 ± {CHI2_TOLERANCE:g}{MONTE_CARLO_ASIDE}",
+            f"1 ± {CHI2_TOLERANCE:g}{MONTE_CARLO_NOTE}",
             abs(chi2 - 1) <= CHI2_TOLERANCE + 2 * scatter,
         ),
         prototype_check(

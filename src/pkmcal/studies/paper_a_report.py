@@ -50,8 +50,8 @@ from pkmcal.studies.paper_a_expected import (
 from pkmcal.studies.reproduction import (
     Column,
     Compared,
+    DisplayNumber,
     Options,
-    ShownNumber,
     Words,
     accuracy_rows,
     deg,
@@ -61,7 +61,7 @@ from pkmcal.studies.statistics import Summary, covered, mean, ratio_of_figures
 from pkmcal.wording import joined, number
 
 if TYPE_CHECKING:
-    from pkmcal.studies.paper_a_photographs import MeasuredNoise
+    from pkmcal.studies.paper_a_images import MeasuredNoise
 
 NARROW_DRAWING_ERROR = 0.002 / 3**0.5
 """Standard deviation (m) of drawing errors spread evenly within 2 mm, the other reading of "uniform
@@ -97,12 +97,12 @@ def reproduce(options: Options) -> Outcome:
     began = perf_counter()
     measured, done = None, 0.0
     if options.photographs:
-        from pkmcal.studies.paper_a_photographs import measured_noise
+        from pkmcal.studies.paper_a_images import measured_noise
 
         done = 0.6
         measured = measured_noise(options.seed, options.within(0.0, done))
     share = (1 - done) * (0.1 if options.long else 0.5)
-    found, narrow = (
+    value, narrow = (
         run(setting, options.runs, options.seed, options.within(begin, begin + share))
         for setting, begin in (
             (HexapodByAxes(), done),
@@ -113,35 +113,35 @@ def reproduce(options: Options) -> Outcome:
     by_poses: dict[int, HexapodByAxesStudy] = {}  # with other numbers of poses a station
     for poses in PROTOTYPE_POSES if options.long else ():
         upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
-        told = options.within(done, upto)
-        same = poses == found.setting.poses
-        setting = replace(found.setting, poses=poses)
-        by_poses[poses] = found if same else run(setting, options.runs, options.seed, told)
+        values = options.within(done, upto)
+        same = poses == value.setting.poses
+        setting = replace(value.setting, poses=poses)
+        by_poses[poses] = value if same else run(setting, options.runs, options.seed, values)
         done = upto
-    figures = paper_a_figures(found)
+    figures = paper_a_figures(value)
     elapsed = perf_counter() - began
-    words = _words(found, narrow, figures, measured, elapsed)
+    words = _words(value, narrow, figures, measured, elapsed)
     return words.reproduction(
         (
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
-            _figure_part(words, found),
-            words.part("effector", _effector_table(found), _readings_table(found, narrow)),
+            _figure_part(words, value),
+            words.part("effector", _effector_table(value), _readings_table(value, narrow)),
             words.part(
                 "groups",
                 Table(
                     "RMSE, mm",
                     ("", *(PAPER_A_QUANTITY_LABELS[g] for g in PAPER_A_PARAMETER_GROUPS)),
                     tuple(
-                        _by_method(found, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
+                        _by_method(value, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
                     ),
                 ),
             ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
-        checks=paper_a_checks(found),
+        checks=paper_a_checks(value),
         remarks=[name for name in PAPER_A_REMARKS if words.values.get(name, True)],
-        numbers={**_numbers(found, narrow, figures, by_poses, elapsed), **_noise(measured)},
+        numbers={**_numbers(value, narrow, figures, by_poses, elapsed), **_noise(measured)},
     )
 
 
@@ -159,17 +159,17 @@ def _name(method: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _told(figures: list[Compared]) -> str:
+def _figures_text(figures: list[Compared]) -> str:
     """Figures in words, by method: ``Joint estimate: base z 0.06 for 0.063``."""
-    said: list[str] = []
+    texts: list[str] = []
     for (method,) in dict.fromkeys(f.key for f in figures):
         items = [
-            f"{PAPER_A_QUANTITY_LABELS[f.quantity]} {f.found.value:.3g} for {f.expected:g}"
+            f"{PAPER_A_QUANTITY_LABELS[f.quantity]} {f.measured.value:.3g} for {f.expected:g}"
             for f in figures
             if f.key == (method,)
         ]
-        said.append(f"{PAPER_A_METHOD_LABELS[method]}, {joined(items)}")
-    text = "; ".join(said)
+        texts.append(f"{PAPER_A_METHOD_LABELS[method]}, {joined(items)}")
+    text = "; ".join(texts)
     return text[:1].upper() + text[1:]
 
 
@@ -200,8 +200,8 @@ def _words(
         s,
         elapsed=elapsed,
         after=(
-            ShownNumber(1e3 * PAPER_A_ERRORS_AFTER[0]),
-            ShownNumber(RADIAN_IN_DEGREES * PAPER_A_ERRORS_AFTER[1]),
+            DisplayNumber(1e3 * PAPER_A_ERRORS_AFTER[0]),
+            DisplayNumber(RADIAN_IN_DEGREES * PAPER_A_ERRORS_AFTER[1]),
         ),
         joint_over_bound=over(PAPER_A_JOINT, PAPER_A_BOUND),
         corrected_over_joint=over(FOUR_STEPS_CORRECTED, PAPER_A_JOINT),
@@ -214,8 +214,8 @@ def _words(
         / s.of(PAPER_A_DRAWING)["displacement"].value,
         agree=len(figures) - len(apart),
         compared=len(figures),
-        of_drawing=_told(of_drawing),
-        others=_told([f for f in apart if f not in of_drawing]),
+        of_drawing=_figures_text(of_drawing),
+        others=_figures_text([f for f in apart if f not in of_drawing]),
         inside=inside.value,
         inside_error=inside.error,
         edge=measured.edge if measured else 0.0,
@@ -316,7 +316,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
         "type": "rect", "layer": "below", "fillcolor": "--band", "line": {"width": 0},
         "xref": "paper", "x0": 0, "x1": 1, "y0": low, "y1": high,
     }  # fmt: skip
-    said = {
+    text = {
         "text": "grey band: the paper, 0.04 to 1 mm", "font": {"size": 11, "color": "--muted"},
         "xref": "paper", "x": 1.0, "xanchor": "right", "showarrow": False,
         "y": float(np.log10(high)), "yanchor": "bottom",
@@ -335,7 +335,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
                   "tickvals": ERROR_AXIS_TICKS, "title": {"text": "mean |error|, mm"}},
         "yaxis2": {**axis, "domain": [0.76, 1.0], "title": {"text": "true value, mm"}},
         "shapes": [band],
-        "annotations": [said],
+        "annotations": [text],
     }  # fmt: skip
     return {"data": data, "layout": layout}
 
@@ -395,19 +395,19 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
 def _poses_part(words: Words, studies: dict[int, HexapodByAxesStudy]) -> Part:
     """Accuracy by the number of poses a station."""
     poses = sorted(studies)
-    found = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
+    results = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
     least = [1e3 * studies[n].of(PAPER_A_BOUND)["displacement"].value for n in poses]
     rows = [
         Row(
             str(n),
-            (number(found[n].value, 4), number(found[n].error, 4), number(bound, 4),
+            (number(results[n].value, 4), number(results[n].error, 4), number(bound, 4),
              number(PROTOTYPE_POSES[n], 3)),
         )
         for n, bound in zip(poses, least, strict=True)
     ]  # fmt: skip
     heads = ("poses a station", "found", "± Monte-Carlo", "bound", "prototype")
     title = "Displacement of the end-effector, joint estimate, mm"
-    drawn = _falling(poses, [found[n] for n in poses], least)
+    drawn = _falling(poses, [results[n] for n in poses], least)
     return words.part(
         "poses",
         Table(title, heads, tuple(rows)),
@@ -415,16 +415,16 @@ def _poses_part(words: Words, studies: dict[int, HexapodByAxesStudy]) -> Part:
     )
 
 
-def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict[str, Any]:
+def _falling(poses: list[int], results: list[Summary], least: list[float]) -> dict[str, Any]:
     """End-effector (mm) by poses a station, on logarithmic axes."""
     as_root = [least[-1] * (poses[-1] / n) ** 0.5 for n in poses]
-    two_sigma = [2 * s.error for s in found]
+    two_sigma = [2 * s.error for s in results]
     data = [
         trace("Cramér-Rao bound", poses, least, "--ink", "lines",
                line={"color": "--ink", "dash": "dot", "width": 1.5}),
         trace("as N to the power of −½", poses, as_root, "--quiet", "lines",
                line={"color": "--quiet", "dash": "dash", "width": 1.5}),
-        trace("joint estimate", poses, [s.value for s in found], "--calibrated",
+        trace("joint estimate", poses, [s.value for s in results], "--calibrated",
                error_y={"array": two_sigma, "color": "--calibrated"}),
         trace("independent prototype", PROTOTYPE_POSES, PROTOTYPE_POSES.values(),
                "--drawing", "markers",
@@ -476,8 +476,8 @@ def _numbers(
             {
                 "method": f.key[0],
                 "quantity": f.quantity,
-                "found": f.found.value,
-                "error": f.found.error,
+                "found": f.measured.value,
+                "error": f.measured.error,
                 "expected": f.expected,
                 "rounding": f.rounding,
                 "differs": f.differs,
@@ -490,26 +490,26 @@ def _numbers(
 
 
 def _accuracy(s: HexapodByAxesStudy, method: str) -> dict[str, Any]:
-    found = {
+    results = {
         name: s.of(method)[name] for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     }
     return {
-        "found": {name: summary.value for name, summary in found.items()},
-        "standard_error": {name: summary.error for name, summary in found.items()},
+        "found": {name: summary.value for name, summary in results.items()},
+        "standard_error": {name: summary.error for name, summary in results.items()},
     }
 
 
 def _noise(measured: MeasuredNoise | None) -> dict[str, Any]:
     """[A] Table 1 of one image and, where it was measured, ours."""
 
-    def told(noise: AxisNoise) -> dict[str, float]:
+    def report(noise: AxisNoise) -> dict[str, float]:
         return dict(zip(("psi", "theta", "x", "z"), noise.sigma().tolist(), strict=True))
 
-    out: dict[str, Any] = {"table_1": told(TABLE_1)}
+    out: dict[str, Any] = {"table_1": report(TABLE_1)}
     if measured is not None:
         out["table_1_measured"] = {
-            "median": told(measured.middle),
-            "worst": told(measured.bound),
+            "median": report(measured.middle),
+            "worst": report(measured.bound),
             "edge_px": measured.edge,
         }
     return out

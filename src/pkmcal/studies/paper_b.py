@@ -39,7 +39,7 @@ POINTS_FITTED_AN_EDGE, POINT_NOISE = 100, 0.2
 PAPER_B_READING_NOISE = 3e-6
 """m, noise of a reading."""
 PAPER_B_BATCH_RUNS = 5
-ASKED_RUNS_A_CASE = 4
+RUNS_A_CASE = 4
 """One run of a case for so many that are asked for: there are twelve, and most end in a joint
 estimate."""
 MOST_CONTROLLED_RUNS = 20
@@ -113,7 +113,7 @@ class HexapodByLegs:
 
     def populations(self, runs: int) -> list[Population]:
         """Each camera with each case; and one machine that is controlled."""
-        each = max(2, runs // ASKED_RUNS_A_CASE)
+        each = max(2, runs // RUNS_A_CASE)
         out = [
             Population(f"{view}, {case}", each, PAPER_B_BATCH_RUNS)
             for view, case in product(PAPER_B_VIEW_NAMES, PAPER_B_CASES)
@@ -129,28 +129,28 @@ class HexapodByLegs:
         if batch.population == CONTROLLED_POPULATION:
             truth, view = controlled_machine(), views_by_name()[PERSPECTIVE_VIEW]
             case = PAPER_B_CASES["right"]
-            return [seen(truth, view, case, rng) for _ in range(batch.runs)]
+            return [measured_hexapod(truth, view, case, rng) for _ in range(batch.runs)]
         where, _, name = batch.population.partition(", ")
         view, case = views_by_name()[where], PAPER_B_CASES[name]
-        return [seen(drawn_machine(rng), view, case, rng) for _ in range(batch.runs)]
+        return [measured_hexapod(drawn_machine(rng), view, case, rng) for _ in range(batch.runs)]
 
     def solve(self, batch: Batch, data: list[MeasuredHexapod]) -> dict[Key, Fitted]:
         """Every method's base centres in the camera's frame, (B, L, 3)."""
         where, _, name = batch.population.partition(", ")
         methods = PAPER_B_CASES[name].methods if name else (ROBUST_REGRESSION,)
         rng = batch.generator(1)
-        found = [solved(one, methods, rng) for one in data]
+        results = [solved(one, methods, rng) for one in data]
         values = hexapod_with_cylinder_legs().parameters.drawing
         theta = np.broadcast_to(values, (batch.runs, len(values)))
         return {
             (where, name or CONTROLLED_POPULATION, method): Fitted(
-                theta, told={"centres": np.stack([f[method] for f in found])}
+                theta, extra={"centres": np.stack([f[method] for f in results])}
             )
             for method in methods
         }
 
     def judge(
-        self, batch: Batch, data: list[MeasuredHexapod], found: Mapping[Key, Fitted]
+        self, batch: Batch, data: list[MeasuredHexapod], fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """Errors of the base centres."""
         del batch
@@ -158,8 +158,8 @@ class HexapodByLegs:
         camera, drawing = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
-        for key, fit in found.items():
-            centres = fit.told["centres"]
+        for key, fit in fits.items():
+            centres = fit.extra["centres"]
             off = centres - truth
             T = register(np.broadcast_to(drawing, centres.shape), centres)
             laid = apply(T[:, None], drawing)
@@ -234,7 +234,9 @@ def views_by_name() -> dict[str, View]:
     }
 
 
-def seen(truth: Machine, view: View, case: Case, rng: np.random.Generator) -> MeasuredHexapod:
+def measured_hexapod(
+    truth: Machine, view: View, case: Case, rng: np.random.Generator
+) -> MeasuredHexapod:
     """What a camera sees of a machine at the limits of its workspace."""
     corners = np.array(list(product(*truth.joint_ranges)))
     readings = corners[rng.permutation(len(corners))[:PAPER_B_CONFIGURATIONS]]
@@ -267,8 +269,8 @@ def solved(
     out: dict[str, Array] = {}
     for method in PAPER_B_REGRESSIONS:
         if method in methods or method == ROBUST_REGRESSION:
-            found = linear.centres(one.machine, one.measurements, method, rng)
-            out[method] = found.centres[0]
+            value = linear.centres(one.machine, one.measurements, method, rng)
+            out[method] = value.centres[0]
     start = out[ROBUST_REGRESSION]
     if SCALED_BY_RATIO in methods:
         out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, drawing)
@@ -286,5 +288,5 @@ def jointly_estimated_centres(one: MeasuredHexapod, start: Array) -> Array:
     T = register(machine.base_centers(), start)
     poses = machine.forward_result(measured.joints).T_base_platform
     state = State(machine.values, T[None], poses, np.zeros(1))
-    found = bundle(machine, measured, state)
-    return apply(found.state.T_camera_base[0], found.machine.base_centers())
+    fit = bundle(machine, measured, state)
+    return apply(fit.state.T_camera_base[0], fit.machine.base_centers())

@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.control.image import Eye
-from pkmcal.control.seen import SeenMachine, seen_machine
+from pkmcal.control.machine_view import MachineView, machine_view
 from pkmcal.control.simulation import LoopSettings, ServoRuns, simulate_servo_runs
 from pkmcal.control.study import Belief, Trials, Uncertainty, estimates, outcome
 from pkmcal.geometry.rigid import apply, inverse, register
@@ -47,18 +47,18 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     """The same way with every estimate. centres : (R, L, 3) of [B] 14, camera frame, a run each."""
     machine, drawing = controlled_machine(), hexapod_with_cylinder_legs()
     view = views_by_name()[PERSPECTIVE_VIEW]
-    true = seen_machine(machine, view.T_camera_base)
+    true = machine_view(machine, view.T_camera_base)
     eye = Eye.of(true, view.camera)
     runs = len(centres)
     rng = np.random.default_rng(seed)
     exact = Uncertainty(np.zeros((len(machine.values),) * 2), np.zeros(3), np.zeros(3))
     beliefs: dict[str, Belief] = {}
     for name, (position, degrees) in CAMERA_BY_HAND_ERRORS.items():
-        found = estimates(
+        value = estimates(
             true, drawing.values, exact, runs, rng, position, float(np.radians(degrees))
         )
-        beliefs.setdefault("true", found[0])
-        beliefs[name] = replace(found[3], name=name)
+        beliefs.setdefault("true", value[0])
+        beliefs[name] = replace(value[3], name=name)
     T = np.broadcast_to(view.T_camera_base, (runs, 4, 4))
     values = np.tile(drawing.values, (runs, 1))
     values[:, centre_index(machine.layout)[0]] = apply(inverse(T)[:, None], centres)
@@ -73,7 +73,7 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     ran: dict[str, ServoRuns] = {
         # the same noise for all, so that differences are the estimates'
         name: simulate_servo_runs(
-            eye, belief.seen, start, goal, PAPER_B_LOOP_SETTINGS, np.random.default_rng(seed)
+            eye, belief.view, start, goal, PAPER_B_LOOP_SETTINGS, np.random.default_rng(seed)
         )
         for name, belief in beliefs.items()
     }
@@ -82,12 +82,12 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     }
     index = centre_index(machine.layout)[0]
     where = {
-        name: apply(b.seen.T_camera_base[..., None, :, :], b.seen.theta[..., index])
+        name: apply(b.view.T_camera_base[..., None, :, :], b.view.theta[..., index])
         for name, b in beliefs.items()
     }
     return ControlledHexapod(eye, trials, {name: np.array(c) for name, c in where.items()})
 
 
-def _belief(name: str, title: str, true: SeenMachine, values: Array, T: Array) -> Belief:
+def _belief(name: str, title: str, true: MachineView, values: Array, T: Array) -> Belief:
     return Belief(name, title, replace(true, machine=true.machine.with_values(values),
                                        T_camera_base=T))  # fmt: skip

@@ -18,7 +18,7 @@ from pkmcal.studies.paper_b import (
     HexapodByLegs,
 )
 from pkmcal.studies.paper_b_control import E1, E2, ControlledHexapod
-from pkmcal.studies.reproduction import MONTE_CARLO_ASIDE, Compared, compared, prototype_check
+from pkmcal.studies.reproduction import MONTE_CARLO_NOTE, Compared, compared, prototype_check
 from pkmcal.studies.statistics import Summary, ratio_of_figures
 from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
@@ -46,7 +46,7 @@ COLLAPSED_REGRESSION_ERROR = 0.05
 MOST_JOINT_OVER_LINEAR = {MIRROR_VIEW: 0.7, PERSPECTIVE_VIEW: 0.3}
 """Part of the linear error that the joint estimate may have, whatever is wrong with the edges: the
 readings tell lengths, which the camera before the machine sees worst."""
-ESTIMATES_ALIKE_FACTOR = 2.0
+SIMILAR_ESTIMATES_FACTOR = 2.0
 """Times by which E1 and E2 may differ and count as alike, beside the tenfold of E3."""
 
 
@@ -102,15 +102,15 @@ def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
     return (
         Check(
             "linear on right edges, mirror and camera",
-            _mm(*(found.value for found in right.values())),
+            _mm(*(value.value for value in right.values())),
             "below a millimetre",
-            max(found.value for found in right.values()) < 1e-3,
+            max(value.value for value in right.values()) < 1e-3,
         ),
         Check(
             "linear with 35 % of wrong edges, over that",
-            ", ".join(number(found.value, 2) for found in held),
-            f"≤ {MOST_ROBUST_ERROR_GROWTH}{MONTE_CARLO_ASIDE}",
-            all(found.value - 2 * found.error <= MOST_ROBUST_ERROR_GROWTH for found in held),
+            ", ".join(number(value.value, 2) for value in held),
+            f"≤ {MOST_ROBUST_ERROR_GROWTH}{MONTE_CARLO_NOTE}",
+            all(value.value - 2 * value.error <= MOST_ROBUST_ERROR_GROWTH for value in held),
         ),
         Check(
             "least squares and M-estimators with 5 % of wrong edges",
@@ -122,13 +122,13 @@ def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
             "linear, edges 0.1 px outside",
             _mm(*shifted.values(), places=1),
             "millimetres, no more than the paper's 12 and 8",
-            all(1e-3 < found < 1.1 * CAD_MEDIAN_ERROR[view] for view, found in shifted.items()),
+            all(1e-3 < value < 1.1 * CAD_MEDIAN_ERROR[view] for view, value in shifted.items()),
         ),
         Check(
             "joint over linear: right edges, then jointly 0.1 px outside, and a radius 1 % wrong",
-            ", ".join(number(found.value, 2) for found in joint.values()),
+            ", ".join(number(value.value, 2) for value in joint.values()),
             f"≤ {MOST_JOINT_OVER_LINEAR[MIRROR_VIEW]} by the mirror,"
-            f" ≤ {MOST_JOINT_OVER_LINEAR[PERSPECTIVE_VIEW]} by the camera{MONTE_CARLO_ASIDE}",
+            f" ≤ {MOST_JOINT_OVER_LINEAR[PERSPECTIVE_VIEW]} by the camera{MONTE_CARLO_NOTE}",
             all(
                 r.value - 2 * r.error <= MOST_JOINT_OVER_LINEAR[view]
                 for (view, _), r in joint.items()
@@ -166,8 +166,8 @@ def _controlled(ran: ControlledHexapod) -> tuple[Check, ...]:
             "beside the way: E1, E2, E3",
             _mm(far[E1], far[E2], far["hand"]),
             "E1 and E2 alike, E3 five times as far",
-            far[E2] < ESTIMATES_ALIKE_FACTOR * far[E1]
-            and far[E1] < ESTIMATES_ALIKE_FACTOR * far[E2]
+            far[E2] < SIMILAR_ESTIMATES_FACTOR * far[E1]
+            and far[E1] < SIMILAR_ESTIMATES_FACTOR * far[E2]
             and far["hand"] > 5 * max(far[E1], far[E2]),
         ),
     )

@@ -76,7 +76,7 @@ DRAWN_EDGE_PLACES = 9
 """Places along an edge that is drawn."""
 DRAWN_ERROR_ENLARGEMENT = 10.0
 """Times that errors are drawn enlarged."""
-RUNS_SHOWN = 0
+EXAMPLE_RUNS = 0
 """The run whose joints are drawn: the first, not the best."""
 CONTROL_CURVE_STYLES = {
     "true": ("True geometry", "--quiet", "dot"),
@@ -100,24 +100,24 @@ HexapodByLegsStudy = StudyResult[HexapodByLegs]
 def reproduce(options: Options) -> Outcome:
     """The whole reproduction."""
     began = perf_counter()
-    found = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
-    options.told("Control by the edges", 0.9)
+    study = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
+    options.progress("Control by the edges", 0.9)
     ran = controlled_by_estimates(
-        found.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION),
+        study.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION),
         options.seed,
     )
-    return paper_b_outcome(found, ran, perf_counter() - began)
+    return paper_b_outcome(study, ran, perf_counter() - began)
 
 
-def paper_b_outcome(found: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Outcome:
+def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Outcome:
     """The reproduction that a study and the controlled runs give. elapsed : s, of both."""
-    words = _words(found, ran, elapsed)
+    words = _words(study, ran, elapsed)
     return words.reproduction(
         (
-            words.part("accuracy", *_tables(found), plots={"shares": {"figure": _shares(found)}}),
-            words.part("figure-6", plots={"mirror": _picture(found, MIRROR_VIEW)}),
-            _geometry_part(words, found),
-            words.part("figure-8", plots={"camera": _picture(found, PERSPECTIVE_VIEW, ran)}),
+            words.part("accuracy", *_tables(study), plots={"shares": {"figure": _shares(study)}}),
+            words.part("figure-6", plots={"mirror": _picture(study, MIRROR_VIEW)}),
+            _geometry_part(words, study),
+            words.part("figure-8", plots={"camera": _picture(study, PERSPECTIVE_VIEW, ran)}),
             words.part(
                 "figure-9",
                 plots={
@@ -138,9 +138,9 @@ def paper_b_outcome(found: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: 
             ),
             words.part("how"),
         ),
-        checks=paper_b_checks(found, ran),
+        checks=paper_b_checks(study, ran),
         remarks=("accuracy", "scale", "overshoot", "alike"),
-        numbers=_numbers(found, ran, elapsed),
+        numbers=_numbers(study, ran, elapsed),
     )
 
 
@@ -148,15 +148,15 @@ def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Wor
     """All that is said, with the figures that it names."""
     true, estimated = _joints(s, MIRROR_VIEW)
     project = views_by_name()[MIRROR_VIEW].camera.project
-    seen = ran.eye.camera.project
-    by_hand = np.linalg.norm(seen(ran.centres["hand"]) - seen(ran.centres["true"]), axis=-1)
+    visible = ran.eye.camera.project
+    by_hand = np.linalg.norm(visible(ran.centres["hand"]) - visible(ran.centres["true"]), axis=-1)
     astray = {
         f"{name}_astray": 1e3 * float(np.median(trial.astray)) for name, trial in ran.trials.items()
     }
     start, goal = ran.eye.true.machine.forward(
         np.array([CONTROL_START_READINGS, CONTROL_GOAL_READINGS])
     )
-    way = pose_difference(goal, start)
+    sense = pose_difference(goal, start)
     return Words.of(
         "b",
         s,
@@ -168,8 +168,8 @@ def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Wor
         mirror_pixel=float(np.linalg.norm(project(estimated) - project(true), axis=-1).max()),
         mirror_off=1e3 * float(np.linalg.norm(estimated - true, axis=-1).max()),
         hand_pixel=float(np.median(by_hand)),
-        way=1e3 * float(np.linalg.norm(way[3:])),
-        way_tilt=float(np.degrees(np.linalg.norm(way[:3]))),
+        way=1e3 * float(np.linalg.norm(sense[3:])),
+        way_tilt=float(np.degrees(np.linalg.norm(sense[:3]))),
         **astray,
     )
 
@@ -227,7 +227,7 @@ def _control_table(ran: ControlledHexapod) -> Table:
 def _joints(s: HexapodByLegsStudy, view: str, case: str = "shifted") -> tuple[Array, Array]:
     """True and linearly estimated base joints (L, 3) of the run that is drawn, camera frame, m."""
     key = (view, case, ROBUST_REGRESSION)
-    return s.values("truth", *key)[RUNS_SHOWN], s.values("centres", *key)[RUNS_SHOWN]
+    return s.values("truth", *key)[EXAMPLE_RUNS], s.values("centres", *key)[EXAMPLE_RUNS]
 
 
 def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
@@ -268,8 +268,8 @@ def _picture(
     else:
         data.append(_marks("true joints", true, "--ink", "circle", 4))
         # of the machine that is controlled, laid where this run's is by its own true joints
-        off = camera.project(ran.centres["hand"][RUNS_SHOWN]) - camera.project(
-            ran.centres["true"][RUNS_SHOWN]
+        off = camera.project(ran.centres["hand"][EXAMPLE_RUNS]) - camera.project(
+            ran.centres["true"][EXAMPLE_RUNS]
         )
         data.append(_marks("by hand", true + off, "--calibrated", "x-thin", 11))
     data.append(_marks("estimated joints", estimated, "--drawing", "circle-open", 13))
@@ -290,11 +290,11 @@ def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
     """[B] Fig. 7."""
     drawing = hexapod_with_cylinder_legs().base_centers()
     sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
-    looks = (
+    passes = (
         (MIRROR_VIEW, "--calibrated", "circle-open"),
         (PERSPECTIVE_VIEW, "--drawing", "diamond-open"),
     )
-    for view, colour, symbol in looks:
+    for view, colour, symbol in passes:
         true, estimated = _joints(s, view)
         # the run's own machine is the drawing's here, so that its errors are the method's alone
         fitted = register(true, estimated)
@@ -345,8 +345,8 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
     for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         runs = ran.trials[name].runs
         share = np.median(runs.error / runs.error[:, :1], axis=0)
-        look = {"color": colour, "dash": dash, "width": 2}
-        data.append(trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines", line=look))
+        style = {"color": colour, "dash": dash, "width": 2}
+        data.append(trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines", line=style))
     layout = plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout}
@@ -361,15 +361,15 @@ def _beside(ran: ControlledHexapod) -> dict[str, Any]:
     for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         here = apply(ran.trials[name].runs.T_base_platform[:, :, None], points)
         off = np.sqrt(np.mean(np.sum((here - there) ** 2, axis=-1), axis=-1))
-        look = {"color": colour, "dash": dash, "width": 2}
+        style = {"color": colour, "dash": dash, "width": 2}
         off_mm = 1e3 * np.median(off, axis=0)
-        data.append(trace(title, ideal.time, off_mm, colour, "lines", line=look))
+        data.append(trace(title, ideal.time, off_mm, colour, "lines", line=style))
     return {"data": data, "layout": plane("time, s", "mm")}
 
 
 def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> dict[str, Any]:
-    look = {"color": colour, "size": size, "symbol": symbol, "line": {"color": colour, "width": 2}}
-    return trace(name, points[:, 0], points[:, 1], colour, "markers", marker=look)
+    style = {"color": colour, "size": size, "symbol": symbol, "line": {"color": colour, "width": 2}}
+    return trace(name, points[:, 0], points[:, 1], colour, "markers", marker=style)
 
 
 # ------------------------------------------------------------------ for programs
@@ -385,15 +385,15 @@ def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> d
         "accuracy": [
             {
                 **dict(zip(("view", "case", "method"), key, strict=True)),
-                **{q: _told(s.of(*key)[q].value) for q in ("centre", "depth", "cad", "pixel")},
-                "centre_error": _told(s.of(*key)["centre"].error),
+                **{q: _caption(s.of(*key)[q].value) for q in ("centre", "depth", "cad", "pixel")},
+                "centre_error": _caption(s.of(*key)["centre"].error),
                 "runs": len(s.values("centre", *key)),
                 "prototype": PAPER_B_PROTOTYPE.get(key, {}).get("centre"),
             }
             for key in s.samples
         ],
         "prototype": [
-            {"key": f.key, "found": f.found.value, "expected": f.expected, "held": f.held}
+            {"key": f.key, "found": f.measured.value, "expected": f.expected, "held": f.held}
             for f in paper_b_figures(s)
         ],
         "control": {
@@ -403,12 +403,12 @@ def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> d
                 "astray": float(np.median(t.astray)),
                 "overshoot": float(t.overshoot.max()),
                 "error_rise": float(t.rise.max()),
-                "settling": _told(float(np.nanmedian(t.settling))) if t.reached else None,
+                "settling": _caption(float(np.nanmedian(t.settling))) if t.reached else None,
             }
             for name, t in ran.trials.items()
         },
     }
 
 
-def _told(value: float) -> float | None:
+def _caption(value: float) -> float | None:
     return value if np.isfinite(value) else None

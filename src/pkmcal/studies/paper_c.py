@@ -24,10 +24,10 @@ from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import (
     Fitted,
-    drawing,
     drawn_from_bound,
     freedom,
     joint,
+    nominal_estimate,
     tool_errors,
     tool_places,
 )
@@ -164,7 +164,7 @@ class H4ByBoard:
         }
 
     def judge(
-        self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
+        self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
         """The tool's errors; where the truth is the paper's machine, its validation as well."""
         space, lines = batch.generator(COMPARED_POSES_STREAM), batch.generator(RULED_LINES_STREAM)
@@ -174,7 +174,7 @@ class H4ByBoard:
         )
         papers = batch.population == "design"
         out: dict[Key, Sample] = {}
-        for (kind, name, method), fit in found.items():
+        for (kind, name, method), fit in fits.items():
             machine = model(kind_of(name))
             one, other = (
                 tool_errors(machine.layout, fit.theta, at, self.turn, self.shift)
@@ -195,7 +195,7 @@ class H4ByBoard:
                 }
             if papers and name == "design":
                 values["table_2"] = table_2_of(machine, fit.theta)
-            out[kind, name, method] = Sample(values | fit.told)
+            out[kind, name, method] = Sample(values | fit.extra)
         return out | {("design", ROTATION_AXIS_METHOD): axis_of_rotation(data)} if papers else out
 
 
@@ -212,7 +212,7 @@ def _fits(
     begin = start(machine, data)
     out: dict[str, Fitted] = {}
     if PAPER_C_DRAWING in methods:
-        out[PAPER_C_DRAWING] = drawing(machine, len(data.theta))
+        out[PAPER_C_DRAWING] = nominal_estimate(machine, len(data.theta))
     for method, form in PRINTED_EQUATION_FORMS.items():
         if method in methods:
             out[method] = estimate_of_pose_fit(at_poses(machine, data, begin, form, whitened=False))
@@ -228,16 +228,16 @@ def _fits(
 def start(machine: Machine, data: SimulatedRuns) -> State:
     """Where every method begins: the drawing, camera and board by the closed form; B runs."""
     n, values = data.count, machine.parameters.drawing
-    found = forward(machine.layout, values, data.joints[:, :n], machine.home())
-    pair = solve_pairs(found.T_base_platform, data.T_camera_board[:, :n], size_of(machine))
+    fk = forward(machine.layout, values, data.joints[:, :n], machine.home())
+    pair = solve_pairs(fk.T_base_platform, data.T_camera_board[:, :n], size_of(machine))
     return State(
         values,
         pair.T_camera_base[:, None],
-        found.T_base_platform,
+        fk.T_base_platform,
         np.zeros(1),
         T_mount=pair.T_mount[:, None],
         on_platform=np.ones(1, dtype=bool),
-        internal=found.internal,
+        internal=fk.internal,
     )
 
 
@@ -246,9 +246,9 @@ def at_poses(
     whitened: bool, use_drawing: bool = False,
 ) -> PoseFit:  # fmt: skip
     """[C] eq. 3 or 5, as printed or whitened. begin : of :func:`start`."""
-    n, seen = data.count, data.T_camera_board
+    n, in_view = data.count, data.T_camera_board
     problem, state = pose_problem(
-        machine, measurements(data), seen[:, :n], data.joints[:, :n], begin, form
+        machine, measurements(data), in_view[:, :n], data.joints[:, :n], begin, form
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
     return fit_machine_to_poses(
@@ -260,14 +260,14 @@ def estimate_of_pose_fit(fit: PoseFit, *, whitened: bool = False) -> Fitted:
     """A fit at measured poses as an estimate, with its rank and how many unknowns it estimates."""
     problem, state = fit.problem, fit.solution.state
     runs, n = problem.readings.shape[:2]
-    told = {
+    extra = {
         "rank": np.full(runs, fit.rank),
         "estimated": np.full(runs, int(problem.keep.sum())),
     }
     if whitened:
         rows = problem.weigh.shape[-1] - problem.layout.n_internal
-        told["chi2"] = fit.solution.cost / (n * rows + len(problem.prior) - fit.rank)
-    return Fitted(problem.theta(state), state.T_camera_base[:, 0], state.T_mount[:, 0], told)
+        extra["chi2"] = fit.solution.cost / (n * rows + len(problem.prior) - fit.rank)
+    return Fitted(problem.theta(state), state.T_camera_base[:, 0], state.T_mount[:, 0], extra)
 
 
 def joint_from_pose_fit(
@@ -281,9 +281,9 @@ def joint_from_pose_fit(
         state.z, state.T_camera_base, poses, np.zeros((len(poses), 1, 1)), state.T_mount,
         state.internal,
     )  # fmt: skip
-    found = joint(problem, first)
-    end, known = found.solution.state, begin.rank - len(begin.problem.prior)
-    chi2 = found.solution.cost / freedom(data, machine.layout, known)
+    solution = joint(problem, first)
+    end, reference = solution.solution.state, begin.rank - len(begin.problem.prior)
+    chi2 = solution.solution.cost / freedom(data, machine.layout, reference)
     return Fitted(
         problem.theta(end), end.T_camera_base[:, 0], end.T_mount[:, 0], {"chi2": chi2}
     )  # fmt: skip
@@ -310,17 +310,17 @@ def axis_of_rotation(data: SimulatedRuns) -> Sample:
     """[C] IV.B of every run: spread of the axis over pairs of poses, found and by noise alone, and
     of single poses, rad; chi2 per degree of freedom of one axis.
     """
-    found = [
+    results = [
         rotation_axis(measurements(data, run).poses, "schoenflies")
         for run in range(len(data.theta))
     ]
     return Sample(
         {
-            "spread": np.array([f.spread for f in found]),
-            "expected": np.array([f.expected_spread for f in found]),
-            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in found]),
-            "chi2": np.array([f.chi2 / f.dof for f in found]),
-            "dof": np.array([f.dof for f in found]),
+            "spread": np.array([f.spread for f in results]),
+            "expected": np.array([f.expected_spread for f in results]),
+            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in results]),
+            "chi2": np.array([f.chi2 / f.dof for f in results]),
+            "dof": np.array([f.dof for f in results]),
         }
     )
 

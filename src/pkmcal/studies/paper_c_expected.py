@@ -128,10 +128,10 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
     old = largest_side(study, ("design", PAPER_C_DRAWING))
     new = largest_side(study, ("design", EQ3_AS_PRINTED))
     every = ranks(study)
-    found = {key: every[key] for key in PAPER_C_RANKS}
-    told_ranks, wanted = (
+    results = {key: every[key] for key in PAPER_C_RANKS}
+    expected_ranks, wanted = (
         ", ".join(f"{rank} ({count})" for rank, count in values.values())
-        for values in (found, PAPER_C_RANKS)
+        for values in (results, PAPER_C_RANKS)
     )
     axis = study.of("design", ROTATION_AXIS_METHOD)["chi2"].value
     dof = study.values("dof", "design", ROTATION_AXIS_METHOD)
@@ -165,9 +165,9 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
         ),
         Check(
             "ranks, Models 12 and 31 (unknowns estimated)",
-            told_ranks,
+            expected_ranks,
             wanted,
-            found == PAPER_C_RANKS,
+            results == PAPER_C_RANKS,
         ),
         Check(
             "χ² per degree of freedom of one axis of rotation, mean",

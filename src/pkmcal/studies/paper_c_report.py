@@ -59,21 +59,21 @@ H4ByBoardStudy = StudyResult[H4ByBoard]
 
 def reproduce(options: Options) -> Outcome:
     """The whole reproduction."""
-    return paper_c_outcome(run(H4ByBoard(), options.runs, options.seed, options.told))
+    return paper_c_outcome(run(H4ByBoard(), options.runs, options.seed, options.progress))
 
 
-def paper_c_outcome(found: H4ByBoardStudy) -> Outcome:
+def paper_c_outcome(study: H4ByBoardStudy) -> Outcome:
     """The reproduction that a study gives."""
     start = before()
-    words = _words(found, start)
+    words = _words(study, start)
     return words.reproduction(
         (
             words.part(
                 "accuracy",
-                *_accuracy_tables(found),
-                plots={"tool": {"figure": _accuracy_plot(found), "height": 520}},
+                *_accuracy_tables(study),
+                plots={"tool": {"figure": _accuracy_plot(study), "height": 520}},
             ),
-            words.part("table-2", *_tables_2(found)),
+            words.part("table-2", *_tables_2(study)),
             words.part(
                 "before",
                 Table(
@@ -93,16 +93,16 @@ def paper_c_outcome(found: H4ByBoardStudy) -> Outcome:
                 ),
             ),
             words.part(
-                "table-3", _table_3(found), plots={"motors": {"figure": _residual_plot(found)}}
+                "table-3", _table_3(study), plots={"motors": {"figure": _residual_plot(study)}}
             ),
-            words.part("table-4", _table_4(found), _square_table(found)),
-            words.part("axis", _axis_table(found)),
-            words.part("ranks", _ranks_table(found)),
+            words.part("table-4", _table_4(study), _square_table(study)),
+            words.part("axis", _axis_table(study)),
+            words.part("ranks", _ranks_table(study)),
             words.part("how"),
         ),
-        checks=paper_c_checks(found, start),
+        checks=paper_c_checks(study, start),
         remarks=[name for name in PAPER_C_REMARKS if words.values.get(name, True)],
-        numbers=_numbers(found, start),
+        numbers=_numbers(study, start),
     )
 
 
@@ -122,7 +122,9 @@ def _words(s: H4ByBoardStudy, start: Before) -> Words:
         * rms_over_runs(
             s.values("straightness", "design", "calibration", EQ5_AS_PRINTED)[:, :2]
         ).value,
-        apart="; ".join(f"{f.name} {f.found.value:.3g} for {f.expected:g} {f.unit}" for f in apart),
+        apart="; ".join(
+            f"{f.name} {f.measured.value:.3g} for {f.expected:g} {f.unit}" for f in apart
+        ),
         larger=LARGER_WORKSPACE_FACTOR,
         noise_mm=1e3 * setting.shift,
         noise_deg=float(np.degrees(setting.turn)),
@@ -170,12 +172,12 @@ def _tables_2(s: H4ByBoardStudy) -> tuple[Table, Table]:
         for name, method in (("equation 3", EQ3_AS_PRINTED), ("joint estimate", PAPER_C_JOINT))
     )
 
-    def rows(of: slice, places: int, *found: tuple[str, Array]) -> tuple[Row, ...]:
+    def rows(of: slice, places: int, *value: tuple[str, Array]) -> tuple[Row, ...]:
         def cells(values: Array) -> tuple[str, ...]:
             return tuple(number(float(v), places) for v in values[of])
 
         out = [Row(f"The paper, {name}", cells(values), "paper") for name, values in printed]
-        for name, values in found:
+        for name, values in value:
             out.append(Row(f"Found, {name}", cells(values.mean(axis=0))))
             out.append(Row("  its scatter", cells(values.std(axis=0)), "prototype"))
         return tuple(out)
@@ -192,8 +194,8 @@ def _control_mean(s: H4ByBoardStudy, model_and_method: tuple[str, str]) -> Array
     """Means (4,) of the motors' residuals; after a calibration they have no sign of their own, so
     their root mean square over the runs.
     """
-    found = s.values("control_mean", "design", *model_and_method)
-    return found.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(found)
+    value = s.values("control_mean", "design", *model_and_method)
+    return value.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(value)
 
 
 def _table_3(s: H4ByBoardStudy) -> Table:
@@ -205,9 +207,9 @@ def _table_3(s: H4ByBoardStudy) -> Table:
     rows: list[Row] = []
     for label, which, key in VALIDATION_TABLE_ROWS:
         ours = (_control_mean(s, which), each_rms(s.values("control_rms", "design", *which)))
-        for what, paper, found in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
+        for what, paper, item in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
             rows.append(Row(f"{label}, {what}: the paper", two_digits(paper), "paper"))
-            rows.append(Row("  found", two_digits(found)))
+            rows.append(Row("  found", two_digits(item)))
     heads = ("", "q₁", "q₂", "q₃", "q₄")
     return Table("Table 3: residuals of the motors, mrad", heads, tuple(rows))
 
@@ -222,9 +224,9 @@ def _table_4(s: H4ByBoardStudy) -> Table:
         if key:
             one, two = TABLE_4[key]
             rows.append(Row(f"{label}: the paper", (mm(one, 2), mm(two, 2), "", ""), "paper"))
-        found = each_rms(s.values("straightness", "design", *which))
+        value = each_rms(s.values("straightness", "design", *which))
         name = "  found" if key else f"  found, {label}"
-        rows.append(Row(name, tuple(mm(float(v)) for v in found)))
+        rows.append(Row(name, tuple(mm(float(v)) for v in value)))
     return Table(
         "Table 4: straightness, mm",
         ("", "200 mm, x", "200 mm, y", "400 mm, x", "400 mm, y"),
@@ -249,8 +251,8 @@ def _axis_table(s: H4ByBoardStudy) -> Table:
     """[C] IV.B: the axis of rotation and its spread."""
     a = s.samples["design", ROTATION_AXIS_METHOD].values
 
-    def row(name: str, found: float, noise: float) -> Row:
-        return Row(name, (deg(found, 3), deg(noise, 3)))
+    def row(name: str, value: float, noise: float) -> Row:
+        return Row(name, (deg(value, 3), deg(noise, 3)))
 
     rows = (
         Row("The paper, standard deviation", (deg(ROTATION_AXIS_SPREAD, 2), ""), "paper"),
@@ -295,9 +297,9 @@ def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
             labels.append(f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}")
             places.append(place)
             errors[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
-            known = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
-            if known:
-                printed[place] = float(known)
+            reference_values = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+            if reference_values:
+                printed[place] = float(reference_values)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
         lying = bars(
             TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour
@@ -391,13 +393,13 @@ def _numbers(s: H4ByBoardStudy, start: Before) -> dict[str, Any]:
 
 def _accuracy(s: H4ByBoardStudy, *key: str) -> dict[str, Any]:
     """One method's figures, with the prototype's, mm and mrad, where it has any."""
-    found = s.of(*key)
-    chi2, printed = found["chi2"].value, PAPER_C_PROTOTYPE.get(key)
+    value = s.of(*key)
+    chi2, printed = value["chi2"].value, PAPER_C_PROTOTYPE.get(key)
     figures = [printed.get(name) for name in ("larger_shift", "larger_turn")] if printed else None
     return {
         **dict(zip(("truth", "model", "method"), key, strict=True)),
-        **{name: found[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")},
-        **{f"{name}_error": found[name].error for name in ("larger_shift", "larger_turn")},
+        **{name: value[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")},
+        **{f"{name}_error": value[name].error for name in ("larger_shift", "larger_turn")},
         "chi2": None if np.isnan(chi2) else chi2,
         "runs": len(s.values("shift", *key)),
         "prototype": figures and [v and float(v) for v in figures],

@@ -44,8 +44,8 @@ def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Arr
     n = data.count
     poses = data.T_base_platform[:, n:]
     if fit.T_camera_base is not None and fit.T_mount is not None:
-        seen = data.T_camera_board[:, n:]
-        poses = inverted(fit.T_camera_base)[:, None] @ seen @ inverted(fit.T_mount)[:, None]
+        in_view = data.T_camera_board[:, n:]
+        poses = inverted(fit.T_camera_base)[:, None] @ in_view @ inverted(fit.T_mount)[:, None]
         poses = taken(machine.layout.motion, poses).pose
     return readings_at_poses(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
 
@@ -62,9 +62,9 @@ def before() -> Before:
     machine = model("design")
     poses = workspace(ERROR_BEFORE_POSES, np.random.default_rng(0))
     readings = readings_at_poses(machine.layout, table_2_values(machine, IDENTIFIED_TABLE_2), poses)
-    found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
-    shift = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
-    turn = rotation_vector(found[:, :3, :3] @ poses[:, :3, :3].mT)
+    fk = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
+    shift = np.linalg.norm(fk[:, :3, 3] - poses[:, :3, 3], axis=1)
+    turn = rotation_vector(fk[:, :3, :3] @ poses[:, :3, :3].mT)
     return Before(float(shift.mean()), float(np.linalg.norm(turn, axis=1).mean()))
 
 
@@ -77,8 +77,10 @@ def straightness_along_rulers(
     from the readings by the machine (B, P).
     """
     out: list[Array] = []
-    for way in [length * rule for length in RULED_LINE_LENGTHS for rule in RULED_LINE_DIRECTIONS]:
-        along = np.linspace(-0.5, 0.5, RULED_LINE_POINTS)[:, None] * way
+    for direction in [
+        length * rule for length in RULED_LINE_LENGTHS for rule in RULED_LINE_DIRECTIONS
+    ]:
+        along = np.linspace(-0.5, 0.5, RULED_LINE_POINTS)[:, None] * direction
         poses = schoenflies(
             np.concatenate(
                 [MEASURED_VOLUME_MIDDLE + along, np.zeros((RULED_LINE_POINTS, 1))], axis=1
@@ -86,8 +88,8 @@ def straightness_along_rulers(
         )
         readings = readings_at_poses(data.machine.layout, data.theta[:, None], poses)
         readings = readings + data.noise.reading * rng.normal(size=readings.shape)
-        found = forward(machine.layout, theta[..., None, :], readings, poses).T_base_platform
-        points = found[..., :3, 3]
+        fk = forward(machine.layout, theta[..., None, :], readings, poses).T_base_platform
+        points = fk[..., :3, 3]
         s = np.linalg.svd(points - points.mean(axis=-2, keepdims=True), compute_uv=False)
         out.append(np.sqrt(np.sum(s[..., 1:] ** 2, axis=-1) / RULED_LINE_POINTS))
     return np.stack(out, axis=-1)

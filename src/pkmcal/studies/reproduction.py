@@ -25,13 +25,13 @@ from pkmcal.wording import brief, count, number
 REPRODUCED_PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """A prototype's figures as it prints them, by what was estimated how and by quantity."""
-MONTE_CARLO_ASIDE = ", its Monte-Carlo error aside"
+MONTE_CARLO_NOTE = ", its Monte-Carlo error aside"
 
 
 @dataclass(frozen=True)
 class Options:
     """What a person may choose. runs : of the Monte-Carlo simulation. long : also what takes
-    minutes. photographs : also what is measured on rendered photographs. told : called with
+    minutes. photographs : also what is measured on rendered photographs. progress : called with
     the step in words and the share done.
     """
 
@@ -39,24 +39,24 @@ class Options:
     seed: int = 0
     long: bool = False
     photographs: bool = False
-    told: StudyProgress = lambda _text, _share: None
+    progress: StudyProgress = lambda _text, _share: None
 
     def within(self, first: float, last: float) -> StudyProgress:
         """The same telling, of a part of the work."""
-        return lambda text, share: self.told(text, first + (last - first) * share)
+        return lambda text, share: self.progress(text, first + (last - first) * share)
 
 
 def reproduce_paper(paper: str, options: Options) -> Outcome:
     """One paper's figures beside ours. paper : its letter, small."""
-    found: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
-    if found.verdict.usable or options.runs >= Options.runs:
-        return found
+    outcome: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
+    if outcome.verdict.usable or options.runs >= Options.runs:
+        return outcome
     few = note("study.few_runs", runs=options.runs, usual=Options.runs)
-    verdict = replace(found.verdict, findings=(*found.verdict.findings, few))
-    return replace(found, verdict=verdict)
+    verdict = replace(outcome.verdict, findings=(*outcome.verdict.findings, few))
+    return replace(outcome, verdict=verdict)
 
 
-class ShownNumber(float):
+class DisplayNumber(float):
     """A number in a text: ``{:3}`` with three decimals, ``{:~}`` with two digits."""
 
     def __format__(self, spec: str) -> str:
@@ -80,15 +80,19 @@ class Words:
         values : what else the texts name.
         """
         units = study.setting.quantities
-        shown = {
+        display = {
             ", ".join(key): {
                 name: summary.times(units[name].factor) for name, summary in accuracy.items()
             }
             for key, accuracy in study.accuracy.items()
         }
-        known: dict[str, Any] = {
-            "found": {m: {q: ShownNumber(s.value) for q, s in a.items()} for m, a in shown.items()},
-            "error": {m: {q: ShownNumber(s.error) for q, s in a.items()} for m, a in shown.items()},
+        numbers: dict[str, Any] = {
+            "found": {
+                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in display.items()
+            },
+            "error": {
+                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in display.items()
+            },
             "setting": study.setting,
             "runs": study.runs,
             "seed": study.seed,
@@ -96,9 +100,9 @@ class Words:
         }
         times = {"wall": study.wall, "solving": study.solving, "cpu": study.cpu}
         for name, value in {**times, **values}.items():
-            known[name] = ShownNumber(value) if isinstance(value, float) else value
+            numbers[name] = DisplayNumber(value) if isinstance(value, float) else value
         document = read_yaml(Path(__file__).with_name(f"paper_{letter}.yaml")).data
-        return cls(letter, document, known)
+        return cls(letter, document, numbers)
 
     def say(self, text: str) -> str:
         """A text with its figures put in."""
@@ -140,8 +144,8 @@ class Words:
                 f"Not reproduced: this run misses {len(failed)} of the"
                 f" {count(len(checks), 'expectation')} that it is held against."
             )
-        said = {name: self.say(self.document["remarks"][name]) for name in remarks}
-        open_ = [said[name] for name in self.document["not_reproduced"] if name in said]
+        words = {name: self.say(self.document["remarks"][name]) for name in remarks}
+        open_ = [words[name] for name in self.document["not_reproduced"] if name in words]
         return Outcome(
             command="reproduce",
             title=self.document["title"],
@@ -166,7 +170,7 @@ class Words:
                     name,
                     text=text,
                 )
-                for name, text in said.items()
+                for name, text in words.items()
             ),
             document={
                 "paper": self.letter,
@@ -174,7 +178,7 @@ class Words:
                 "passed": passed,
                 "headline": headline,
                 "checks": [vars(check) for check in checks],
-                "remarks": list(said.values()),
+                "remarks": list(words.values()),
                 "not_reproduced": open_,
                 **numbers,
             },
@@ -202,19 +206,19 @@ def accuracy_rows(
     what an independent prototype ``printed``.
     """
     setting: StudySetting = study.setting
-    found = [
+    results = [
         (column, study.accuracy[key][column.quantity].times(quantity.factor))
         for column in columns
         for quantity in [setting.quantities[column.quantity]]
     ]
-    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in found)
+    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in results)
     rows = [Row(name, tuple(cells))]
     if errors:
-        cells = (number(s.error, c.error_places) for c, s in found)
+        cells = (number(s.error, c.error_places) for c, s in results)
         rows.append(Row("  ± Monte-Carlo error", tuple(cells), "prototype"))
-    known = tuple((printed or {}).get(c.quantity, "") for c in columns)
-    if any(known):
-        rows.append(Row("  independent prototype", known, "prototype"))
+    reference_values = tuple((printed or {}).get(c.quantity, "") for c in columns)
+    if any(reference_values):
+        rows.append(Row("  independent prototype", reference_values, "prototype"))
     return rows
 
 
@@ -228,7 +232,7 @@ class Compared(NamedTuple):
 
     key: Key
     quantity: str
-    found: Summary
+    measured: Summary
     expected: float
     rounding: float
     tolerance: float
@@ -239,13 +243,16 @@ class Compared(NamedTuple):
     @property
     def differs(self) -> bool:
         """By more than two standard errors of the difference of two such simulations."""
-        return abs(self.found.value - self.expected) > 2 * 2**0.5 * self.found.error + self.rounding
+        return (
+            abs(self.measured.value - self.expected)
+            > 2 * 2**0.5 * self.measured.error + self.rounding
+        )
 
     @property
     def tolerable(self) -> bool:
         """Whether the difference is one of the setting, Monte-Carlo error aside."""
-        allowed = self.tolerance * self.expected + 2 * self.found.error
-        return abs(self.found.value - self.expected) <= allowed
+        allowed = self.tolerance * self.expected + 2 * self.measured.error
+        return abs(self.measured.value - self.expected) <= allowed
 
 
 def compared(
@@ -259,15 +266,15 @@ def compared(
     out: list[Compared] = []
     for key, figures in prototype.items():
         for quantity, printed in figures.items():
-            shown = study.setting.quantities[quantity]
-            found = study.of(*key)[quantity].times(shown.factor)
+            display = study.setting.quantities[quantity]
+            count = study.of(*key)[quantity].times(display.factor)
             rounding = 0.5 * 10.0 ** -len(printed.partition(".")[2])
             allowed = tolerance(key, quantity)
             name = named(key, quantity)
             out.append(
                 Compared(
-                    key, quantity, found, float(printed), rounding, allowed, held(key),
-                    name, shown.unit,
+                    key, quantity, count, float(printed), rounding, allowed, held(key),
+                    name, display.unit,
                 )
             )  # fmt: skip
     return out
@@ -279,7 +286,7 @@ def prototype_check(figures: list[Compared], within: str) -> Check:
     """
     held = [f for f in figures if f.held]
     bad = [
-        f"{f.name}: {f.found.value:.3g} against {f.expected:g} {f.unit}"
+        f"{f.name}: {f.measured.value:.3g} against {f.expected:g} {f.unit}"
         for f in held
         if not f.tolerable
     ]
@@ -291,14 +298,14 @@ def prototype_check(figures: list[Compared], within: str) -> Check:
     return Check("figures of the independent prototype", text, within, not bad)
 
 
-def at_most(what: str, unit: str, found: Summary, most: float, places: int) -> Check:
+def at_most(what: str, unit: str, summary: Summary, most: float, places: int) -> Check:
     """A figure that may exceed a limit by its Monte-Carlo error alone."""
     space = "" if unit == "°" else " "
     return Check(
         what,
-        f"{number(found.value, places)} ± {number(found.error, places)}{space}{unit}",
-        f"≤ {most:g}{space}{unit}{MONTE_CARLO_ASIDE}",
-        found.value - 2 * found.error <= most,
+        f"{number(summary.value, places)} ± {number(summary.error, places)}{space}{unit}",
+        f"≤ {most:g}{space}{unit}{MONTE_CARLO_NOTE}",
+        summary.value - 2 * summary.error <= most,
     )
 
 

@@ -115,8 +115,8 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
     poses, mounts = PoseSet.empty(), ()
     if view.T_platform_board is not None:
         whiten = np.broadcast_to(np.diag(1 / data.noise.pose), (n, 6, 6))
-        seen = data.T_camera_board[run, :n]
-        poses = PoseSet(view.station[:n], np.arange(n), none, seen, whiten)
+        in_view = data.T_camera_board[run, :n]
+        poses = PoseSet(view.station[:n], np.arange(n), none, in_view, whiten)
         mounts = (Mount("board", "platform"),)
     stations = len(view.T_camera_base)
     return Measurements(
@@ -157,9 +157,9 @@ def joint_problem(
     if data.view.legs.size:
         axis = data.axis.reshape(len(data.axis), -1, 4)
         radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
-        found = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
-        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in found)
-        basis[:, at.row, at.place], white[:, at.row, at.place] = found
+        count = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
+        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in count)
+        basis[:, at.row, at.place], white[:, at.row, at.place] = count
         blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
         none = np.zeros((1, *at.shape, 4, 1))
         numbers = replace(numbers, basis=basis, white=white, optics=none)

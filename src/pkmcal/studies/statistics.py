@@ -45,10 +45,10 @@ def each_rms(errors: Array) -> Array:
     return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
-def ratio_of_figures(found: Summary, bound: Summary) -> Summary:
+def ratio_of_figures(summary: Summary, bound: Summary) -> Summary:
     """One figure over another, as if their errors were independent."""
-    value = found.value / bound.value
-    return Summary(value, value * float(np.hypot(found.error / found.value,
+    value = summary.value / bound.value
+    return Summary(value, value * float(np.hypot(summary.error / summary.value,
                                                  bound.error / bound.value)))  # fmt: skip
 
 
@@ -58,10 +58,10 @@ def covered(errors: Array, sigma: Array, share: float = 0.95) -> Array:
     """
     from scipy.special import ndtri
 
-    known = np.isfinite(sigma) & np.isfinite(errors)
-    inside = known & (np.abs(errors) <= float(ndtri(0.5 + share / 2)) * sigma)
+    finite = np.isfinite(sigma) & np.isfinite(errors)
+    inside = finite & (np.abs(errors) <= float(ndtri(0.5 + share / 2)) * sigma)
     axes = tuple(range(1, errors.ndim))
-    return np.sum(inside, axis=axes) / np.maximum(np.sum(known, axis=axes), 1)
+    return np.sum(inside, axis=axes) / np.maximum(np.sum(finite, axis=axes), 1)
 
 
 SUMMARIES_BY_STATISTIC: Mapping[Statistic, Callable[[Array], Summary]] = {

@@ -44,16 +44,16 @@ class Store:
     @classmethod
     @contextmanager
     def opened(
-        cls, out: Path, told: str, settings: Sequence[StudySetting], seed: int
+        cls, out: Path, title: str, settings: Sequence[StudySetting], seed: int
     ) -> Generator[Store]:
         """The store in a results folder, made or found there, for this process alone.
 
-        told : the study in words. Raises InputError where it holds finished batches of another
+        title : the study in words. Raises InputError where it holds finished batches of another
         study, and while another process works in it.
         """
         folder = out / BATCHES_FOLDER
         path = folder / STUDY_DESCRIPTION_FILE
-        own = {"study": told, "seed": seed, "pkmcal": version("pkmcal")}
+        own = {"study": title, "seed": seed, "pkmcal": version("pkmcal")}
         own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
         with alone_in(folder, "study"):
             if any(folder.glob("*.npz")):
@@ -133,11 +133,11 @@ def plainly(value: Any) -> Any:
 
 def _description(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        found = None
-    if isinstance(found, dict):
-        return found
+        value = None
+    if isinstance(value, dict):
+        return value
     raise InputError(
         "this does not describe a study",
         where=str(path),

@@ -110,10 +110,10 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         text = f"The stated deviations hold: {share} of the 95 % intervals do."
     if len(study.found) == 1:
         cell = study.found[0]
-        left = amount(cell.position.value, "m")
+        residual = amount(cell.position.value, "m")
         if _turns(study):
-            left += f" and {amount(cell.orientation.value, 'rad')}"
-        return f"Calibrations leave {left} at the tool. {text}"
+            residual += f" and {amount(cell.orientation.value, 'rad')}"
+        return f"Calibrations leave {residual} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
         return f"{text} Nothing of what was varied shows beyond chance in so many runs."
@@ -169,15 +169,15 @@ def _cards(study: SweepResult) -> tuple[Figure, ...]:
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
     off = ((brief(1e3 * best.position.value), "mm"), (brief(1e3 * best.orientation.value), "mrad"))
     below = ((brief(1e3 * best.position_95), "mm"), (brief(1e3 * best.orientation_95), "mrad"))
-    shown = slice(None) if _turns(study) else slice(1)
+    display = slice(None) if _turns(study) else slice(1)
     return (
         Figure(
             "How far off is the tool after a calibration?",
-            off[shown],
+            off[display],
             f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
         ),
         Figure(
-            "What stays below in 95 % of the workspace?", below[shown], "over all runs and poses"
+            "What stays below in 95 % of the workspace?", below[display], "over all runs and poses"
         ),
         Figure(
             "Do its 95 % intervals hold?",
@@ -300,8 +300,8 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
                 data.append(trace(label or "error", x, y, colour, error_y=bars))
                 stated = [1e3 * c.position_sigma for c in cells]
                 dash = {"color": colour, "dash": "dot"}
-                told = f"stated, {label}" if label else "stated"
-                data.append(trace(told, x, stated, colour, "lines", line=dash))
+                label_text = f"stated, {label}" if label else "stated"
+                data.append(trace(label_text, x, stated, colour, "lines", line=dash))
         unit = study.subject.names[name].unit
         layout = plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
         layout["yaxis"] |= {"rangemode": "tozero"}
@@ -378,8 +378,8 @@ def _cell(cell: CellFindings) -> dict[str, Any]:
     summaries = ("position", "orientation", "covered", "covered_tool", "failed")
     out: dict[str, Any] = {"values": dict(cell.values), "runs": cell.runs}
     for name in summaries:
-        found = getattr(cell, name)
-        out[name] = {"value": found.value, "standard_error": found.error}
+        results = getattr(cell, name)
+        out[name] = {"value": results.value, "standard_error": results.error}
     for name in ("position_95", "orientation_95", "position_sigma", "orientation_sigma", "chi2"):
         out[name] = getattr(cell, name)
     out["intervals"] = {

@@ -46,10 +46,10 @@ SweptSetting = SimulatedCalibrations | JointByAxes
 @dataclass(frozen=True)
 class Varied:
     """A name that can be varied. least, most : its numbers. whole : no fractions. unit : of its
-    numbers. told : what it is. words : its values where they are no numbers.
+    numbers. cell_text : what it is. words : its values where they are no numbers.
     """
 
-    told: str
+    cell_text: str
     unit: str = ""
     least: float = 0.0
     most: float = math.inf
@@ -166,25 +166,25 @@ def _of_session(session: Session) -> StudySubject:
             found=listed([" and ".join(sorted(own)) or "the base's board" for own in words], 4),
         )
     places = [station.T_camera_base for station in session.stations]
-    known = [place for place in places if place is not None]
-    if len(known) < len(places):
+    above_limit = [place for place in places if place is not None]
+    if len(above_limit) < len(places):
         findings.append(note("study.chosen_stations"))
-    seen = [{p.configuration for p in station.photographs} for station in session.stations]
+    in_view = [{p.configuration for p in station.photographs} for station in session.stations]
     usual = Design.configurations
-    if not any(seen):
+    if not any(in_view):
         findings.append(note("study.no_images", number=usual))
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
         tuple(station.camera for station in session.stations),
         stations=len(places),
-        T_camera_base=np.stack(known) if len(known) == len(places) else None,
+        T_camera_base=np.stack(above_limit) if len(above_limit) == len(places) else None,
         observe=tuple(word for word in ("legs", "board") if word in words[0]),
         board=board,
-        configurations=max(2, round(float(np.median([len(own) for own in seen]))))
-        if any(seen)
+        configurations=max(2, round(float(np.median([len(own) for own in in_view]))))
+        if any(in_view)
         else usual,
-        shared=len(seen) > 1 and any(seen) and all(own == seen[0] for own in seen),
+        shared=len(in_view) > 1 and any(in_view) and all(own == in_view[0] for own in in_view),
         reading_noise=session.joint_noise,
     )
     return StudySubject(f"the session {session.folder}", design, tuple(findings))
@@ -233,7 +233,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
     if not good:
         most = f" to {varied.most:g}" if math.isfinite(varied.most) else " or more"
         raise InputError(
-            f"{name} cannot be this ({varied.told})",
+            f"{name} cannot be this ({varied.cell_text})",
             where="--vary",
             found=text,
             expected=("a whole number of " if varied.whole else "")
@@ -277,8 +277,8 @@ def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
 
 def _design(design: Design, values: Mapping[str, Value]) -> Design:
     """A design with other values; where stations have moved, places are drawn anew."""
-    moved = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
-    if moved:
+    shifted = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
+    if shifted:
         design = replace(design, T_camera_base=None)
     if "stations" in values and len(design.cameras) > 1:
         design = replace(design, cameras=design.cameras[:1])
@@ -303,7 +303,9 @@ def _design(design: Design, values: Mapping[str, Value]) -> Design:
         plain["elevation"] = math.radians(float(values["elevation"]))
     design = replace(design, machine=machine, cameras=cameras, **plain)
     if "radius" in values:
-        design = replace(design, machine=_with_radii(design.seen_machine, float(values["radius"])))
+        design = replace(
+            design, machine=_with_radii(design.machine_with_cylinders, float(values["radius"]))
+        )
     return design
 
 

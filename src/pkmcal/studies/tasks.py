@@ -87,7 +87,7 @@ class StudySetting(Protocol):
         """Every estimator's answer."""
         ...
 
-    def judge(self, batch: Batch, data: Any, found: Mapping[Key, Fitted]) -> Mapping[Key, Sample]:
+    def judge(self, batch: Batch, data: Any, fits: Mapping[Key, Fitted]) -> Mapping[Key, Sample]:
         """How far each is from the truth."""
         ...
 
@@ -124,8 +124,8 @@ def work(task: Job) -> SolvedBatch:
         with threadpool_limits(1, "blas"):
             data = setting.draw(batch)
             began, used = time.perf_counter(), time.thread_time()
-            found = setting.solve(batch, data)
+            fits = setting.solve(batch, data)
             wall, cpu = time.perf_counter() - began, time.thread_time() - used
-            return SolvedBatch(setting.judge(batch, data, found), wall, cpu)
+            return SolvedBatch(setting.judge(batch, data, fits), wall, cpu)
     except PkmcalError as error:
         raise (error.located(task.name) if task.name else error) from None

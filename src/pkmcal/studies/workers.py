@@ -115,7 +115,7 @@ class _Pool:
             number = self.next()
             while number is not None:
                 with self._process() as process:
-                    while number is not None and (answer := _asked(process, self.tasks[number])):
+                    while number is not None and (answer := _answer(process, self.tasks[number])):
                         self._answered(number, answer)
                         number = self.next()
                 if number is not None:  # the process has ended with a task in hand
@@ -180,7 +180,7 @@ def _closed(stream: IO[bytes]) -> None:
         stream.close()
 
 
-def _asked(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
+def _answer(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
     """What a process answers to a task; None where it has died."""
     if process.stdin is None or process.stdout is None:
         return None

@@ -71,26 +71,29 @@ def pinned(
     T_camera_base where the joints leave them open.
     """
     if len(pins) == 1:
-        seen = camera.project(apply(T_camera_base, pins[0]))
-        return aimed(camera, T_camera_base, seen, pixels[0])
+        visible = camera.project(apply(T_camera_base, pins[0]))
+        return aimed(camera, T_camera_base, visible, pixels[0])
     from scipy.optimize import least_squares
 
     count = 4 if len(pins) == 2 else 6
     spread = HAND_POSE_SPREAD[:count]
 
-    def misfit(moved: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
         def rows(x: Array) -> Array:
-            seen = camera.project(apply(moved(x * spread), pins))
-            off = np.nan_to_num(seen - pixels, nan=UNSEEN_JOINT_PIXELS).ravel() / PINNED_JOINT_SIGMA
+            visible = camera.project(apply(shifted(x * spread), pins))
+            off = (
+                np.nan_to_num(visible - pixels, nan=UNSEEN_JOINT_PIXELS).ravel()
+                / PINNED_JOINT_SIGMA
+            )
             return off if count == 4 else np.concatenate([off, x])
 
         return rows
 
     for _ in range(1 if count == 4 else PINNING_ROUNDS):
-        moved = _motion(T_camera_base, points)
+        shifted = _motion(T_camera_base, points)
         with np.errstate(over="ignore"):  # of a pixel that is kilometres away
-            x = least_squares(misfit(moved), np.zeros(count)).x
-        T_camera_base = moved(x * spread)
+            x = least_squares(misfit(shifted), np.zeros(count)).x
+        T_camera_base = shifted(x * spread)
     return T_camera_base
 
 
@@ -102,12 +105,12 @@ def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:
     sight = middle / np.linalg.norm(middle)
     across = np.linalg.svd(sight[None])[2][1:]
 
-    def moved(x: Array) -> Array:
+    def shifted(x: Array) -> Array:
         turn = x[4:] @ across if len(x) > 4 else np.zeros(3)
         near = pose(np.eye(3), (np.exp(x[3]) - 1) * middle)
         return _about_camera(x[:3]) @ near @ _about(turn, middle) @ T_camera_base
 
-    return moved
+    return shifted
 
 
 def _rays(camera: Camera, start: Array, end: Array) -> Array:

@@ -13,24 +13,30 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.pages.drawn import EDGE_CURVE_POINTS, Drawn, machine_laid_over, polyline, straightened
+from pkmcal.pages.overlays import (
+    EDGE_CURVE_POINTS,
+    Drawn,
+    machine_laid_over,
+    polyline,
+    straightened,
+)
+from pkmcal.view.content import Pane, Viewed
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned_as_ball
-from pkmcal.view.requests import LookRequest, requested_pose
-from pkmcal.view.viewed import Pane, Viewed
+from pkmcal.view.requests import ViewRequest, requested_pose
 
-STATION_PLACE_DECIMALS = 4
+STATION_POSE_DECIMALS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
 
 
-def pane_of(viewed: Viewed, look: LookRequest) -> Pane:
+def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
     """The machine that a request shows, before the camera where the files have it."""
-    take = viewed.calibrated if look.shown == "calibration" else viewed.drawn
-    return take(look.station, look.photograph)
+    take = viewed.calibrated if request.shown == "calibration" else viewed.drawn
+    return take(request.station, request.photograph)
 
 
-def overlay_after_gesture(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     """The pose after the gesture, and what it lays over the photograph, in pixels."""
-    pane = placed_by_hand(viewed, look)
+    pane = placed_by_hand(viewed, request)
     edges, spots = machine_laid_over(
         pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
     )
@@ -62,19 +68,21 @@ def overlay_after_gesture(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     }
 
 
-def placed_by_hand(viewed: Viewed, look: LookRequest) -> Pane:
+def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
     """The same, before the camera as the hand put it there."""
-    pane, T_camera_base = pane_of(viewed, look), requested_pose(look)
+    pane, T_camera_base = pane_of(viewed, request), requested_pose(request)
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
-    if look.pins:
-        pins = np.stack([_joint(viewed, look, k) for k in range(len(look.pins))])
-        pixels = np.array([pin.pixel for pin in look.pins], dtype=float)
+    if request.pins:
+        pins = np.stack([_joint(viewed, request, k) for k in range(len(request.pins))])
+        pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
         T_camera_base = pinned(camera, T_camera_base, points, pins, pixels)
-    if look.gesture is not None:
-        start, end = (np.array(p, dtype=float) for p in (look.gesture.start, look.gesture.end))
-        match look.gesture.kind:
+    if request.gesture is not None:
+        start, end = (
+            np.array(p, dtype=float) for p in (request.gesture.start, request.gesture.end)
+        )
+        match request.gesture.kind:
             case "aim":
                 T_camera_base = aimed(camera, T_camera_base, start, end)
             case "turn":
@@ -82,7 +90,7 @@ def placed_by_hand(viewed: Viewed, look: LookRequest) -> Pane:
             case "roll":
                 T_camera_base = rolled(camera, T_camera_base, points, start, end)
             case "distance":
-                factor = float(look.gesture.factor)
+                factor = float(request.gesture.factor)
                 T_camera_base = farther(camera, T_camera_base, points, start, factor)
     return replace(pane, T_camera_base=T_camera_base)
 
@@ -91,13 +99,13 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """A pose as session.yaml has it, with as many digits as are written there."""
     from pkmcal.simulation.placement import StationPlace
 
-    return StationPlace.of(T_camera_base).rounded(STATION_PLACE_DECIMALS)
+    return StationPlace.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 
 
-def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
+def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
     """A pinned joint's centre (3,), base frame, m, in its own photograph's configuration."""
-    pin = look.pins[k]
-    other = look.model_copy(update={"photograph": pin.photograph})
+    pin = request.pins[k]
+    other = request.model_copy(update={"photograph": pin.photograph})
     points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
     if pin.leg > len(points):
         raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)
@@ -114,6 +122,6 @@ def _bare_limbs(pane: Pane) -> list[Drawn]:
         apply(pane.T_camera_base, a + np.linspace(0, 1, EDGE_CURVE_POINTS)[:, None] * (b - a))
     )
     whole = np.isfinite(pixel).all(axis=(1, 2))
-    seen = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
-    lines = (polyline(j, points, True, "") for j, points in seen)
+    in_view = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
+    lines = (polyline(j, points, True, "") for j, points in in_view)
     return [line for line in lines if line]

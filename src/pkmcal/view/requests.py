@@ -15,7 +15,7 @@ from pkmcal.files import Document, Schema, validated_document
 
 Pixel = tuple[float, float]
 RequestedPoseRow = tuple[float, float, float, float]
-ShownMachine = Literal["drawing", "calibration"]
+DisplayMachine = Literal["drawing", "calibration"]
 """Which machine is laid over: the drawing's at the session's poses, or the calibrated one."""
 
 
@@ -39,12 +39,12 @@ class Gesture(Schema):
     factor: float = Field(default=1.0, gt=0.01, lt=100)
 
 
-class LookRequest(Schema):
+class ViewRequest(Schema):
     """One photograph with a machine laid over; pose : T_camera_base, where not the files' own."""
 
     station: int
     photograph: int
-    shown: ShownMachine = "drawing"
+    shown: DisplayMachine = "drawing"
     pose: tuple[RequestedPoseRow, RequestedPoseRow, RequestedPoseRow, RequestedPoseRow] | None = (
         None
     )
@@ -53,7 +53,7 @@ class LookRequest(Schema):
     anywhere: bool = False
 
 
-def checked_request(body: bytes) -> LookRequest:
+def checked_request(body: bytes) -> ViewRequest:
     """A request of the page. Raises InputError for anything else."""
     try:
         data = json.loads(body)
@@ -61,14 +61,14 @@ def checked_request(body: bytes) -> LookRequest:
         raise InputError("the request is not valid JSON", where="the page") from None
     if not isinstance(data, dict):
         raise InputError("the request is no JSON object", where="the page")
-    return validated_document(Document(Path("the page"), "the page", data, {}), LookRequest)
+    return validated_document(Document(Path("the page"), "the page", data, {}), ViewRequest)
 
 
-def requested_pose(look: LookRequest) -> Array | None:
+def requested_pose(request: ViewRequest) -> Array | None:
     """T_camera_base (4, 4) that a request gives, if it does. Raises InputError for another map."""
-    if look.pose is None:
+    if request.pose is None:
         return None
-    pose = np.array(look.pose, dtype=float)
+    pose = np.array(request.pose, dtype=float)
     rot = pose[:3, :3]
     rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
     if not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):

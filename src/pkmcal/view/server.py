@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import json_value, next_step_after, resolved
+from pkmcal.view.content import Viewed
 from pkmcal.view.guard import Guard
-from pkmcal.view.keep import PoseFile
 from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
-from pkmcal.view.requests import LookRequest, checked_request
-from pkmcal.view.viewed import Viewed
+from pkmcal.view.pose_file import PoseFile
+from pkmcal.view.requests import ViewRequest, checked_request
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -33,19 +33,19 @@ def listening_socket(port: int) -> socket.socket:
     """
     # the protocol by its number: without it asyncio does not ask to send at once, and the second
     # part of every answer waits 40 ms for the first one to be acknowledged
-    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    socket_ = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    socket_.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((LOOPBACK_ADDRESS, port))
+        socket_.bind((LOOPBACK_ADDRESS, port))
     except OSError as error:
-        found.close()
+        socket_.close()
         raise InputError(
             f"the page cannot be served on port {port} ({error.strerror or error})",
             where="--port",
             next_step="Name another port, or leave --port out for a free one",
         ) from None
-    found.listen(CONNECTIONS_WAITING)
-    return found
+    socket_.listen(CONNECTIONS_WAITING)
+    return socket_
 
 
 def new_token() -> str:
@@ -59,23 +59,23 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Mount, Route
 
-    kept = PoseFile(viewed.session.folder)
+    retained = PoseFile(viewed.session.folder)
 
-    def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        from pkmcal.view.found import found
+    def value(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+        from pkmcal.view.edge_search import edge_search
 
-        return found(viewed, look)
+        return edge_search(viewed, request)
 
-    def fit(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+    def fit(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         from pkmcal.view.fit import recognised_overlay
 
-        return recognised_overlay(viewed, look)
+        return recognised_overlay(viewed, request)
 
-    def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
-        pose = placed_by_hand(viewed, look).T_camera_base
-        return {"said": kept.write(viewed.station(look.station), pose)}
+    def save(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+        pose = placed_by_hand(viewed, request).T_camera_base
+        return {"said": retained.write(viewed.station(request.station), pose)}
 
-    def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
+    def answering(answer: Callable[[Viewed, ViewRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
@@ -103,9 +103,9 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         Route("/view.css", style),
         Route("/photograph/{s:int}/{k:int}", photograph),
         *(
-            Route(f"/{name}", asked(answer), methods=["POST"])
+            Route(f"/{name}", answering(answer), methods=["POST"])
             for name, answer in (
-                ("overlay", overlay_after_gesture), ("found", found), ("fit", fit), ("save", save),
+                ("overlay", overlay_after_gesture), ("found", value), ("fit", fit), ("save", save),
             )
         ),
     ]  # fmt: skip
@@ -123,22 +123,22 @@ async def _answered(work: Callable[[], Any]) -> Response:
         return JSONResponse(error.as_dict(), 422)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        said = InputError(
+        message = InputError(
             f"the operating system refused: {reason}",
             where=error.filename,
             next_step=next_step_after(error),
         )
-        return JSONResponse(said.as_dict(), 422)
+        return JSONResponse(message.as_dict(), 422)
     except Exception as error:  # noqa: BLE001 - the last resort, as at the command line
-        said = PkmcalError(
+        message = PkmcalError(
             f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
             next_step="Report it",
         )
-        return JSONResponse(said.as_dict(), 500)
+        return JSONResponse(message.as_dict(), 500)
     return done if isinstance(done, Response) else JSONResponse(json_value(done))
 
 
-def serve_until_interrupted(app: Guard, found: socket.socket) -> None:
+def serve_until_interrupted(app: Guard, socket_: socket.socket) -> None:
     """Answer until the program is interrupted."""
     from contextlib import suppress
 
@@ -149,7 +149,7 @@ def serve_until_interrupted(app: Guard, found: socket.socket) -> None:
         timeout_graceful_shutdown=ANSWER_TIME_AT_CLOSING, server_header=False,
     )  # fmt: skip
     with suppress(KeyboardInterrupt):  # Ctrl-C is how this ends
-        uvicorn.Server(config).run(sockets=[found])
+        uvicorn.Server(config).run(sockets=[socket_])
 
 
 def view_page_html(viewed: Viewed) -> str:

@@ -67,7 +67,7 @@ class Bar(PlatformCarrier):
     body: ClassVar = "bar"
     floats: ClassVar = True
     most_turn: ClassVar = np.pi / 2
-    in_the_way: ClassVar = FOLDED_BARS_CLAUSE
+    obstacle: ClassVar = FOLDED_BARS_CLAUSE
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
@@ -111,7 +111,7 @@ class Bar(PlatformCarrier):
         return out
 
     @classmethod
-    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
+    def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
         """The bar turns with the base frame, the hinge moves with the platform frame."""
         parts = moved_direction(parameters[..., :3], e), moved_point(parameters[..., 3:], f)
         return np.concatenate(parts, axis=-1)
@@ -149,7 +149,7 @@ class HingedBar(PlatformCarrier):
     ways: ClassVar = ("center",)
     turns: ClassVar = True
     most_turn: ClassVar = np.pi / 2
-    in_the_way: ClassVar = FOLDED_BARS_CLAUSE
+    obstacle: ClassVar = FOLDED_BARS_CLAUSE
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")

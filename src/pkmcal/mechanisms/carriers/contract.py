@@ -204,7 +204,7 @@ class Carrier(ABC):
         )
 
     @classmethod
-    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
+    def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
         """The parameters (..., n) told in the new frames, e and f (..., 4, 4).
 
         Points and directions of the side's own body, as here, move with its frame.
@@ -229,7 +229,7 @@ class Carrier(ABC):
 
     @classmethod
     def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """Derivative (..., n, n) of :meth:`moved` by the parameters."""
+        """Derivative (..., n, n) of :meth:`reframed` by the parameters."""
         own = e if cls.side == "base" else f
         return turned_blocks(parameters.shape[-1], *((at.start, own) for at, _ in cls._vectors()))
 
@@ -313,7 +313,7 @@ class PlatformCarrier(Carrier, ABC):
     knows; legs on the same body share it.
     floats : ``center`` is told along the base frame's axes.
     most_turn : how far the platform turns about z to either side, rad, until something is in the
-    way; ``in_the_way`` says what.
+    way; ``obstacle`` says what.
     """
 
     side: ClassVar = "platform"
@@ -322,7 +322,7 @@ class PlatformCarrier(Carrier, ABC):
     floats: ClassVar[bool] = False
     called: ClassVar[str] = "platform joints"
     most_turn: ClassVar[float] = np.inf
-    in_the_way: ClassVar[str] = ""
+    obstacle: ClassVar[str] = ""
 
     @staticmethod
     @abstractmethod
@@ -365,8 +365,8 @@ def complex_steps(function: Callable[[Array], Array], parameters: Array) -> Arra
     """Derivatives (..., m, n) of a function (..., m) of parameters (..., n), exact to rounding."""
     columns: list[Array] = []
     for step in np.eye(parameters.shape[-1]):
-        moved: Any = parameters + 1j * COMPLEX_STEP_SIZE * step
-        columns.append(function(moved).imag / COMPLEX_STEP_SIZE)
+        shifted: Any = parameters + 1j * COMPLEX_STEP_SIZE * step
+        columns.append(function(shifted).imag / COMPLEX_STEP_SIZE)
     return np.stack(columns, axis=-1)
 
 

@@ -178,7 +178,7 @@ class Crank(BaseCarrier):
         return near + np.where(np.abs(first) <= np.abs(second), first, second)
 
     @classmethod
-    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
+    def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Centre and axis move with the base frame; ``zero`` and the vertical stay, so that the
         angle takes up what e0 turns against them.
         """
@@ -207,7 +207,7 @@ class Crank(BaseCarrier):
     @classmethod
     def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Turns, and how much more an error of the axis twists e0 here than there."""
-        before, after = _frame(parameters), _frame(Crank.moved(parameters, e, f))
+        before, after = _frame(parameters), _frame(Crank.reframed(parameters, e, f))
         rot = e[..., :3, :3]
         n = parameters.shape[-1]
         shape = (*_lead(parameters, e), n, n)

@@ -20,8 +20,8 @@ from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 from pkmcal.outcome.finding import Finding, doubtful
 
-SeenChoice = Literal["legs", "board", "both", "readings"]
-SEEN_CHOICES: tuple[SeenChoice, ...] = ("legs", "board", "both", "readings")
+ObservedChoice = Literal["legs", "board", "both", "readings"]
+OBSERVED_CHOICES: tuple[ObservedChoice, ...] = ("legs", "board", "both", "readings")
 SESSION_TEMPLATE_FOLDER = Path(__file__).parent / "session"
 TO_FILL = {
     "mechanism.yaml": "write the drawing of your machine into it",
@@ -63,8 +63,8 @@ READINGS_ALONE_TEXT = """\
 """
 EXAMPLE_UNIT_FACTORS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
 """Units of example readings by the mark in a column's head."""
-LEGS_SEEN_TEXT = " - The machine stands still."
-BOARD_SEEN = """\
+LEGS_TEXT = " - The machine stands still."
+BOARD_TEXT = """\
  - The machine stands still. The board sharp, whole in the picture, neither white nor black, and
    not always seen from the same side.
 """
@@ -75,17 +75,20 @@ DRIVE_NOISE_TEXT = """\
 
 
 def write_session(
-    folder: Path | str, machine: str | None = None, seen: SeenChoice | None = None, places: int = 1
+    folder: Path | str,
+    machine: str | None = None,
+    what: ObservedChoice | None = None,
+    places: int = 1,
 ) -> tuple[str, ...]:
     """Write a session into a new or empty folder; returns its files.
 
     machine : a built-in machine's name or a mechanism file; without one a hexapod to be changed.
-    seen : what the camera sees of it; the legs unless told, or a board where the drawing gives them
+    what : what the camera sees of it; the legs unless told, or a board where the drawing gives them
     no cylinders, or nothing where readings alone tell the geometry. places : that the camera stands
     in, one after another. Raises InputError for a folder that is not empty, and for legs that
     cannot be seen.
     """
-    return write_texts(folder, session_texts(machine, seen, places))
+    return write_texts(folder, session_texts(machine, what, places))
 
 
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
@@ -106,7 +109,7 @@ def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
 
 
 def session_texts(
-    machine: str | None = None, seen: SeenChoice | None = None, places: int = 1
+    machine: str | None = None, what: ObservedChoice | None = None, places: int = 1
 ) -> dict[str, str]:
     """The session's files by their names, as of :func:`write_session`."""
     files = sorted(path for path in SESSION_TEMPLATE_FOLDER.rglob("*") if path.is_file())
@@ -118,26 +121,26 @@ def session_texts(
     if machine is not None:
         drawn = load_mechanism(machine)
         visible = any(leg.tubes for leg in drawn.document.legs)
-        if not visible and seen in ("legs", "both"):
+        if not visible and what in ("legs", "both"):
             raise InputError(
                 f"the drawing of {drawn.name} has no cylinders that a camera could see",
                 where=machine,
                 expected="a board on the platform, or tubes on its legs",
                 next_step="Ask for a board alone, or give the legs of a copy of the drawing tubes",
             )
-        if seen is None and not visible:
-            seen = "readings" if drawn.redundancy > 0 else "board"
+        if what is None and not visible:
+            what = "readings" if drawn.redundancy > 0 else "board"
         texts["mechanism.yaml"] = read_text(catalogue().get(machine, Path(machine)))
         texts["joints.csv"] = example_readings(drawn)
         turns = set(drawn.joint_units) == {"rad"}
-    seen = seen or "legs"
-    texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, seen, places)
-    if seen in ("board", "both"):
+    what = what or "legs"
+    texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, what, places)
+    if what in ("board", "both"):
         texts["board.yaml"] = board_text()
     where_to = texts.pop("images/front/README.txt")
-    if seen == "board":
-        where_to = where_to[: where_to.index(LEGS_SEEN_TEXT)] + BOARD_SEEN
-    if seen == "readings":
+    if what == "board":
+        where_to = where_to[: where_to.index(LEGS_TEXT)] + BOARD_TEXT
+    if what == "readings":
         del texts["cameras/front.yaml"]
         return texts
     for name in _places(places):
@@ -180,24 +183,24 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
     return csv_text(heads, ["0001", "0002"], rows.round(4))
 
 
-def _session(text: str, hexapod: bool, turns: bool, seen: SeenChoice, places: int) -> str:
+def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
     """The starter session.yaml for another machine, another thing that is seen, more places."""
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
         text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
-    if seen == "readings":
+    if what == "readings":
         return text[: text.index("# One entry")] + READINGS_ALONE_TEXT
     start, end = text.index("    observe: legs"), text.index("#  left:")
-    first = f"    observe: {OBSERVE_ENTRY_VALUES[seen]}\n"
-    if seen == "legs":
+    first = f"    observe: {OBSERVE_ENTRY_VALUES[what]}\n"
+    if what == "legs":
         first += text[start:end].partition("\n")[2]
-    moved = [
-        MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[seen])
+    shifted = [
+        MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[what])
         for n in _places(places)[1:]
     ]
-    rest = text[end:] if places == 1 and seen == "legs" and hexapod else ""
-    board = "" if seen == "legs" else ON_PLATFORM
-    return text[:start] + first + "".join(moved) + rest + board
+    rest = text[end:] if places == 1 and what == "legs" and hexapod else ""
+    board = "" if what == "legs" else ON_PLATFORM
+    return text[:start] + first + "".join(shifted) + rest + board
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
@@ -247,7 +250,10 @@ def _examples(name: str) -> tuple[str, ...]:
         return tuple(
             _session(template, *given)
             for given in product(
-                (True, False), (True, False), SEEN_CHOICES, range(1, len(STARTER_PLACE_NAMES) + 1)
+                (True, False),
+                (True, False),
+                OBSERVED_CHOICES,
+                range(1, len(STARTER_PLACE_NAMES) + 1),
             )
         )
     return (template,)

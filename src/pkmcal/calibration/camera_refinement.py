@@ -1,0 +1,254 @@
+"""What a session's photographs and tables measured, put together; cameras refined with it.
+
+A camera's intrinsics, where they are refined, are those of its calibration plus F u: F F^T is the
+calibration's covariance, and the u are unknowns of the estimate with unit variance. The focal
+lengths of photographs by hand breathe besides: each photograph's are larger than its camera's by an
+unknown of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.boards.views import Boards
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import (
+    BREATHING_SIGMA,
+    EdgeSet,
+    LinkSet,
+    Measurements,
+    Mount,
+    Observation,
+    Set,
+    concatenate,
+)
+from pkmcal.session.load import Session
+
+
+@dataclass(frozen=True)
+class CameraRefinement:
+    """The cameras of a session and where their refinement stands.
+
+    files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
+    r = 0 where cameras are held. at : (C, r). of_station : (S,) file of each station's camera.
+    breathes : (S,) whether the station is a photograph by hand. breath : (S,) excess of its focal
+    lengths, in BREATHING_SIGMA.
+    """
+
+    files: tuple[str, ...]
+    calibrated: tuple[Camera, ...]
+    factor: Array
+    at: Array
+    of_station: tuple[str, ...]
+    breathes: Booleans
+    breath: Array
+
+    __repr__ = short_repr
+
+    @property
+    def refined(self) -> bool:
+        """Whether any camera's intrinsics are refined."""
+        return self.factor.shape[-1] > 0
+
+    @property
+    def refines_all(self) -> bool:
+        """Whether every camera's intrinsics are refined."""
+        return self.refined and bool(np.any(self.factor != 0, axis=(1, 2)).all())
+
+    @property
+    def active(self) -> bool:
+        """Whether there is anything to refine, of a camera or of a photograph."""
+        return self.refined or bool(self.breathes.any())
+
+    def camera(self, file: str) -> Camera:
+        """A camera with its intrinsics at the present place."""
+        camera = self.calibrated[self.files.index(file)]
+        if not self.refined:
+            return camera
+        change = self.change(file)[: len(camera.parameters)]
+        return replace(camera, parameters=camera.parameters + change)
+
+    def at_station(self, number: int) -> Camera:
+        """The camera of a station, with its own focal lengths where these breathe."""
+        camera = self.camera(self.of_station[number])
+        excess = BREATHING_SIGMA * self.breath[number] * camera.focal_part
+        return replace(camera, parameters=camera.parameters + excess)
+
+    def of(self, stations: Integers) -> CameraRefinement:
+        """The same for some of the stations, by their numbers."""
+        return replace(
+            self,
+            of_station=tuple(self.of_station[k] for k in stations),
+            breathes=self.breathes[stations],
+            breath=self.breath[stations],
+        )
+
+    def change(self, file: str) -> Array:
+        """What the intrinsics have changed by so far, (n,), as wide as the widest camera's."""
+        number = self.files.index(file)
+        return self.factor[number] @ self.at[number]
+
+    def updated(self, estimate: Estimate) -> CameraRefinement:
+        """The refinement after an estimate."""
+        state, at, breath = estimate.state, self.at, self.breath
+        if state.intrinsics.shape == at.shape:
+            at = at + state.intrinsics
+        if len(state.breathing):
+            breath = breath + state.breathing[: len(breath)]
+        return replace(self, at=at, breath=breath)
+
+    def result(self, estimate: Estimate, file: str) -> Camera:
+        """A camera as the last estimate has it, with its covariance."""
+        camera = self.updated(estimate).camera(file)
+        if not self.refined:
+            return camera
+        covariance = estimate.intrinsics_covariance[self.files.index(file)]
+        n = len(camera.parameters)
+        return replace(camera, covariance=covariance[:n, :n])
+
+
+def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Array:
+    """Turns (N, 2, n) of the measured normals by their camera's parameters, their pixels held.
+
+    cameras : (S,) of the stations that have one, which come first; n of the widest. A plane that
+    holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least squares over
+    the pixels that support an edge.
+    """
+    edges, at = observation.edges, observation.point_edge
+    widest = max((len(camera.parameters) for camera in cameras), default=0)
+    ray, turn = np.zeros((len(at), 3)), np.zeros((len(at), 3, widest))
+    for station, camera in enumerate(cameras):
+        mine = edges.station[at] == station
+        ray[mine] = camera.ray(observation.points[mine])
+        turn[mine, :, : len(camera.parameters)] = camera.ray_jacobians(observation.points[mine])[1]
+    good = np.isfinite(ray).all(axis=1) & np.isfinite(turn).all(axis=(1, 2))
+    rows = np.einsum("ni,nij->nj", ray[good], edges.basis[at[good]])
+    value = -np.einsum("nip,ni->np", turn[good], edges.normal[at[good]])
+    normal, right = np.zeros((len(edges), 2, 2)), np.zeros((len(edges), 2, widest))
+    np.add.at(normal, at[good], rows[:, :, None] * rows[:, None])
+    np.add.at(right, at[good], rows[:, :, None] * value[:, None])
+    return np.linalg.pinv(normal, hermitian=True) @ right
+
+
+def refinement_of(session: Session, refine: bool) -> CameraRefinement:
+    """The session's cameras, held or to be refined; an InputError where there is none.
+
+    A camera of which EXIF alone tells is refined in any case.
+    """
+    cameras = {s.camera_file: s.camera for s in session.stations}
+    rough = {s.camera_file for s in session.stations if s.from_exif}
+    files, calibrated = tuple(cameras), tuple(cameras.values())
+    breathes = np.array([station.handheld for station in session.stations], dtype=bool)
+    stations = tuple(s.camera_file for s in session.stations), breathes, np.zeros(len(breathes))
+    if not refine and not rough:
+        held = np.zeros((len(files), 0, 0))
+        return CameraRefinement(files, calibrated, held, np.zeros((len(files), 0)), *stations)
+    if not cameras:
+        raise InputError(
+            "no station has a camera whose intrinsics could be refined",
+            where="session.yaml, stations",
+            next_step="Leave --refine-camera out",
+        )
+    roots = [
+        covariance_root(camera)
+        if refine or file in rough
+        else np.zeros((len(camera.parameters), 0))
+        for file, camera in cameras.items()
+    ]
+    n, r = (max(root.shape[k] for root in roots) for k in (0, 1))
+    factor = np.stack([np.pad(f, ((0, n - len(f)), (0, r - f.shape[1]))) for f in roots])
+    return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)), *stations)
+
+
+def covariance_root(camera: Camera) -> Array:
+    """F (n, r) of a camera; what its calibration held fixed has no variance and no column. A camera
+    whose file states no covariance has a usual one.
+    """
+    stated = camera.covariance
+    covariance = camera.usual_covariance() if stated is None else stated
+    scale = np.sqrt(np.diag(covariance))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    used = values > 1e-12 * values[-1]
+    return scale[:, None] * vectors[:, used] * np.sqrt(values[used])
+
+
+def measurements_of(
+    session: Session,
+    boards: Boards,
+    edges: EdgeSet | None = None,
+    cameras: CameraRefinement | None = None,
+) -> Measurements:
+    """What is measured; no cameras at a first look, which is too coarse to refine any."""
+    # What targets are fixed to: the board, then each tracker's own, then the points of links.
+    mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
+    poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
+    breathing = np.zeros(0)
+    if cameras is not None and cameras.active and session.stations:
+        if cameras.breathes.any():
+            poses, edges = _breathing(poses, cameras), _breathing(edges, cameras)
+            breathing = np.pad(cameras.breath, (0, len(session.trackers)))
+        change = [
+            cameras.at_station(k).parameters - session.stations[k].camera.parameters
+            for k in range(len(session.stations))
+        ]
+        widest = max(len(part) for part in change)
+        poses = poses.transform(np.stack([np.pad(x, (0, widest - len(x))) for x in change]))
+    sets = [poses]
+    for k, table in enumerate(session.trackers, start=len(session.stations)):
+        sets.append(table.poses(k, len(mounts)))
+        mounts.append(Mount(table.name, "platform"))
+    links: list[LinkSet] = []
+    for one in session.links:
+        links.append(one.at_mount(len(mounts)))
+        mounts.append(Mount(one.kind, "platform"))
+    measurements = Measurements(
+        edges=edges,
+        joints=session.joints,
+        joint_noise=session.joint_noise,
+        n_stations=len(session.station_names),
+        camera_of_station=session.camera_of_station,
+        poses=concatenate(sets),
+        mounts=tuple(mounts),
+        links=tuple(links),
+        level=np.array(
+            [False] * len(session.stations) + [table.level for table in session.trackers],
+            dtype=bool,
+        ),
+    )
+    if cameras is None or not cameras.files:
+        return measurements
+    return replace(
+        measurements,
+        intrinsics_factor=cameras.factor,
+        intrinsics_at=cameras.at,
+        shaded=len(measurements.edges) > 0,
+        breathing_at=breathing,
+    )
+
+
+def _breathing(measured: Set, cameras: CameraRefinement) -> Set:
+    """What was measured, with what the excess of each photograph's focal lengths does to it."""
+    each = [
+        cameras.camera(file) if breathes else None
+        for file, breathes in zip(cameras.of_station, cameras.breathes, strict=True)
+    ]
+    return replace(measured, by_focal=by_focal(measured.by_intrinsics, measured.station, each))
+
+
+def by_focal(by: Array, station: Integers, cameras: Sequence[Camera | None]) -> Array:
+    """What focal lengths that grow by their own size do, (N, d), where measurements answer to their
+    camera's parameters by ``by`` (N, d, n). station : (N,); of those without a camera nothing.
+    """
+    focal = np.zeros((int(station.max(initial=-1)) + 1, by.shape[-1]))
+    for k, camera in enumerate(cameras[: len(focal)]):
+        if camera is not None and by.shape[-1]:
+            part = camera.focal_part
+            focal[k, : len(part)] = part
+    return (by @ focal[station][..., None])[..., 0]

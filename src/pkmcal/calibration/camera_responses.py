@@ -1,0 +1,238 @@
+"""How photographs code light, told by the edges: as sensors count it, or as telephones write it.
+
+A file's kind says what is usual, not what is so. Blurred edges lean to their dark side where levels
+are coded otherwise than believed, each by its own contrast, and no machine does that: so the way
+from where edges lie by one response to where they lie by the other is a departure of one number
+(:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs, taken by
+themselves, tell whether there is anything to gain, but of polished legs; if so all are measured by
+the other response too, and right is the one from which there is less to gain by going to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, evenly
+from pkmcal.cameras.response import OTHER_RESPONSE, Response
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import ScoreTests
+from pkmcal.identify.verdict import POLISHED_SHADING
+from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
+from pkmcal.observe.image_batches import Photographs
+from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.session.load import Session
+from pkmcal.wording import listed
+
+RESPONSE_TEST_CONFIGURATIONS = 6
+"""Configurations of a camera whose photographs are asked at first: of painted legs their hundred
+and fifty edges show a wrong response by six standard deviations."""
+LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
+"""chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
+from which some do not tell."""
+LEAST_EDGE_SHARE = 0.5
+"""Share of the edges that a response has to find, of those by the usual one, to be right."""
+ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
+"""Odds from which the edges overrule what is usual for files of a kind; and from which what is
+usual needs no caution."""
+_Camera = tuple[str, Response]
+"""A camera's file, and what is usual for the photographs' kind."""
+
+
+@dataclass(frozen=True)
+class ResponseEstimate:
+    """What edges say of how photographs code light, where they do not say that it is as usual.
+
+    entries : of session.yaml's stations, of one camera. usual : by which their photographs were
+    measured at first. gain : of chi2 by the other response, less what there would be to gain by
+    going back; NaN where the test failed, and failure says why.
+    """
+
+    entries: tuple[str, ...]
+    usual: Response
+    gain: float
+    failure: str = ""
+
+    @property
+    def sure(self) -> bool:
+        """Whether the other response is right."""
+        return self.gain > 2 * np.log(ODDS_FOR_OTHER_RESPONSE)
+
+    @property
+    def response(self) -> Response:
+        """The one by which the photographs are measured."""
+        return OTHER_RESPONSE[self.usual] if self.sure else self.usual
+
+    @property
+    def finding(self) -> Finding:
+        """A note where the edges are sure, else a warning."""
+        facts = {
+            "usual": self.usual,
+            "other": OTHER_RESPONSE[self.usual],
+            "stations": self.entries,
+            "log_odds": self.gain / 2,
+        }
+        where = listed(self.entries)
+        if self.failure:
+            return note("image.response_untested", where, **facts, why=self.failure)
+        if self.sure:
+            return note("image.response", where, **facts, odds=ODDS_FOR_OTHER_RESPONSE)
+        return doubtful("image.response_unknown", where, **facts)
+
+
+def overruled(responses: Sequence[ResponseEstimate]) -> dict[str, Response]:
+    """How photographs code light, by their entry in session.yaml, where it is not as usual."""
+    return {entry: one.response for one in responses if one.sure for entry in one.entries}
+
+
+def responses_by_edges(
+    session: Session,
+    photographs: Sequence[Photographs],
+    measurements: Measurements,
+    estimate: Estimate,
+    roughly: Callable[[list[Photographs]], EdgeSet],
+    measured: Callable[[list[Photographs]], EdgeSet],
+    of_edges: Callable[[EdgeSet], Measurements],
+) -> tuple[ResponseEstimate, ...]:
+    """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
+    say that it is otherwise than usual, or do not tell.
+
+    measurements, estimate : by the usual responses. roughly, measured : the edges of photographs,
+    looked for where those of ``measurements`` were, with their blur or with one of their own.
+    of_edges : measurements with these edges instead.
+    """
+    usual: dict[_Camera, list[Photographs]] = {}
+    for p in photographs:
+        station = session.stations[p.station]
+        if not station.response_given:
+            usual.setdefault((station.camera_file, p.response), []).append(p)
+    try:
+        questionable = _questionable(measurements, estimate, usual, roughly)
+        if not questionable:
+            return ()
+        edges = measurements.edges
+        own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in questionable}
+        every = {camera: measured(_otherwise(usual[camera])) for camera in questionable}
+        # in the dark a wrong response leaves hardly an edge
+        every = {x: e for x, e in every.items() if len(e) > LEAST_EDGE_SHARE * own[x].sum()}
+        if not every:
+            return ()
+        there, _ = _scored(measurements, estimate, every)
+        stay = ~np.any([own[camera] for camera in every], axis=0)
+        new = concatenate([edges.select(stay), *every.values()])
+        otherwise = of_edges(new.select(np.argsort(new.station, kind="stable")))
+        ended = bundle(estimate.machine, otherwise, estimate.state)
+        before = {camera: edges.select(own[camera]) for camera in every}
+        back, _ = _scored(otherwise, ended, before)
+    except PkmcalError as error:  # such as too few edges by the other response
+        why = str(error).rstrip(".")
+        return tuple(
+            ResponseEstimate(_entries(session, usual[camera]), camera[1], np.nan, why)
+            for camera in usual
+        )
+    rows = [
+        ResponseEstimate(
+            _entries(session, usual[camera]),
+            camera[1],
+            there[camera] - back[camera],
+        )
+        for camera in every
+    ]
+    return tuple(one for one in rows if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+
+
+def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:
+    """Their entries in session.yaml."""
+    return tuple(dict.fromkeys(session.stations[p.station].entry for p in photographs))
+
+
+def _questionable(
+    measurements: Measurements,
+    estimate: Estimate,
+    usual: Mapping[_Camera, Sequence[Photographs]],
+    roughly: Callable[[list[Photographs]], EdgeSet],
+) -> list[_Camera]:
+    """Cameras all of whose photographs are to be asked: some have something to gain, or do not
+    tell, as those of polished legs.
+    """
+    if estimate.edge_noise.shading.max() > POLISHED_SHADING:
+        return list(usual)
+    queries = {camera: _test_images(mine) for camera, mine in usual.items()}
+    few = {x: roughly(_otherwise(_select(usual[x], some))) for x, some in queries.items()}
+    # edges of the same machine that stay where they are would hold these back
+    weight = np.where(_edge_mask(measurements.edges, usual, queries), estimate.edge_weights, 0.0)
+    gains, ways = _scored(measurements, replace(estimate, edge_weights=weight), few)
+    return [
+        camera
+        for camera in usual
+        if gains[camera] > LEAST_RESPONSE_GAIN or not ways[camera] < MOST_TURN_DEVIATION
+    ]
+
+
+def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
+    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in photographs]
+
+
+def _select(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
+    """Some of each station's photographs, if any."""
+    pairs = zip(photographs, which, strict=True)
+    return [p.select(np.flatnonzero(some)) for p, some in pairs if some.any()]
+
+
+def _test_images(photographs: Sequence[Photographs]) -> list[Booleans]:
+    """Which of each station's photographs are those of some configurations, evenly over a camera's
+    stations.
+    """
+    visible = [np.unique(p.configuration) for p in photographs]
+    first = np.cumsum([0, *map(len, visible)])
+    some = evenly(int(first[-1]), RESPONSE_TEST_CONFIGURATIONS)
+    return [
+        np.isin(p.configuration, here[some[(some >= since) & (some < end)] - since])
+        for p, here, since, end in zip(photographs, visible, first[:-1], first[1:], strict=True)
+    ]
+
+
+def _edge_mask(
+    edges: EdgeSet,
+    usual: Mapping[_Camera, Sequence[Photographs]],
+    queries: Mapping[_Camera, Sequence[Booleans]],
+) -> Booleans:
+    """Which edges (N,) are in the photographs that are asked, or of cameras that are not asked."""
+    out = np.ones(len(edges), dtype=bool)
+    for camera, mine in usual.items():
+        for p, some in zip(mine, queries[camera], strict=True):
+            visible = np.isin(edges.configuration, p.configuration[some])
+            out &= (edges.station != p.station) | visible
+    return out
+
+
+def _scored(
+    measurements: Measurements, estimate: Estimate, other: Mapping[_Camera, EdgeSet]
+) -> tuple[dict[_Camera, float], dict[_Camera, float]]:
+    """chi2 that would be gained by going to where other edges are, for the edges of each camera,
+    and the standard deviation of the way that fits.
+    """
+    effects = [Effect(edges=_normal_turn(measurements.edges, edges)) for edges in other.values()]
+    if not effects:
+        return {}, {}
+    tests = ScoreTests(*linearize_at_solution(measurements, estimate), effects)
+    gains = [score.chi2 for score in tests.scores()]
+    deviations = [float(freed.sigma[0]) for freed in tests.fitted(range(len(effects)))]
+    return dict(zip(other, gains, strict=True)), dict(zip(other, deviations, strict=True))
+
+
+def _normal_turn(edges: EdgeSet, other: EdgeSet) -> Array:
+    """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
+    those that it does not have, nor of coarse ones, which no response moves.
+    """
+    mine, theirs = edges.same_as(other)
+    both = ~edges.coarse[mine] & ~other.coarse[theirs]
+    mine, theirs = mine[both], theirs[both]
+    turn = np.zeros((len(edges), 2, 1))
+    shifted = other.normal[theirs] - edges.normal[mine]
+    turn[mine, :, 0] = np.einsum("nij,ni->nj", edges.basis[mine], shifted)
+    return turn

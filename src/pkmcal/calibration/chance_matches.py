@@ -1,0 +1,128 @@
+"""Whether the edges that were measured are the machine's, or what chance offers anywhere.
+
+Some edge lies within reach of any place in a picture. A machine that is not the one before the
+camera, recognised all the same, is given a tenth of its edges by that, and the joint estimate makes
+them agree with it, in large deviations. So where few of the edges that should be seen were
+measured, they are looked for again with the whole picture moved aside, in several directions: there
+no leg is where it should be, and what is found is chance's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
+from pkmcal.observe import legs
+from pkmcal.observe.image_batches import Photographs, placed_at
+from pkmcal.observe.repeats import combined
+from pkmcal.observe.station_localization import BY_CHANCE
+from pkmcal.outcome.finding import Finding, wrong
+from pkmcal.session.load import Session
+from pkmcal.wording import how_often
+
+IMAGE_OFFSET = 2 * legs.LEG_SEARCH_REACH
+"""Pixels by which the picture is moved: further than legs were looked for."""
+OFFSET_DIRECTIONS = 8
+"""Directions in which it is, evenly: the chance that is told is that of one more draw."""
+
+
+class _Offered(NamedTuple):
+    """Edges of some stations: in sight, measured, about how many chance offers aside, and the
+    probability that it offers as many as were measured.
+    """
+
+    in_sight: int
+    measured: int
+    by_chance: float
+    chance: float
+
+
+def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
+    """A reason where chance may have offered the edges by which the result was estimated; tested
+    only where less than a third of the edges in sight were measured.
+    """
+    offered = _offered(turns, [p.station for p in turns.photographs])
+    if offered is None:
+        return ()
+    return (
+        wrong(
+            "edges.by_chance",
+            in_sight=offered.in_sight,
+            measured=offered.measured,
+            aside=offered.by_chance,
+            distance=IMAGE_OFFSET,
+            chance=offered.chance,
+        ),
+    )
+
+
+def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
+    """Why stations on a tripod may stand elsewhere than they were found, by their numbers, where
+    others tell the machine: chance offers as many edges as were measured there. One search of a
+    thousand ends elsewhere, surely as it seems; and where the machine hardly shows, little is lost.
+    A board on the base tells a place whatever edges do.
+    """
+    boards = set(turns.measurements.poses.station.tolist())
+    wrong: dict[int, str] = {}
+    for k in (p.station for p in turns.photographs):
+        station = session.stations[k]
+        if station.handheld or k in boards:
+            continue
+        if (offered := _offered(turns, [k])) is not None:
+            advice = "" if station.T_camera_base is not None else "; a pose by hand would tell"
+            wrong[k] = (
+                f"only {offered.measured} of {offered.in_sight} edges in sight were measured where"
+                f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"
+                f" may stand elsewhere{advice}"
+            )
+    return wrong if len(wrong) < len(turns.photographs) else {}
+
+
+def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
+    """What chance may have offered of some stations' edges; nothing where it can not have."""
+    from scipy.special import stdtr
+
+    in_view = turns.observation
+    mine = np.isin(in_view.edges.station, stations)
+    measured = int(np.sum(mine & ~in_view.edges.coarse))
+    missed = sum(
+        r.side >= 0 and r.reason != legs.OUT_OF_SIGHT_REASON and r.station in stations
+        for r in in_view.rejected
+    )
+    given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
+    in_sight = int(np.sum(mine)) + missed - given_up
+    if not turns.photographs or measured >= FEW_MEASURED * in_sight:
+        return None
+    angle = 2 * np.pi * np.arange(OFFSET_DIRECTIONS) / OFFSET_DIRECTIONS
+    lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    counts = np.array([_count(turns, stations, away) for away in lateral])
+    mean = float(counts.mean())
+    # eight counts may lie nearer to each other by chance than counts do
+    spread = max(float(counts.std(ddof=1)), np.sqrt(mean), 1.0)
+    own = _count(turns, stations, np.zeros(2))
+    apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
+    chance = float(stdtr(len(counts) - 1, -apart))
+    return _Offered(in_sight, measured, mean, chance) if chance >= BY_CHANCE else None
+
+
+def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> int:
+    """Edges measured from some stations with the pictures moved ``offset`` (2,), in the pixels that
+    edges are in.
+    """
+    state = turns.estimate.state
+    shifted: list[Photographs] = []
+    for p in turns.photographs:
+        if p.station in stations:
+            parameters = p.camera.parameters.copy()
+            parameters[2:4] += p.binning * offset  # the centre, always third and fourth
+            shifted.append(replace(p, camera=replace(p.camera, parameters=parameters)))
+    placed = placed_at(shifted, state.T_camera_base, state.T_base_platform)
+    passes = legs.measure_stations(placed, turns.estimate.machine, turns.blur)
+    return sum(
+        len(combined(station_edges).edges) for station_edges in passes
+    )  # as those that were measured

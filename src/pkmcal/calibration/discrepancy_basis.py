@@ -1,0 +1,409 @@
+"""What a session's model may leave out smoothly: components of the discrepancy, and what to say.
+
+Errors of the readings over the workspace (legs that give way under load, commanded axes that
+droop), with the motors' last steps (backlash, lag), with time (warmth); a base that moves with the
+platform; stations that creep; legs that are no straight cylinders; a bed that is not flat. Heights
+know only the last: what else varies over the workspace lifts the tool as an uneven bed does. Each
+is one entry of
+:func:`discrepancy_components`; :mod:`pkmcal.identify.discrepancy` says how their scales are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.holdout import points_of_poses
+from pkmcal.geometry.cylinders import contour_point, line_through
+from pkmcal.geometry.rigid import apply, dot, skew
+from pkmcal.identify.covariance import data_share, machine_covariance
+from pkmcal.identify.discrepancy import Component, Discrepancy
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.tool import ToolError
+from pkmcal.identify.unidentified import only_heights
+from pkmcal.identify.unknowns import own_blocks
+from pkmcal.measurements import Effect, Measurements
+from pkmcal.outcome.finding import Finding, doubtful
+
+CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
+"""Distances over which errors of neighbouring poses are alike, in the root mean square distance of
+the session's poses from their middle; the last one leaves functions that are nearly straight."""
+MOST_FUNCTIONS = 40
+"""Smooth functions of the pose: in six dimensions straight and square ones are 27."""
+LENGTH_STEP = 1.5
+"""Factor from one correlation length of the bed to the next, from the points' mean distance, below
+which unevenness is noise, to LONGEST_BED_LENGTH, from which on it is nearly a parabola."""
+LONGEST_BED_LENGTH = 4.0
+"""In the root mean square distance of the points from their middle."""
+LANDMARK_POSES = 200
+"""Poses, evenly of all, by which the functions are made where there are more."""
+PLACES_ALONG_EDGE_SPAN = 9
+
+
+@dataclass(frozen=True)
+class BedSurface:
+    """The unevenness of a bed at the points that were probed, all (n,): configuration, x and y of
+    the tool (m, base frame), height (m, up) with the mean taken off, and its standard deviation.
+
+    Where the machine's own parameters bend the bed as well, the height is what the surface's
+    smoothness makes of the rest, and the standard deviation says how little that is.
+    """
+
+    configuration: Integers
+    x: Array
+    y: Array
+    height: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """A component of the discrepancy that the data show.
+
+    code : such as readings.workspace. scale : its standard deviation, m or rad of what it acts on.
+    unit : m or rad. ratio : twice the logarithm of the likelihood ratio. tool, tool_before : m,
+    standard deviation of the platform's position, root mean square over the session's poses, with
+    all components and without any. sure : whether it is named, or only contained in the covariance,
+    for larger noise of the readings or poses explains the data as well. length : correlation
+    length, m, and surface : the map, of a bed; None of all else.
+    """
+
+    code: str
+    scale: float
+    ratio: float
+    tool: float
+    tool_before: float
+    unit: str
+    sure: bool
+    length: float | None = None
+    surface: BedSurface | None = None
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "code": self.code,
+            "scale": self.scale,
+            "likelihood_ratio": self.ratio,
+            "sure": self.sure,
+            "sigma_tool": self.tool,
+            "sigma_tool_before": self.tool_before,
+            "length": self.length,
+            "surface": self.surface and asdict(self.surface),
+        }
+
+
+UNEVEN_BED = "bed.surface"
+"""Code of the component that heights have."""
+
+
+def discrepancy_findings(errors: tuple[ModelError, ...]) -> Iterator[Finding]:
+    """A warning for each component, the bed first, then the largest by evidence; none without sure
+    ones.
+    """
+    if not any(one.sure for one in errors):
+        return
+    for one in errors:
+        if one.code == UNEVEN_BED:
+            yield uneven_bed(one)
+    for k, one in enumerate(one for one in errors if one.code != UNEVEN_BED):
+        tool: dict[str, Any] = {}
+        if not k:
+            tool = {"tool_sigma": one.tool, "tool_sigma_before": one.tool_before}
+        yield doubtful(f"discrepancy.{one.code}", sigma=one.scale, unit=one.unit,
+                       log_odds=one.ratio / 2, **tool)  # fmt: skip
+
+
+def explains_heights(errors: tuple[ModelError, ...]) -> bool:
+    """Whether an uneven bed surely explains why heights scatter."""
+    return any(one.code == UNEVEN_BED and one.sure for one in errors)
+
+
+def uneven_bed(error: ModelError) -> Finding:
+    """The warning about an uneven bed."""
+    return doubtful(
+        f"discrepancy.{error.code}",
+        sigma=error.scale,
+        unit=error.unit,
+        log_odds=error.ratio / 2,
+        length=error.length,
+    )
+
+
+def discrepancy_components(measurements: Measurements, estimate: Estimate) -> list[Component]:
+    """All components that a session can have."""
+    bed = _of_bed(measurements, estimate)
+    if only_heights(estimate):
+        return bed
+    return [*_of_readings(measurements, estimate), *_of_stations(measurements, estimate),
+            *_of_legs(measurements, estimate), *bed]  # fmt: skip
+
+
+def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
+    """A bed that is not flat, where heights were felt: a Gaussian process over x and y."""
+    poses = measurements.poses
+    felt = height_rows(measurements)
+    if not felt.size:
+        return []
+    xy = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
+    xy = xy - xy.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum(xy**2, axis=1))))
+    # n points all over a disc of that size are about so far from their neighbours
+    places = len(np.unique(xy.round(6), axis=0))
+    apart = np.sqrt(2 * np.pi / places)
+    count = int(np.ceil(np.log(LONGEST_BED_LENGTH / apart) / np.log(LENGTH_STEP)))
+    lengths = apart * LENGTH_STEP ** np.arange(max(count, 1))
+    basis, roots = smooth_functions(xy, lengths.tolist(), LANDMARK_POSES)
+    if not roots:
+        return []
+    effect = np.zeros((len(poses), 6, basis.shape[1]))
+    effect[felt, 5] = basis
+    either = READING_ROWS_KIND, POSE_ROWS_KIND  # a height is as much its readings' as its probe's
+    in_metres = tuple((size * lengths).tolist())
+    return [Component(UNEVEN_BED, Effect(poses=effect), roots, either, in_metres)]
+
+
+def height_rows(measurements: Measurements) -> Integers:
+    """Rows of the measured poses that are heights: of their six numbers only z was measured."""
+    valid = np.any(measurements.poses.whiten != 0, axis=-2)
+    return np.flatnonzero(valid[:, 5] & ~valid[:, :5].any(axis=1))
+
+
+def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
+    """Errors of the readings: over the workspace, with the last step, with time."""
+    used, joints = estimate.configurations, measurements.joints
+    n, m = joints.shape
+    poses = estimate.state.T_base_platform[used]
+    basis, roots = smooth_functions(points_of_poses(estimate.machine, poses))
+    each = np.eye(m)
+
+    def by_motor(functions: Array) -> Array:
+        """Functions (K', p) of each motor by itself, (K, m, p m)."""
+        out = np.zeros((n, m, functions.shape[1] * m))
+        out[used] = np.einsum("kp,mn->kmpn", functions, each).reshape(len(functions), m, -1)
+        return out
+
+    if not basis.shape[1]:  # all of one pose
+        return
+    yield Component(
+        "readings.workspace",
+        Effect(readings=by_motor(basis)),
+        tuple(np.kron(root, each) for root in roots),
+        (READING_ROWS_KIND,),
+    )
+    step = np.diff(joints, axis=0, prepend=joints[:1])
+    size = float(np.sqrt(np.mean(step[used] ** 2)))
+    if size > 0:
+        sign, step = np.sign(step), step / size
+        alone = np.concatenate([x[:, :, None] * each for x in (sign, step)], axis=2)
+        together = np.stack([sign, step], axis=2)
+        yield Component(
+            "readings.step",
+            Effect(readings=np.concatenate([alone, together], axis=2)),
+            (np.eye(2 * m + 2) / 2,),
+            (READING_ROWS_KIND,),
+        )
+    time = functions_of_time(n)[used]
+    yield Component(
+        "readings.time", Effect(readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS_KIND,)
+    )
+
+
+def smooth_functions(
+    points: Array,
+    lengths: Sequence[float] = CORRELATION_LENGTHS,
+    most: int = MOST_FUNCTIONS,
+) -> tuple[Array, tuple[Array, ...]]:
+    """Functions (K, p) of places (K, d) with a mean of zero and orthonormal over the places, and
+    for each correlation length the root (p, p) of their coefficients' covariance, of functions
+    with a mean square of one.
+
+    lengths : correlation lengths, the shortest first, in the root mean square distance of the
+    places from their middle. most : functions at most. Principal functions of a squared exponential
+    kernel of the shortest length, Nyström's way.
+    """
+    size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
+    points = points / (size or 1.0)
+    marks = points[np.unique(np.linspace(0, len(points) - 1, LANDMARK_POSES).astype(int))]
+
+    def kernel(one: Array, length: float) -> Array:
+        squares = np.sum((one[:, None] - marks) ** 2, axis=-1)
+        return np.exp(-squares / (2 * length**2))
+
+    middle = np.eye(len(marks)) - 1 / len(marks)
+    values, vectors = np.linalg.eigh(middle @ kernel(marks, lengths[0]) @ middle)
+    order = np.argsort(-values)[:most]
+    order = order[values[order] > 1e-6 * max(float(values.max()), 1e-6)]
+    turn = middle @ vectors[:, order] / np.sqrt(values[order])
+    if not order.size:
+        return np.zeros((len(points), 0)), ()
+    functions = kernel(points, lengths[0]) @ turn
+    functions = functions - functions.mean(axis=0)
+    q, r = np.linalg.qr(functions)
+    scale = np.sqrt(len(points))
+    at_marks = (kernel(marks, lengths[0]) @ turn) @ np.linalg.inv(r) * scale
+    at_marks = at_marks - at_marks.mean(axis=0)
+    back = np.linalg.pinv(at_marks)
+    roots: list[Array] = []
+    for length in lengths:
+        spread = back @ (middle @ kernel(marks, length) @ middle) @ back.T
+        value, direction = np.linalg.eigh(spread)
+        value = np.maximum(value, 0.0)
+        roots.append(direction * np.sqrt(value / max(float(value.sum()), 1e-300)))
+    return q * scale, tuple(roots)
+
+
+def functions_of_time(n: int) -> Array:
+    """A straight and a square function (n, 2) of the number of a configuration, with means of zero
+    and, together, a mean square of one.
+    """
+    time = np.linspace(-1, 1, n)
+    both = np.stack([time, time**2 - np.mean(time**2)], axis=1)
+    size = np.sqrt(np.mean(both**2, axis=0))
+    return both / np.where(size > 0, size, 1.0) / np.sqrt(2)
+
+
+def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
+    """Motions between base and stations, turns in parts of the machine's size."""
+    used, state, n = estimate.configurations, estimate.state, len(measurements.joints)
+    stations = range(measurements.n_stations)
+    points = points_of_poses(estimate.machine, state.T_base_platform[used])
+    size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
+    if not stations or size == 0:
+        return
+    unit = np.diag(np.repeat([1 / size, 1.0], 3))
+    straight = np.zeros((n, points.shape[1]))
+    straight[used] = points / size
+    by_base = [_motion_in_station(T) @ unit for T in state.T_camera_base]
+    motion = np.stack([np.einsum("ij,kp->kipj", by, straight) for by in by_base])
+    motion = motion.reshape(len(by_base), n, 6, -1)
+    yield Component("base.workspace", Effect(motion=motion), (np.eye(motion.shape[-1]),))
+    parts: list[Array] = []
+    for s in stations:
+        taken = [x.configuration[x.station == s] for x in (measurements.edges, measurements.poses)]
+        if len(np.unique(np.concatenate(taken))) > 1:
+            part = np.zeros((len(stations), n, 6, 6))
+            part[s] = np.sqrt(2) * functions_of_time(n)[:, :1, None] * unit
+            parts.append(part)
+    if parts:
+        motion = np.concatenate(parts, axis=-1)
+        yield Component("station.time", Effect(motion=motion), (np.eye(motion.shape[-1]),))
+
+
+def _motion_in_station(T: Array) -> Array:
+    """(6, 6) left perturbation of T_camera_base by (omega, tau) of the base in its own frame."""
+    turn, place = T[:3, :3], T[:3, 3]
+    return np.block([[turn, np.zeros((3, 3))], [skew(place) @ turn, turn]])
+
+
+def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Component]:
+    """Legs that are thicker at one end, or bent: radius and axis (m) by three numbers a leg."""
+    if not len(measurements.edges):
+        return
+    edges, machine, state = measurements.edges, estimate.machine, estimate.state
+    ends = machine.ends_at(measurements.joints, state.T_base_platform)
+    T = state.T_camera_base[edges.station]
+    a, b = (apply(T, x[edges.configuration, edges.leg]) for x in (ends.a, ends.b))
+    u = line_through(a, b)[0]
+    part = np.linspace(0, 1, PLACES_ALONG_EDGE_SPAN)
+    along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * part
+    radius = machine.values[machine.layout.radius_of(edges.leg, edges.tube)]
+    points = contour_point(
+        a[:, None], u[:, None], edges.normal[:, None], radius[:, None], along
+    )  # (N, n, 3)
+    distance = np.sqrt(dot(points, points))
+    place = np.clip(along / np.sqrt(dot(b - a, b - a))[:, None], 0, 1)
+    # the leg's own directions: across, level and upright, as the base has them
+    level = np.cross(u, T[:, :3, 2])
+    level = level / np.maximum(np.sqrt(dot(level, level)), 1e-9)[:, None]
+    bow = 4 * place * (1 - place)
+    upright = np.cross(u, level)
+    bends = [bow * dot(direction, edges.normal)[:, None] for direction in (level, upright)]
+    outward = np.stack([2 * place - 1, *bends], axis=-1)
+    # a plane that holds the displaced points: rays . dn = -outward / distance
+    by_turn = (points / distance[..., None]) @ edges.basis
+    turn = np.linalg.pinv(by_turn) @ (-outward / distance[..., None])
+    own = np.eye(machine.n_legs)[edges.leg]
+    effect = np.einsum("nij,nl->nijl", turn, own).reshape(len(edges), 2, -1)
+    yield Component("legs.shape", Effect(edges=effect), (np.eye(effect.shape[-1]),))
+
+
+def with_discrepancy(
+    measurements: Measurements, estimate: Estimate, problem: Problem, discrepancy: Discrepancy
+) -> Estimate:
+    """The estimate whose covariances contain the discrepancy; problem : as the estimate ended."""
+    if not discrepancy.scales:
+        return estimate
+    machine, shared, u = estimate.machine, discrepancy.shared, problem.unknowns
+    gauge = default_gauge(machine)
+    more = machine_covariance(problem, machine, estimate.state, shared, gauge)
+    joint = estimate.joint_covariance + more
+    n, variance = len(machine.values), np.diag(shared)
+    optics, factor = own_blocks(shared, u.optics, u.n_optics), measurements.intrinsics_factor
+    return replace(
+        estimate,
+        joint_covariance=joint,
+        # what is left out may make a value less sure than the drawing alone has it
+        data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
+        edge_shift_sigma=np.sqrt(estimate.edge_shift_sigma**2 + optics[:, 0, 0]),
+        intrinsics_covariance=estimate.intrinsics_covariance
+        + factor @ optics[:, 1:, 1:] @ factor.mT,
+        breathing_sigma=np.sqrt(estimate.breathing_sigma**2 + variance[u.breathing]),
+        size_sigma=np.sqrt(estimate.size_sigma**2 + variance[u.sizes]),
+    )
+
+
+def bed_surface(
+    measurements: Measurements, estimate: Estimate, discrepancy: Discrepancy
+) -> BedSurface:
+    """The bed's map, by the discrepancy's coefficients given the data."""
+    felt, poses = height_rows(measurements), measurements.poses
+    heights = [
+        np.zeros((len(felt), effect.count)) if effect.poses is None else effect.poses[felt, 5]
+        for effect in discrepancy.random.effects
+    ]
+    by = np.concatenate(heights, axis=1) @ discrepancy.random.root
+    place = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
+    variance = np.einsum("ni,ij,nj->n", by, discrepancy.covariance, by)
+    return BedSurface(
+        poses.configuration[felt],
+        place[:, 0],
+        place[:, 1],
+        by @ discrepancy.mean,
+        np.sqrt(np.maximum(variance, 0.0)),
+    )
+
+
+def model_errors(
+    discrepancy: Discrepancy,
+    tool: ToolError,
+    before: ToolError,
+    unit: str,
+    surface: BedSurface | None,
+) -> tuple[ModelError, ...]:
+    """The components found, with what they make of the tool's standard deviation.
+
+    tool, before : with the discrepancy and without. unit : of the readings. surface : of the bed,
+    where it is among them.
+    """
+    with_, without = (float(np.sqrt(np.nanmean(x.position**2))) for x in (tool, before))
+    return tuple(
+        ModelError(
+            one.code,
+            one.scale,
+            one.ratio,
+            with_,
+            without,
+            unit if one.code.startswith("readings") else "m",
+            discrepancy.sure,
+            one.length,
+            surface if one.code == UNEVEN_BED else None,
+        )
+        for one in discrepancy.scales
+    )

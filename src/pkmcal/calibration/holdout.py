@@ -1,0 +1,234 @@
+"""Configurations put aside before an estimate is made: which, and the estimate without them.
+
+They are spread over the workspace, or a region of it. What the calibrated machine then predicts of
+them is judged in :mod:`pkmcal.judge.holdouts`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import Measurements, Observation
+from pkmcal.mechanisms import Machine
+from pkmcal.session.readings import same_pose
+from pkmcal.wording import count
+
+FEWEST_TO_CALIBRATE = 3
+"""Configurations without which a calibration of the rest means nothing."""
+
+MOST_CLUSTERING_ROUNDS = 100
+NAMED_REGION_OFFSET = 0.7
+"""Standard deviations of the whole workspace by which a region must lie off its middle to be named
+by that direction."""
+REGION_DIRECTION_NAMES = (
+    ("turned about −x", "turned about +x"),
+    ("turned about −y", "turned about +y"),
+    ("turned about −z", "turned about +z"),
+    ("towards −x", "towards +x"),
+    ("towards −y", "towards +y"),
+    ("low", "high"),
+)
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Configurations beside each other. rows : (n,) which. name : where, in words."""
+
+    rows: Integers
+    name: str
+
+
+@dataclass(frozen=True)
+class Holdout:
+    """Configurations that an estimate did not see, to judge it by.
+
+    region : which. measurements : of these and of those in use.
+    """
+
+    region: Neighbours
+    measurements: Measurements
+
+
+def points_of_poses(machine: Machine, poses: Array) -> Array:
+    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
+    then positions; both from the mean.
+    """
+    joints = machine.platform_centers()
+    radius = float(np.sqrt(np.mean(np.sum((joints - joints.mean(axis=0)) ** 2, axis=1))))
+    turns = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    out = np.concatenate([turns * radius, poses[:, :3, 3]], axis=1)
+    return out - out.mean(axis=0)
+
+
+def clusters(points: Array, n: int) -> Integers:
+    """Number (k,) of each point's cluster: k-means, begun at points far from one another.
+
+    No random draw: the same points give the same clusters.
+    """
+    centres = points[[int(np.argmax(np.sum(points**2, axis=1)))]]
+    for _ in range(n - 1):
+        far = _distances(points, centres).min(axis=1)
+        centres = np.concatenate([centres, points[[int(np.argmax(far))]]])
+    owner = np.argmin(_distances(points, centres), axis=1)
+    for _ in range(MOST_CLUSTERING_ROUNDS):
+        inside = owner[:, None] == np.arange(n)
+        centres = (inside.T @ points) / np.maximum(inside.sum(axis=0), 1)[:, None]
+        new = np.argmin(_distances(points, centres), axis=1)
+        if np.array_equal(new, owner) or len(np.unique(new)) < n:
+            break
+        owner = new
+    return owner
+
+
+def spread(points: Array, n: int) -> Integers:
+    """Some points, n in rising order, spread over all: the middle one of each of n clusters."""
+    owner = clusters(points, n)
+    chosen: list[int] = []
+    for k in range(n):
+        rows = np.flatnonzero(owner == k)
+        middle = points[rows].mean(axis=0)
+        chosen.append(int(rows[np.argmin(np.sum((points[rows] - middle) ** 2, axis=1))]))
+    return np.sort(np.array(chosen))
+
+
+def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
+    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`points_of_poses`."""
+    owner = clusters(points, n)
+    scale = points.std(axis=0)
+    scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves
+    results = [np.flatnonzero(owner == k) for k in range(n)]
+    return tuple(
+        Neighbours(rows[own], _named(points[own].mean(axis=0) / scale))
+        for own in results
+        if own.size
+    )
+
+
+def _named(middle: Array) -> str:
+    """A region by the two directions in which it lies off the middle the most."""
+    order = np.argsort(-np.abs(middle))[:2]
+    words = [
+        REGION_DIRECTION_NAMES[k][int(middle[k] > 0)]
+        for k in order
+        if abs(middle[k]) > NAMED_REGION_OFFSET
+    ]
+    return ", ".join(words) or "the middle"
+
+
+def _distances(points: Array, centres: Array) -> Array:
+    """Squared distances (k, n)."""
+    return np.sum((points[:, None] - centres) ** 2, axis=-1)
+
+
+def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
+    """Configurations of n poses, to hold out, spread over the workspace.
+
+    One that is in use tells of the others of its pose what they read: all of a pose are held out.
+    """
+    rows, pose = _poses(whole, measurements)
+    first, at = np.unique(pose, return_index=True)
+    _check(n, first.size - n, first.size, "configurations held out")
+    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
+    out = np.isin(pose, first[spread(points, n)])
+    return Neighbours(rows[out], "spread over the workspace")
+
+
+def by_region(
+    drawing: Machine, whole: Estimate, measurements: Measurements, n: int
+) -> tuple[Neighbours, ...]:
+    """The configurations that were seen, in n regions of the workspace, those of a pose in one."""
+    rows, pose = _poses(whole, measurements)
+    first, at = np.unique(pose, return_index=True)
+    _check(n, first.size - first.size // n, first.size, "regions")
+    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
+    return tuple(
+        replace(region, rows=rows[np.isin(pose, region.rows)])
+        for region in regions(points, first, n)
+    )
+
+
+def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integers]:
+    """The configurations that were seen (n,), and the row of each one's pose (n,)."""
+    rows = np.flatnonzero(whole.configurations)
+    if not rows.size:
+        return rows, rows
+    return rows, same_pose(measurements.joints[rows], measurements.joint_noise)
+
+
+def _check(n: int, remainder: int, total: int, what: str) -> None:
+    """Raise InputError where n poses or regions, of a total, leave too few poses to calibrate."""
+    if (
+        n >= 1
+        and remainder >= max(FEWEST_TO_CALIBRATE, total // 2)
+        and not (what == "regions" and n < 2)
+    ):
+        return
+    least = 2 if what == "regions" else 1
+    most = total if what == "regions" else total - max(FEWEST_TO_CALIBRATE, total // 2)
+    if most < least:
+        raise InputError(
+            "there are too few configurations to hold any out",
+            found=f"{count(total, 'pose')} seen",
+            expected=f"{2 * FEWEST_TO_CALIBRATE} at least; configurations whose readings"
+            " are equal within their noise are of one pose",
+            next_step="Photograph more configurations",
+        )
+    raise InputError(
+        f"this number of {what} is not possible",
+        found=str(n),
+        expected=f"{least} to {most}, for {count(total, 'pose')} seen",
+    )
+
+
+def select(measurements: Measurements, keep: Booleans) -> Measurements:
+    """The measurements of some configurations (K,); readings keep their rows. Links stay where both
+    of their configurations do.
+
+    Boards on the base hang on no configuration and stay.
+    """
+    edges, poses = measurements.edges, measurements.poses
+    on_base = ~measurements.on_platform[poses.mount]
+    return replace(
+        measurements.with_links(measurements.links_among(keep)),
+        edges=edges.select(keep[edges.configuration]),
+        poses=poses.select(keep[poses.configuration] | on_base),
+    )
+
+
+def estimate_without(
+    drawing: Machine, turns: RefinementResult, out: Neighbours
+) -> RefinementResult:
+    """What the last turn left, as if a region's configurations had not been taken.
+
+    They did help to find legs in the photographs; no number of the estimate comes from them.
+    """
+    keep = np.ones(len(turns.measurements.joints), dtype=bool)
+    keep[out.rows] = False
+    measurements = select(turns.measurements, keep)
+    return turns._replace(
+        observation=replace(_without(turns.observation, keep), poses=measurements.poses),
+        measurements=measurements,
+        estimate=bundle(drawing, measurements, turns.estimate.state),
+    )
+
+
+def _without(observation: Observation, keep: Booleans) -> Observation:
+    """An observation of the configurations to keep, (K,), edges renumbered."""
+    retained = keep[observation.edges.configuration]
+    points = retained[observation.point_edge]
+    numbers = np.cumsum(retained) - 1
+    return replace(
+        observation,
+        edges=observation.edges.select(retained),
+        rejected=tuple(r for r in observation.rejected if keep[r.configuration]),
+        points=observation.points[points],
+        point_edge=numbers[observation.point_edge[points]],
+    )

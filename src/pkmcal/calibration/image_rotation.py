@@ -1,0 +1,146 @@
+"""Photographs that are upside down against their camera's file, told by their edges.
+
+A program that turns photographs by half shows the machine as well as before, from a station that is
+turned, too, and no look at them tells. But the camera's centre is then on the other side of the
+picture's middle, which no place of the camera makes up for. So the way from a camera to the same
+one turned is a departure of one number (:mod:`pkmcal.identify.score`), whose fit is 0 where the
+file is right and 1 where the photographs are upside down. Where the edges are sure of that, these
+are measured by the camera turned by half; where it is but likelier, the verdict says so. A camera
+that is estimated with the machine is not asked about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.model_violations import CameraChange
+from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.cameras import Camera
+from pkmcal.cameras.files import written_camera
+from pkmcal.identify.bundle import linearize_at_solution
+from pkmcal.identify.score import ScoreTests
+from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.session.load import Session
+
+ODDS_FOR_UPSIDE_DOWN = 1000.0
+"""Odds from which the edges overrule the file."""
+ODDS_FOR_UPRIGHT = 20.0
+"""Odds from which the photographs of one of session.yaml's stations are upright, so that those of
+the same camera are not taken to be turned alike."""
+ODDS_TO_REPORT = 20.0
+"""Odds from which photographs that may be upside down are said to be so."""
+FURTHER_THAN_TURNED = 1.5
+"""Times the way, from which what fits is neither camera, though one is nearer."""
+USUAL_CENTRE_ERROR = 1.5
+"""px; of a calibrated camera's centre along the way, where the file does not say."""
+LEAST_CENTRE_ERROR = 1e-6
+"""px; of a centre that a file holds to be exact."""
+
+
+@dataclass(frozen=True)
+class UpsideDown:
+    """A camera's file against which photographs are upside down. entries : of session.yaml's
+    stations. camera : the one that took them, as they are. log_odds : for that.
+    """
+
+    file: str
+    entries: tuple[str, ...]
+    camera: Camera
+    log_odds: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether they are measured so."""
+        return self.log_odds > np.log(ODDS_FOR_UPSIDE_DOWN)
+
+    @property
+    def finding(self) -> Finding:
+        """A note where the edges are sure, else a warning."""
+        facts = {"file": self.file, "stations": self.entries, "log_odds": self.log_odds}
+        if not self.sure:
+            return doubtful(
+                "image.perhaps_upside_down", self.file, **facts, odds=float(np.exp(self.log_odds))
+            )
+        x, y = self.camera.document()["center"]
+        return note(
+            "image.upside_down",
+            self.file,
+            **facts,
+            odds=ODDS_FOR_UPSIDE_DOWN,
+            centre_x=x,
+            centre_y=y,
+            written=written_camera(self.file),
+        )
+
+
+def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, ...]:
+    """The cameras against whose files the photographs are upside down, or may well be."""
+    changed = CameraChange.of(session, turns.observation, turns.measurements)
+    refined = turns.measurements.intrinsics_factor.shape[-1] > 0
+    if changed is None or refined or not len(turns.measurements.edges):
+        return ()
+    entries = np.array([station.entry for station in session.stations])
+    cameras = {station.entry: (station.camera_file, station.camera) for station in session.stations}
+    ways = {entry: _half_turn_change(camera) for entry, (_, camera) in cameras.items()}
+    effects = [
+        changed.effect(entries == entry, attempt[:, None]) for entry, attempt in ways.items()
+    ]
+    fits = ScoreTests(*linearize_at_solution(turns.measurements, turns.estimate), effects).fitted(
+        range(len(effects))
+    )
+    out = list[UpsideDown]()
+    for file, camera in dict(cameras.values()).items():
+        own = [k for k, (mine, _) in enumerate(cameras.values()) if mine == file]
+        value = np.concatenate([fits[k].value for k in own])
+        sigma = np.concatenate([fits[k].sigma for k in own])
+        reference_values = _file_sigma(camera)
+        alone = [_log_odds(value[[k]], sigma[[k]], reference_values) for k in range(len(own))]
+        odds = _log_odds(value, sigma, reference_values)
+        if odds > np.log(ODDS_TO_REPORT) and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
+            names = tuple(list(cameras)[k] for k in own)
+            out.append(UpsideDown(file, names, camera.turned_by_half(), odds))
+    return tuple(out)
+
+
+def _half_turn_change(camera: Camera) -> Array:
+    """Change (n,) of a camera's parameters to those of the same turned by half."""
+    return camera.turned_by_half().parameters - camera.parameters
+
+
+def _file_sigma(camera: Camera) -> float:
+    """Standard deviation of how far along the way a camera may be from what its file says, by its
+    centre.
+    """
+    centre = _half_turn_change(camera)[2:4]
+    length = float(np.linalg.norm(centre))
+    if not length:
+        return np.inf
+    if camera.covariance is None:
+        return USUAL_CENTRE_ERROR / length
+    reference_values = camera.covariance[2:4, 2:4] + LEAST_CENTRE_ERROR**2 * np.eye(2)
+    return float(centre @ np.linalg.solve(reference_values, centre)) ** -0.5
+
+
+def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
+    """For the end of the way against its begin, by what fits of some stations, (n,) with its
+    deviations; nothing where nothing is told, or it is another camera.
+    """
+    weight = sigma**-2.0
+    if not weight.any():
+        return 0.0
+    mean = float(weight @ value / weight.sum())
+    variance = float(1 / weight.sum()) + file_sigma**2
+    return (2 * mean - 1) / (2 * variance) if mean < FURTHER_THAN_TURNED else 0.0
+
+
+def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:
+    """The session with other cameras in the place of some files'."""
+    stations = tuple(
+        replace(station, camera=cameras.get(station.camera_file, station.camera))
+        for station in session.stations
+    )
+    return replace(session, stations=stations)

@@ -1,0 +1,458 @@
+"""Recognising the machine in a session's photographs: what `check` and `calibrate` begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import THREADS, Array, Booleans, Integers
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
+from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.observe import legs
+from pkmcal.observe.distance_tables import distance_tables
+from pkmcal.observe.hypotheses import SuspectStation, mistake
+from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
+from pkmcal.observe.pose_likelihood import StationView
+from pkmcal.observe.station_localization import LocalizedPose, find_station
+from pkmcal.session.image_files import label_of
+from pkmcal.session.load import Session, Station
+from pkmcal.session.poses import check_lengths
+from pkmcal.session.readings import frozen
+from pkmcal.wording import listed
+
+MOST_AT_A_STATION, MOST_IN_ALL = 64, 128
+"""Photographs in which the machine is looked for, spread over a station's and shared among the
+stations: a search looks at eight, and of thirty that are asked whether the machine is there, each
+surer by one standard deviation says so by 5 of them together. Their tables take 200 to 400 MB."""
+FEWEST_AT_A_STATION = 8
+"""However many stations there are: what a search looks at."""
+CalibrationProgress = Callable[[str, float], None]
+"""Called with a sentence about the present step and the share that is done, 0 to 1."""
+ALLOWED_LEG_MISS = 2.0
+"""Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
+LEAST_REACHED_SHARE = 0.5
+"""Share of the configurations that the drawing has to reach for the rest to be believed."""
+ALMOST_ALL = 0.9
+
+
+def check_observable(session: Session) -> None:
+    """What the session's form allows but this observation cannot use."""
+    session.machine.check_free(f"{session.document['mechanism']}, fixed")
+    visible = [station.name for station in session.stations if "legs" in station.observe]
+    if visible and not any(leg.tubes for leg in session.machine.document.legs):
+        raise InputError(
+            "no leg of the drawing has visible cylinders",
+            where=f"{session.document['mechanism']}, legs",
+            expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
+            next_step="Measure the legs' radii with calipers",
+        )
+
+
+def read_photographs(session: Session) -> list[Photographs]:
+    """The photographs of stations that observe legs, each of which can be decoded; the first that
+    fit into CACHED_IMAGE_BYTES bytes stay so.
+    """
+
+    def read(number: int, most: int) -> Photographs:
+        station = session.stations[number]
+        paths, labels = photograph_files(session, station)
+        images = Pictures.read(paths, station.camera.image_size, labels, most)
+        rows = np.array([p.configuration for p in station.photographs])
+        readings = session.joints[rows]
+        return Photographs(
+            number, station.camera, rows, readings, images, station.response,
+            legs.first_binning(station.camera.image_size),
+        )  # fmt: skip
+
+    numbers, room, retained = legs_stations(session), CACHED_IMAGE_BYTES, list[int]()
+    for number in numbers:
+        station = session.stations[number]
+        size = station.camera.image_size
+        retained.append(min(fitting(size, room), len(station.photographs)))
+        room -= retained[-1] * size[0] * size[1]
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(read, numbers, retained))
+
+
+def photograph_files(session: Session, station: Station) -> tuple[list[Path], list[str]]:
+    """Paths of a station's photographs, and what they are called in messages."""
+    paths = [photo.path for photo in station.photographs]
+    return paths, [label_of(session.folder, path) for path in paths]
+
+
+def legs_stations(session: Session) -> list[int]:
+    """Numbers of the stations that observe legs."""
+    return [k for k, station in enumerate(session.stations) if "legs" in station.observe]
+
+
+def platform_poses(session: Session, *, most: bool = False) -> Array:
+    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none.
+
+    most : be content where the drawing can take the readings of most configurations. What is
+    measured of the platform may tell the rest, for a motor's zero is drawn to degrees at best.
+    """
+    try:
+        fk = session.machine.forward_result(session.joints)
+    except GeometryError as error:  # the drawing is the user's: it is at fault
+        raise error.as_input(session.document["mechanism"]) from None
+    # near the ends of its workspace a drawing that is right to its tolerance may not close
+    near = fk.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
+    if near.all() or (most and near.mean() > LEAST_REACHED_SHARE):
+        _check_turns(session, fk.T_base_platform, near)
+        return fk.T_base_platform
+    bad = [session.configurations[k] for k in np.flatnonzero(~near)]
+    _check_columns(session, bad)
+    raise InputError(
+        "the drawing's machine cannot take these readings: its legs do not meet the platform",
+        where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
+        found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
+        expected="readings at which all legs reach the platform",
+        next_step="Check these readings, the order of their columns, and the drawing's centres",
+    )
+
+
+def _check_columns(session: Session, bad: list[str]) -> None:
+    """Raise `InputError` where one motor's readings never change, so that the loops do not close,
+    or would close them all with the other sign.
+    """
+    if error := frozen_in(session):
+        raise error
+    machine = session.machine
+    now = _taken(session, session.joints)
+    for column, name in enumerate(session.document["joints"]["columns"]):
+        turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
+        if _taken(session, turned) > max(ALMOST_ALL, now):
+            raise InputError(
+                f"the readings of {name} have the wrong sign",
+                where=f"{session.document['joints']['file']}, column {name}",
+                found=f"readings that the machine cannot take in configuration {listed(bad)}",
+                expected="the other sign of this column, with which its legs meet the platform",
+                next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            )
+
+
+def _taken(session: Session, joints: Array) -> float:
+    """Share of the readings (K, m) that the drawing's machine can take."""
+    fk = session.machine.forward_result(joints)
+    turn = _turn(fk.T_base_platform)
+    return float(np.mean(fk.converged & ~(np.abs(turn) > session.machine.most_turn[0])))
+
+
+def _turn(poses: Array) -> Array:
+    """Turns (K,) about z, rad."""
+    return np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+
+
+def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
+    """Raise `InputError` where an articulated platform would turn by more than its parts allow."""
+    turn, (most, obstacle) = _turn(poses), session.machine.most_turn
+    bad = np.flatnonzero((np.abs(turn) > most) & usable)
+    if not bad.size:
+        return
+    _check_columns(session, [session.configurations[k] for k in bad])
+    worst = bad[np.argmax(np.abs(turn[bad]))]
+    raise InputError(
+        f"the readings turn the platform beyond {np.rad2deg(most):.0f} degrees, where {obstacle}",
+        where=f"{session.document['joints']['file']}, configuration"
+        f" {listed([session.configurations[k] for k in bad])}",
+        found=f"{np.rad2deg(turn[worst]):.1f} degrees "
+        f"(configuration {session.configurations[worst]})",
+        expected=f"less than {np.rad2deg(most):.0f} degrees to either side",
+        next_step="Check these readings, and the zero of the motors",
+    )
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Where the search for each station's pose ended.
+
+    used : numbers of the photographs that were looked at, by station; views : of these.
+    """
+
+    views: tuple[StationView, ...]
+    localizations: tuple[LocalizedPose, ...]
+    used: tuple[Integers, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the machine was recognised in every station's photographs."""
+        return all(pose.good for pose in self.localizations)
+
+
+def recognise(
+    session: Session,
+    photographs: list[Photographs],
+    poses: Array,
+    rngs: list[np.random.Generator],
+    boards: Boards | None = None,
+    starts: Array | None = None,
+) -> Recognition:
+    """Look for the machine in the photographs of every station that observes legs, nothing raised.
+
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
+    boards : on the base, give stations without a pose by hand a start, from the stations that were
+    found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
+    A station that is not found from there is looked for anywhere. Of stations of many photographs
+    some are looked at, spread over all.
+    """
+    boards = boards or Boards()
+    machine = session.machine
+    most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(photographs), 1))
+    in_view = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in photographs)
+
+    def view(p: Photographs) -> StationView:
+        tables = distance_tables(p.images)
+        return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
+
+    at = [p.station for p in photographs]
+    start_poses = [station.T_camera_base for station in session.stations]
+    if starts is not None:
+        start_pairs = zip(start_poses, starts[: len(start_poses)], strict=True)
+        start_poses = [
+            T if T is not None or np.isnan(start).any() else start for T, start in start_pairs
+        ]
+    # one station after the other: what works its tables out uses all threads
+    views = tuple(view(p.select(numbers)) for p, numbers in zip(photographs, in_view, strict=True))
+    solution = _searched(views, [start_poses[s] for s in at], [None] * len(at), rngs)
+    # Through the board a pose by hand would be off by its angle times the stations' distance, so
+    # the rest are searched from where the search has ended with those that were found.
+    good: list[Array | None] = [None] * len(start_poses)
+    for s, pose in zip(at, solution, strict=True):
+        good[s] = pose.T_camera_base if pose and pose.good else None
+    ahead = boards.joined(good)
+    solution = _searched(views, [ahead[s] for s in at], solution, rngs)
+    return Recognition(views, tuple(_anywhere(views, solution, rngs)), in_view)
+
+
+Search = LocalizedPose | None
+
+
+def _searched(
+    views: tuple[StationView, ...],
+    starts: list[Array | None],
+    before: Sequence[Search],
+    rngs: list[np.random.Generator],
+) -> list[Search]:
+    """What is found already, and else the search from each start that there is."""
+
+    def search(
+        view: StationView, start: Array | None, before: Search, rng: np.random.Generator
+    ) -> Search:
+        if start is None or (before and before.good):
+            return before
+        return _better(find_station(view, start, rng), before)
+
+    # one after the other: arrays about a known pose are so small that threads wait for one another
+    return list(map(search, views, starts, before, rngs))
+
+
+def _anywhere(
+    views: tuple[StationView, ...], before: Sequence[Search], rngs: list[np.random.Generator]
+) -> list[LocalizedPose]:
+    """What is surely found already, and else the better of it and of the search all round."""
+
+    def search(view: StationView, before: Search, rng: np.random.Generator) -> LocalizedPose:
+        if before and before.sure:
+            return before
+        return _better(find_station(view, None, rng), before)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(search, views, before, rngs))
+
+
+def _better(one: LocalizedPose, other: Search) -> LocalizedPose:
+    if other is None:
+        return one
+    return max(one, other, key=lambda item: (item.good, item.log_likelihood_ratio))
+
+
+def mistake_in(
+    session: Session,
+    photographs: list[Photographs],
+    recognition: Recognition,
+    rng: np.random.Generator,
+) -> InputError | None:
+    """The error about stations that were not recognised, or show something else than the session
+    says: the usual mix-ups are tried. A reading that never moved is named before all others, for it
+    may look like any of them.
+    """
+    stations = [session.stations[p.station] for p in photographs]
+    error = mistake(
+        [
+            SuspectStation(
+                station.name,
+                [label_of(session.folder, station.photographs[k].path) for k in visible],
+                session.configurations,
+                view,
+                station.T_camera_base,
+                item,
+            )
+            for station, view, item, visible in zip(
+                stations,
+                recognition.views,
+                recognition.localizations,
+                recognition.used,
+                strict=True,
+            )
+        ],
+        rng,
+    )
+    return error and (frozen_in(session) or error)
+
+
+def frozen_in(session: Session) -> InputError | None:
+    """The error about readings that never moved."""
+    joints = session.document["joints"]
+    return frozen(session.joints, session.joint_noise, joints["columns"], joints["file"])
+
+
+class StationSearch(NamedTuple):
+    """Where the search for all stations ended.
+
+    recognition : of the machine in the photographs that were searched, one a station, None where
+    none was. T_camera_base : (S, 4, 4), NaN of photographs by hand that nothing tells yet. error :
+    why one that is not by hand is not known, or what is mixed up; poses are then incomplete.
+    """
+
+    recognition: Recognition | None
+    T_camera_base: Array
+    error: PkmcalError | None
+
+
+def localize_stations(
+    session: Session,
+    photographs: list[Photographs],
+    boards: Boards,
+    rng: np.random.Generator,
+    progress: CalibrationProgress | None = None,
+) -> Array:
+    """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`locate_stations`.
+
+    Raises `InputError`, or `ResultError`, where nothing tells one that is not by hand.
+    """
+    value = locate_stations(session, photographs, boards, rng, progress)
+    if value.error is not None:
+        raise value.error
+    return value.T_camera_base
+
+
+def locate_stations(
+    session: Session,
+    photographs: list[Photographs],
+    boards: Boards,
+    rng: np.random.Generator,
+    progress: CalibrationProgress | None = None,
+) -> StationSearch:
+    """The poses of all stations, each by the first that tells it: what is known before any leg is
+    looked for, the search for the legs, and what measured poses tell. Nothing is raised.
+
+    photographs : in which the machine is looked for, none by hand. progress : called with the step
+    in words and the share done.
+    """
+    nowhere = np.full((len(session.station_names), 4, 4), np.nan)
+    value: Recognition | None = None
+    try:
+        start_poses = prior_station_poses(session, boards)
+        poses = platform_poses(session) if photographs else nowhere
+    except PkmcalError as error:
+        return StationSearch(None, nowhere, error)
+    if photographs:
+        rngs = rng.spawn(len(photographs) + 1)
+        progress = progress or (lambda _text, _share: None)
+        count = sum(len(p.images) for p in photographs)
+        progress(f"Recognising the machine in {count} photographs", 0.2)
+        value = recognise(session, photographs, poses, rngs[1:], boards, start_poses)
+        progress("Comparing with what is often mixed up", 0.3)
+        mixed_up = mistake_in(session, photographs, value, rngs[0])
+        if mixed_up is not None:
+            return StationSearch(value, start_poses, mixed_up)
+        start_poses[[p.station for p in photographs]] = [
+            pose.T_camera_base for pose in value.localizations
+        ]
+        visible = [None if np.isnan(T).any() else T for T in start_poses[: len(session.stations)]]
+        for k, T in enumerate(boards.joined(visible)):
+            start_poses[k] = start_poses[k] if T is None else T
+    by_hand = [s.handheld for s in session.stations] + [False] * len(session.trackers)
+    if not (np.isnan(start_poses[:, 0, 0]) & ~np.array(by_hand, dtype=bool)).any():
+        return StationSearch(value, start_poses, None)
+    try:
+        return StationSearch(value, _by_poses(session, boards, start_poses), None)
+    except PkmcalError as error:
+        return StationSearch(value, start_poses, error)
+
+
+def prior_station_poses(session: Session, boards: Boards) -> Array:
+    """T_camera_base (S, 4, 4) of all stations before any leg is looked for: as the session says, or
+    by what a board on the platform tells; NaN where neither does.
+    """
+    given = [station.T_camera_base for station in session.stations]
+    given = boards.joined(given) + _tracker_starts(session)
+    reference_values = np.array([np.full((4, 4), np.nan) if T is None else T for T in given])
+    reference_values = reference_values.reshape(-1, 4, 4)
+    by_hand = np.array([station.handheld for station in session.stations], dtype=bool)
+    lost = np.isnan(reference_values[: len(session.stations), 0, 0]) & ~by_hand
+    legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))
+    if boards.body == "base" or not boards.stations or legs_tell or not lost.any():
+        return reference_values
+    return _by_poses(session, boards, reference_values)
+
+
+def _by_poses(session: Session, boards: Boards, start_poses: Array) -> Array:
+    """Stations (S, 4, 4) with those that are not known (NaN) by what measured poses tell.
+
+    Raises `InputError`, or `ResultError`, where they tell too little.
+    """
+    from pkmcal.papers.hand_eye import start_from_poses
+
+    measurements = measurements_of(session, boards)
+    try:
+        return start_from_poses(session.machine, measurements, start_poses).T_camera_base
+    except (InputError, ResultError) as error:
+        lost = session.station_names[int(np.flatnonzero(np.isnan(start_poses[:, 0, 0]))[0])]
+        raise error.located(f"session.yaml, stations.{lost}") from None
+
+
+def _tracker_starts(session: Session) -> list[Array | None]:
+    """First poses of trackers whose points or heights do not tell their turn."""
+    if not session.trackers and not session.links:
+        return []
+    try:
+        fk = session.machine.forward_result(session.joints)
+    except GeometryError:
+        return [None] * len(session.trackers)
+    poses = np.where(fk.converged[:, None, None], fk.T_base_platform, np.nan)
+    for table in session.trackers:
+        check_lengths(table, poses)
+    for links in session.links:
+        kinds_of(LinkKind)[links.kind].check_start(links, poses)
+    return [table.start(poses) for table in session.trackers]
+
+
+def boards_of(session: Session, photographs: list[Photographs]) -> Boards:
+    """The session's board in its photographs; see :func:`pkmcal.boards.stations.find_boards`.
+
+    Photographs that only show the board are decoded one by one, as they are looked at.
+    """
+    if session.board is None:  # as most, and what looks for boards takes a while to load
+        return Boards()
+    from pkmcal.boards.stations import find_boards
+
+    return find_boards(session, board_images(session, photographs))
+
+
+def board_images(session: Session, photographs: list[Photographs]) -> dict[int, Sequence[Integers]]:
+    """All stations' photographs by their number: decoded already, or when they are looked at."""
+    images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
+    for number, station in enumerate(session.stations):
+        if number not in images:
+            paths, labels = photograph_files(session, station)
+            images[number] = Pictures(paths, station.camera.image_size, labels)
+    return images

@@ -1,0 +1,88 @@
+"""Whether a saved calibration and a session are of one machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.calibration.saved_calibration import SavedCalibration, load
+from pkmcal.errors import InputError
+from pkmcal.session.load import Session, load_session
+from pkmcal.wording import listed
+
+OTHER_MACHINE_TOLERANCES = 10.0
+"""Tolerances by which two drawings of one machine may differ: a corrected number, not another
+machine's."""
+
+
+def read_same_machine(
+    calibration: SavedCalibration | Path | str, session: Session | Path | str
+) -> tuple[SavedCalibration, Session]:
+    """Both, where they are not loaded. Raises InputError where the session is another machine's."""
+    saved = calibration if isinstance(calibration, SavedCalibration) else load(calibration)
+    if not isinstance(session, Session):
+        session = load_session(session)
+    _check_joints(saved, session)
+    _check_machine(saved, session)
+    return saved, session
+
+
+def _check_machine(saved: SavedCalibration, session: Session) -> None:
+    """Raise `InputError` where the session is another machine's.
+
+    Readings' scales tell no machine from another: the one may have them exact, as calibrations of
+    earlier versions have, and the other not.
+    """
+    machine, drawn = saved.machine, session.machine
+    rows, own = (np.flatnonzero(np.array(m.parameters.kinds) != "scale") for m in (machine, drawn))
+    names, wanted = machine.parameters.names, drawn.parameters.names
+    if [names[k] for k in rows] != [wanted[k] for k in own]:
+        raise _another(
+            f"{machine.name}, {machine.n_legs} legs, {len(machine.parameters)} parameters",
+            f"{drawn.name}, {drawn.n_legs} legs, {len(drawn.parameters)} parameters",
+        )
+    table = drawn.parameters
+    values = table.unit_axes(drawn.values)[own]
+    before = saved.drawing[rows], machine.values[rows]
+    off = [np.abs(values - v) / table.tolerance[own] for v in before]
+    if min(o.max(initial=0.0) for o in off) > OTHER_MACHINE_TOLERANCES:
+        k = int(np.argmax(off[0]))
+        raise _another(
+            f"{wanted[own[k]]} {before[0][k]:.6g} in its drawing",
+            f"{values[k]:.6g} in the session's, {off[0][k]:.0f} tolerances off",
+        )
+
+
+def _another(calibrated: str, text: str) -> InputError:
+    return InputError(
+        "the calibration is of another machine than the session",
+        where="session.yaml, mechanism",
+        found=text,
+        expected=calibrated,
+        next_step="Give the calibration of this machine, or the session's own drawing",
+    )
+
+
+def _check_joints(saved: SavedCalibration, session: Session) -> None:
+    old, new = (_columns(d) for d in (saved.document.get("session"), session.document))
+    if not old or not new or old == new:
+        return
+    common = [name for name in new if name in old]
+    raise InputError(
+        "the session reads other joints than the calibration"
+        if common
+        else "the session and the calibration have no joint in common",
+        where="joints.csv, line 1",
+        found=listed(new, 8),
+        expected=listed(old, 8),
+        next_step="Give the calibration of this machine, with the columns in the same order",
+    )
+
+
+def _columns(document: Any) -> list[str]:
+    """The readings' columns by a session's document, empty where it tells none."""
+    joints = document.get("joints") if isinstance(document, dict) else None
+    columns = joints.get("columns") if isinstance(joints, dict) else None
+    return [str(name) for name in columns] if isinstance(columns, list) else []

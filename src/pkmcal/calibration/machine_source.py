@@ -1,0 +1,231 @@
+"""A machine to be used: calibrated, drawn or built in, with the cameras that saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.results import (
+    CALIBRATED_MECHANISM_FILE,
+    CALIBRATION_DOCUMENT_FILE,
+)
+from pkmcal.calibration.saved_calibration import SavedCalibration, load
+from pkmcal.cameras.contract import Camera
+from pkmcal.cameras.files import camera_path, load_camera, written_camera
+from pkmcal.errors import InputError, legible
+from pkmcal.files import closest, resolved
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms import Machine, catalogue, load_mechanism
+from pkmcal.wording import listed
+
+SESSION_FILE = "session.yaml"
+
+
+@dataclass(frozen=True)
+class MachineSource:
+    """A machine to export or to control, and how far to trust it.
+
+    machine : with the values to use. sigma, covariance : (P,) and (P, P) of its parameters;
+    None for a drawing. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
+    station's camera is missing where its file was not found.
+    headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
+    : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
+    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes. bed : z (m, base frame)
+    of the platform's origin on a bed that was felt, None where none was. session : the
+    calibration's session and its digest, in words; empty for a drawing.
+    """
+
+    machine: Machine
+    sigma: Array | None = None
+    cameras: Mapping[str, Camera] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Camera]())
+    )
+    T_base_camera: Mapping[str, Array] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Array]())
+    )
+    headline: str = "Drawing only, not calibrated."
+    usable: bool = True
+    origin: str = ""
+    covariance: Array | None = None
+    reasons: tuple[str, ...] = ()
+    calibrated: bool = False
+    frames: str = "as in the mechanism file"
+    sigma_camera: Mapping[str, Array] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Array]())
+    )
+    bed: float | None = None
+    session: str = ""
+
+    @property
+    def identity(self) -> str:
+        """Where the values are from, and their short digest: many calibrations have one name."""
+        values = np.asarray(self.machine.values + 0.0, dtype="<f8")
+        digest = blake2b(values.tobytes(), digest_size=4).hexdigest()
+        parts = (self.origin, self.session, f"values {digest}", "" if self.usable else "refused")
+        return ", ".join(part for part in parts if part)
+
+    def sigma_of(self, name: str) -> float | None:
+        """A parameter's standard deviation, m or rad; None where it is not known."""
+        if self.sigma is None or name not in self.machine.parameters.names:
+            return None
+        return float(self.sigma[self.machine.parameters.index(name)])
+
+    def header(self, *conventions: str) -> tuple[str, ...]:
+        """Lines for the top of every file: what this is, of what, and in which conventions."""
+        state = "" if self.usable else "REFUSED, NOT TO BE USED: "
+        lines = (
+            f"Machine {self.machine.name}, exported by pkmcal {version('pkmcal')}"
+            f" from {self.identity}.",
+            state + " ".join((self.headline, *self.reasons)),
+            f"Frames: {self.frames}.",
+            *conventions,
+        )
+        # A name may hold a line break; what follows it must stay a comment.
+        return tuple(legible(" ".join(line.split())) for line in lines)
+
+    def sigma_lines(self, kinds: Sequence[str] = ()) -> list[str]:
+        """One line a parameter, of these kinds or of all: name, value, unit and deviation."""
+        table = self.machine.parameters
+        values = table.unit_axes(self.machine.values)
+        out: list[str] = []
+        for k, name in enumerate(table.names):
+            if kinds and table.kinds[k] not in kinds:
+                continue
+            sigma = self.sigma_of(name)
+            unit = f" {table.units[k]}" if table.units[k] in ("m", "rad") else ""
+            sigma_text = (
+                "" if sigma is None else f", sigma {sigma:.3g}{unit}" if sigma else ", held"
+            )
+            out.append(f"{name} = {values[k]:.9g}{unit}{sigma_text}")
+        return out
+
+
+def load_source(origin: Path | str, session: Path | None = None) -> MachineSource:
+    """A calibration's folder, a mechanism file, or a built-in machine by its name.
+
+    session : the calibration's session, for its cameras; else it is looked for around the folder.
+    Raises InputError where `origin` is none of these.
+    """
+    calibration = loaded(origin)
+    if isinstance(calibration, SavedCalibration):
+        return _of_calibration(calibration, session)
+    built_in = str(origin) in catalogue()
+    return MachineSource(
+        calibration, origin=f"the built-in machine {origin}" if built_in else Path(origin).name
+    )
+
+
+def loaded(origin: Path | str) -> SavedCalibration | Machine:
+    """A calibration's folder or a file in it, a mechanism file, or a built-in machine by its name.
+
+    Raises InputError where `origin` is none of these.
+    """
+    path = Path(origin)
+    if str(origin) in catalogue() and not (path / CALIBRATION_DOCUMENT_FILE).is_file():
+        return load_mechanism(str(origin))
+    if (
+        path.name == CALIBRATED_MECHANISM_FILE
+        and (path.parent / CALIBRATION_DOCUMENT_FILE).is_file()
+    ):
+        path = path.parent  # a calibration's own mechanism file: the rest lies beside it
+    if path.is_dir() or path.name == CALIBRATION_DOCUMENT_FILE:
+        return load(path)
+    if not path.exists() and path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "there is no such calibration and no such machine",
+            found=str(origin),
+            expected=closest(str(origin), catalogue())
+            or "a folder that pkmcal calibrate wrote, a mechanism file, or"
+            f" {listed(sorted(catalogue()), 20)}",
+        )
+    return load_mechanism(path)
+
+
+def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSource:
+    folder = saved.path.parent
+    session_entry = saved.document.get("session") or {}
+    session_words = " ".join(
+        (
+            "session",
+            *(str(session_entry[key]) for key in ("folder", "digest") if key in session_entry),
+        )
+    )
+    files = {station.name: station.camera for station in saved.stations}
+    cameras = {
+        name: load_camera(value)
+        for name, file in files.items()
+        if (value := _camera_file(folder, file, _session_folder(saved, session))) is not None
+    }
+    sigma = {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
+    # where a bed is along itself, heights leave to convention: that is no place to export
+    placed = [s for s in saved.stations if np.isfinite(sigma[s.name]).all()]
+    return MachineSource(
+        machine=saved.machine,
+        sigma=saved.sigma,
+        cameras=MappingProxyType(cameras),
+        T_base_camera=MappingProxyType({s.name: s.T_base_camera for s in placed}),
+        sigma_camera=MappingProxyType({s.name: sigma[s.name] for s in placed}),
+        headline=saved.verdict.headline,
+        usable=saved.verdict.usable,
+        origin=resolved(folder).name,
+        covariance=saved.covariance,
+        reasons=() if saved.verdict.usable else saved.verdict.reasons,
+        calibrated=True,
+        frames=saved.gauge,
+        bed=_bed(saved),
+        session=session_words if session_entry else "",
+    )
+
+
+def _bed(saved: SavedCalibration) -> float | None:
+    """Height of the platform's origin over a bed that was felt, m, base frame, where it is 0 there;
+    None where none was felt, or none that is level.
+    """
+    if saved.document.get("bed"):
+        return saved.document["bed"].get("z")
+    stations = (saved.document.get("session") or {}).get("stations") or {}
+    targets = saved.document.get("targets") or []
+    mounts = {one.get("name"): one.get("T_platform_target") for one in targets}
+    for station in saved.stations:
+        tracker = (stations.get(station.name) or {}).get("tracker") or {}
+        mount = mounts.get(station.name)
+        if tracker.get("level") is True and mount is not None:  # then its table is of heights
+            target = np.array(mount)
+            return -float(inverse(station.T_base_camera)[2, 3] + target[2, 3])
+    return None
+
+
+def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:
+    """Where the session lies: as told, above the calibration, or beside it (as demo writes it)."""
+    if session is not None:
+        if not (session / SESSION_FILE).is_file():
+            raise InputError(
+                "there is no session here", where=str(session), expected=f"a {SESSION_FILE}"
+            )
+        return session
+    above = resolved(saved.path).parent.parent
+    name = str((saved.document.get("session") or {}).get("folder", ""))
+    for folder in (above, above / name):
+        if legible(folder.name) == legible(name) and (folder / SESSION_FILE).is_file():
+            return folder
+    return None
+
+
+def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
+    """A station's camera: as refined with the machine, or as the session had it; a tracker's
+    table is none.
+    """
+    if Path(file).suffix == ".csv":
+        return None
+    refined = folder / written_camera(file)
+    if refined.is_file():
+        return refined
+    given = None if session is None else session / file
+    return given if given is not None and camera_path(given)[0].is_file() else None

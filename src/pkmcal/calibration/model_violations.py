@@ -1,0 +1,369 @@
+"""What the session takes for granted, tested: readings, lenses, boards, tripods, tubes.
+
+Each departure is declared beside the thing that it departs from, with what it would do to the
+measurements and in which words it is told; here they are put together and tested, all at one level
+(:mod:`pkmcal.identify.score` says what freeing each would gain).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.camera_refinement import edges_by_camera
+from pkmcal.calibration.discrepancy_basis import (
+    UNEVEN_BED,
+    ModelError,
+    bed_surface,
+    discrepancy_components,
+    model_errors,
+    with_discrepancy,
+)
+from pkmcal.calibration.tube_outlines import Outline, outlines
+from pkmcal.identify.assembly import Assembled
+from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.discrepancy import discrepancy_of
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import (
+    MOST_VIOLATIONS_SOUGHT,
+    OneStepUpdate,
+    RandomEffects,
+    Score,
+    ScoreTests,
+)
+from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.identify.unidentified import only_heights
+from pkmcal.measurements import Effect, Measurements, ModelViolation, Observation
+from pkmcal.mechanisms.closure import scales as scales_of
+from pkmcal.outcome.finding import Finding, Level
+from pkmcal.session import readings, station_movement
+from pkmcal.session.load import Session
+
+FALSE_VIOLATION_CHANCE = 0.005
+"""Chance at which any departure at all is found in a session that has none."""
+MOST_TOOL_SHIFT = 1.0
+"""Standard deviations by which a departure moves the tool, beyond which the result is refused."""
+
+
+KINDS = {
+    "readings.scale": "reading scale",
+    "readings.play": "backlash",
+    "readings.single": "reading",
+    "station.moved": "station moved",
+    "tube.radius": "tube radius",
+    "tube.edge": "tube edge",
+    "board.size": "board size",
+    "camera.focal": "focal length",
+    "camera.aspect": "pixel aspect",
+    "camera.centre": "picture centre",
+    "camera.distortion": "distortion",
+    "station.focal": "station's focal length",
+    "station.aspect": "station's pixel aspect",
+    "station.centre": "station's picture centre",
+    "station.distortion": "station's distortion",
+}
+"""``kind`` of a departure in calibration.json, by its code."""
+
+
+@dataclass(frozen=True)
+class DetectedViolation:
+    """A departure that the data show.
+
+    finding : for the verdict, a reason where it moves the tool by more than MOST_TOOL_SHIFT.
+    value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
+    many of its standard deviations the platform's position moves if it is taken up, root mean
+    square over the session's poses. shift : the same in m.
+    """
+
+    finding: Finding
+    value: Array
+    sigma: Array
+    score: Score
+    tool: float
+    shift: float
+
+    @property
+    def code(self) -> str:
+        """Of its finding."""
+        return self.finding.code
+
+    @property
+    def of(self) -> str:
+        """What departs, by name."""
+        return self.finding.subject
+
+    @property
+    def against(self) -> bool:
+        """Whether the result should not be used for it."""
+        return self.finding.level is Level.WRONG
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "code": self.code,
+            "kind": KINDS[self.code],
+            "of": self.of,
+            "value": self.value,
+            "sigma": self.sigma,
+            "chi2": self.score.chi2,
+            "dof": self.score.dof,
+            "chance": self.score.adjusted,
+            "moves_tool": self.shift,
+            "moves_tool_in_sigmas": self.tool,
+        }
+
+
+class ModelViolations(NamedTuple):
+    """What the data show that the model does not have.
+
+    violations : violations that have a name, the surest first. errors : components of the model
+    discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
+    discrepancy's effects.
+    """
+
+    violations: tuple[DetectedViolation, ...]
+    errors: tuple[ModelError, ...]
+    estimate: Estimate
+    random: RandomEffects
+
+
+def model_violations(
+    session: Session,
+    observation: Observation,
+    measurements: Measurements,
+    estimate: Estimate,
+    ended: tuple[Assembled, Information],
+) -> ModelViolations:
+    """What the data show that the model does not have.
+
+    A violation is named only if it explains more than the discrepancy does: what is found at first
+    is tested once more beside the discrepancy. ended : the estimate's problem at its end,
+    :func:`pkmcal.identify.bundle.linearize_at_solution`.
+    """
+    columns, units = session.document["joints"]["columns"], session.machine.joint_units
+    layout = estimate.machine.layout
+    present = scales_of(layout, estimate.machine.values) / scales_of(
+        layout, session.machine.parameters.drawing
+    )
+    first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
+    families = [
+        *readings.reading_violations(measurements.joints, columns, units, present[first]),
+        list(_lenses(session, observation, measurements)),
+        list(_lenses_of_stations(session, observation, measurements)),
+        list(_boards(session, measurements)),
+        list(_tripods(session, measurements)),
+    ]
+    tubes = list(
+        islice(
+            outlines(session, measurements, estimate, FALSE_VIOLATION_CHANCE),
+            MOST_VIOLATIONS_SOUGHT,
+        )
+    )
+    families.append([one.violation for one in tubes])
+    listed = [one for family in families for one in family]
+    first_tube = len(listed) - len(tubes)
+    number = np.repeat(np.arange(len(families)), [len(family) for family in families])
+    reference_values = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
+    in_view = np.flatnonzero(ended[0].observed)
+
+    def declared(k: int) -> ModelViolation:
+        if k < len(listed):
+            return listed[k]
+        row, m = divmod(k - len(listed), len(columns))
+        wrong = readings.wrong_reading(columns[m], units[m], session.configurations[in_view[row]])
+        one = np.zeros((*measurements.joints.shape, 1))
+        one[in_view[row], m] = 1.0
+        return replace(wrong, effect=Effect(readings=one))
+
+    def tested(beside: RandomEffects | None) -> tuple[ScoreTests, list[tuple[int, Score]]]:
+        effects = [one.effect for one in listed]
+        tests = ScoreTests(
+            *ended,
+            effects,
+            number.tolist(),
+            singles=True,
+            beside=beside,
+            variance=1 + measurements.imputation_covariance,
+        )
+        value = tests.tests_beyond(FALSE_VIOLATION_CHANCE, [k for k, _ in reference_values])
+        return tests, [*value, *reference_values]
+
+    tests, value = tested(None)
+    discrepancy = discrepancy_of(
+        *ended,
+        discrepancy_components(measurements, estimate),
+        [declared(k).effect for k, _ in value],
+        (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
+        only_heights(estimate),
+    )
+    if discrepancy.scales and value:
+        tests, value = tested(discrepancy.random)
+    before = tool_of(session, estimate)
+    estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
+    tool = tool_of(session, estimate) if discrepancy.scales else before
+    surface = None
+    if any(one.code == UNEVEN_BED for one in discrepancy.scales):
+        surface = bed_surface(measurements, estimate, discrepancy)
+    errors = model_errors(discrepancy, tool, before, units[0], surface)
+    if not value:
+        return ModelViolations((), errors, estimate, discrepancy.random)
+    fits = tests.fitted([k for k, _ in value])
+    last = len(fits) - len(tubes)
+    fits[last:] = [_tube_update(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
+    violations = tuple(
+        _detection(declared(k), score, fit, tool)
+        for (k, score), fit in zip(value, fits, strict=True)
+    )
+    return ModelViolations(violations, errors, estimate, discrepancy.random)
+
+
+def tool_of(session: Session, estimate: Estimate) -> ToolError:
+    """The tool at the session's poses."""
+    used, machine = estimate.configurations, estimate.machine
+    return tool_error(
+        session.machine,
+        machine,
+        free_of_gauge(machine, estimate.covariance),
+        estimate.state.T_base_platform[used],
+        session.joints[used],
+        legs_observed=estimate.edge_weights.size > 0,
+    )
+
+
+def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
+    """A tube's departure by the value that its lines tell."""
+    value, sigma = np.array([one.value]), np.array([one.sigma])
+    return OneStepUpdate(
+        value, sigma, fit.by_data * (one.value / fit.value[0] if fit.value[0] else 0.0)
+    )
+
+
+def _detection(
+    one: ModelViolation, score: Score, fit: OneStepUpdate, tool: ToolError
+) -> DetectedViolation:
+    shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
+    shift = float(np.sqrt(np.nanmean(shifted**2)))
+    sigma = float(np.sqrt(np.nanmean(tool.position**2)))
+    ratio = shift / sigma if sigma > 0 else np.inf  # where nothing that is free moves the tool
+    level = Level.WRONG if ratio > MOST_TOOL_SHIFT else Level.DOUBTFUL
+    # what the data do not determine is no number
+    facts = {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in one.facts(fit.value, fit.sigma).items()
+    }
+    facts |= {"chance": score.adjusted, "tool_shift": shift, "tool_shift_sigmas": ratio}
+    result = Finding(one.code, level, facts, one.of)
+    return DetectedViolation(result, fit.value, fit.sigma, score, ratio, shift)
+
+
+def _lenses(
+    session: Session, observation: Observation, measured: Measurements
+) -> Iterator[ModelViolation]:
+    """A camera that is not as its file says, by the departures that its model declares."""
+    if measured.intrinsics_factor.shape[-1]:
+        return  # they are estimated already
+    changed = CameraChange.of(session, observation, measured)
+    if changed is None:
+        return
+    files = {station.camera_file: station.camera for station in session.stations}
+    for file, camera in files.items():
+        own = np.array([station.camera_file == file for station in session.stations])
+        for part in camera.violations():
+            effect = changed.effect(own, part.columns)
+            yield ModelViolation(
+                f"camera.{part.code}", file, _of_lens(part.facts, file=file), effect
+            )
+
+
+def _lenses_of_stations(
+    session: Session, observation: Observation, measured: Measurements
+) -> Iterator[ModelViolation]:
+    """A station whose camera is another than that of the other stations with the same file; not of
+    images by hand, whose focal lengths are estimated one by one.
+    """
+    files = [station.camera_file for station in session.stations]
+    shared = [
+        files.count(station.camera_file) > 1 and not station.handheld
+        for station in session.stations
+    ]
+    changed = CameraChange.of(session, observation, measured) if any(shared) else None
+    if changed is None:
+        return
+    for s in np.flatnonzero(shared).tolist():
+        station, own = session.stations[s], np.arange(len(files)) == s
+        for part in station.camera.violations():
+            facts = _of_lens(part.facts, file=station.camera_file, station=station.name)
+            effect = changed.effect(own, part.columns)
+            yield ModelViolation(f"station.{part.code}", station.name, facts, effect)
+
+
+def _of_lens(facts: Mapping[str, Any], **where: str) -> Callable[[Array, Array], dict[str, Any]]:
+    """Facts about a camera's file, from estimates of one number, or of one in x and one in y."""
+
+    def described(value: Array, sigma: Array) -> dict[str, Any]:
+        more = {"y": value[1], "sigma_y": sigma[1]} if len(value) > 1 else {}
+        if "stated" in facts:
+            more["fits"] = facts["stated"] + value[0]
+        return {"value": value[0], "sigma": sigma[0], **more, **facts, **where}
+
+    return described
+
+
+@dataclass(frozen=True)
+class CameraChange:
+    """What a change of cameras' parameters does to all that they see: edges (N, 2, n) and poses (M,
+    6, n), with the station of each, (N,) and (M,).
+    """
+
+    edges: Array
+    poses: Array
+    edge_station: Integers
+    pose_station: Integers
+
+    @classmethod
+    def of(
+        cls, session: Session, observation: Observation, measured: Measurements
+    ) -> CameraChange | None:
+        """Nothing where there is no camera."""
+        cameras = [station.camera for station in session.stations]
+        if not cameras:
+            return None
+        edges = edges_by_camera(observation, cameras)
+        poses = np.zeros((len(measured.poses), 6, edges.shape[-1]))
+        own = measured.poses.by_intrinsics
+        poses[..., : own.shape[-1]] = own
+        return cls(edges, poses, measured.edges.station, measured.poses.station)
+
+    def effect(self, stations: Booleans, columns: Array) -> Effect:
+        """That of some stations' camera, (S,), by k numbers: ``columns`` (n, k) of its change."""
+        n = len(columns)
+        also = np.append(stations, False)[np.minimum(self.pose_station, len(stations))]
+        edges, poses = self.edges[..., :n] @ columns, self.poses[..., :n] @ columns
+        return Effect(
+            edges=np.where(stations[self.edge_station][:, None, None], edges, 0.0),
+            poses=np.where(also[:, None, None], poses, 0.0),
+        )
+
+
+def _boards(session: Session, measured: Measurements) -> Iterator[ModelViolation]:
+    """Boards of another size."""
+    for m, mount in enumerate(measured.mounts):
+        if mount.name == "board":
+            from pkmcal.boards.poses import board_size_violation
+
+            yield board_size_violation(measured.poses, m, session.document["board"]["file"])
+
+
+def _tripods(session: Session, measured: Measurements) -> Iterator[ModelViolation]:
+    """Stations that did not stand still."""
+    for s, name in enumerate(session.station_names):
+        in_view = [x.configuration[x.station == s] for x in (measured.edges, measured.poses)]
+        what = "camera" if s < len(session.stations) else "tracker"
+        used = np.unique(np.concatenate(in_view))
+        yield from station_movement.movement_violations(s, name, used, session.configurations, what)

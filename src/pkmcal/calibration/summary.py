@@ -1,0 +1,186 @@
+"""A calibration as people look at it in Python: short, as a summary, as tables and plots.
+
+The same for one that was just made and for one read back from its file.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.parameter_estimates import ParameterEstimates, parameter_estimates
+from pkmcal.identify.tool import NO_TURN, ToolError, checked_poses, tool_error
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
+from pkmcal.wording import brief, count, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What a summary is made of.
+
+    source : the session's name. drawing : (P,) values before. covariance : (P, P). data_share :
+    (P,). poses : (n, 4, 4) of the platform, of the configurations in use. legs_observed : whether
+    edges of legs were. residuals : (n,) of edges and poses, whitened, with weights of half and
+    more. chi2 : per degree of freedom, of the noise as stated; NaN where it is not known. warnings
+    : about the session.
+    """
+
+    source: str
+    method: str
+    machine: Machine
+    verdict: Verdict
+    drawing: Array
+    covariance: Array
+    data_share: Array
+    poses: Array
+    stations: tuple[str, ...]
+    legs_observed: bool
+    residuals: Array
+    chi2: float
+    warnings: tuple[str, ...]
+
+
+class CalibrationSummary(ABC):
+    """What a calibration shows of itself."""
+
+    @abstractmethod
+    def overview(self) -> Overview:
+        """What it is made of."""
+
+    def tool_error(self, T_base_platform: Array) -> ToolError:
+        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
+        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
+        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
+        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
+        array that holds no poses.
+        """
+        overview = self.overview()
+        # what a file's machine calls its drawing are the calibrated values
+        table = replace(overview.machine.parameters, drawing=overview.drawing)
+        machine = replace(overview.machine, parameters=table)
+        return tool_error(
+            machine.with_values(overview.drawing),
+            machine,
+            free_of_gauge(machine, overview.covariance),
+            checked_poses(T_base_platform),
+            legs_observed=overview.legs_observed,
+        )
+
+    @property
+    def parameters(self) -> ParameterEstimates:
+        """All parameters: drawing, value, standard deviation, and what decides them. Shows itself
+        as a table; ``to_pandas()`` makes a DataFrame.
+        """
+        overview = self.overview()
+        return parameter_estimates(
+            overview.drawing, overview.machine, overview.covariance, overview.data_share
+        )
+
+    def summary(self) -> str:
+        """The verdict and the main figures, some ten lines of text."""
+        overview = self.overview()
+        verdict = overview.verdict
+        mark = "✓" if verdict.usable else "✗"
+        lines = [self._title(overview), f"{mark} {verdict.headline}"]
+        lines += [f"  • {reason}" for reason in verdict.reasons]
+        lines += [f"  {name + ':':12} {text}" for name, text in self._figures(overview)]
+        lines += [f"! {text}" for text in (*verdict.warnings, *overview.warnings)]
+        lines += [f"→ {text}" for text in verdict.advice]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        overview = self.overview()
+        state = "usable" if overview.verdict.usable else "not to be used"
+        return f"<{self._title(overview)}: {state}>"
+
+    def _repr_html_(self) -> str:
+        overview = self.overview()
+        verdict = overview.verdict
+        rows = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
+            for name, text in self._figures(overview)
+        )
+        words = [*verdict.reasons, *verdict.warnings, *overview.warnings, *verdict.advice]
+        points = "".join(f"<li>{escape(text)}</li>" for text in words)
+        mark = "✓" if verdict.usable else "✗"
+        return (
+            f"<p><b>{escape(self._title(overview))}</b></p>"
+            f"<p>{mark} {escape(verdict.headline)}</p><table>{rows}</table>"
+            + (f"<ul>{points}</ul>" if points else "")
+        )
+
+    def _title(self, values: Overview) -> str:
+        return (
+            f"Calibration of {values.machine.name} from {values.source or 'a session'}, method"
+            f" {values.method}, {count(len(values.poses), 'configuration')}"
+        )
+
+    def _figures(self, values: Overview) -> list[tuple[str, str]]:
+        """Names and values of the main figures."""
+        out: list[tuple[str, str]] = []
+        tool = self.tool_error(values.poses)
+        for name, place, turn in (
+            ("Tool, σ", tool.position, tool.orientation),
+            ("Drawing off", tool.off_position, tool.off_orientation),
+        ):
+            finite = np.isfinite(place)
+            if finite.any():
+                angle = float(np.rad2deg(turn[finite].mean()))
+                turned = f", {brief(angle)}°" if angle > np.rad2deg(NO_TURN) else ""
+                where = f"{brief(float(place[finite].max()) * 1e3)} mm at worst"
+                out.append(
+                    (name, f"{brief(float(place[finite].mean()) * 1e3)} mm{turned} ({where})")
+                )
+        kinds = [row.decided_by for row in self.parameters]
+        parts = [f"{kinds.count(k)} by {text}" for k, text in
+                 (("data", "the data"), ("drawing", "the drawing")) if k in kinds]  # fmt: skip
+        held = len(kinds) - kinds.count("data") - kinds.count("drawing")
+        parts += [f"{held} held by frame or file"] if held else []
+        out.append(("Parameters", f"{len(kinds)}: {', '.join(parts)}"))
+        if values.stations:
+            out.append(
+                ("Stations", ", ".join(values.stations[:6]) + ", …" * (len(values.stations) > 6))
+            )
+        if np.isfinite(values.chi2):
+            out.append(
+                ("Fit", f"χ² {number(values.chi2, 2)} per degree of freedom, noise as stated")
+            )
+        return out
+
+    # ------------------------------------------------------------------ plots
+
+    def plot_residuals(self, ax: Axes | None = None) -> Axes:
+        """Residuals of all edges and poses in standard deviations, against what noise alone makes.
+
+        ax : axes to draw into; new ones unless given. Needs ``pip install '.[plot]'``.
+        """
+        from pkmcal.calibration.plots import draw_residuals
+
+        return draw_residuals(self.overview().residuals, ax)
+
+    def plot_parameters(self, ax: Axes | None = None) -> Axes:
+        """How far each parameter is from its drawing, with two standard deviations, in tolerances
+        of the drawing. ax, needs : as :meth:`plot_residuals`.
+        """
+        from pkmcal.calibration.plots import parameters
+
+        return parameters(self.parameters, self.overview().machine.parameters.tolerance, ax)
+
+    def plot_tool(self, T_base_platform: Array | None = None, ax: Axes | None = None) -> Axes:
+        """The tool's error at poses (n, 4, 4), the photographed ones unless given: the drawing's,
+        and what is uncertain after the calibration. ax, needs : as :meth:`plot_residuals`.
+        """
+        from pkmcal.calibration.plots import tool
+
+        poses = self.overview().poses if T_base_platform is None else T_base_platform
+        return tool(self.tool_error(poses), ax)

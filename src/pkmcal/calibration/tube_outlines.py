@@ -1,0 +1,140 @@
+"""Tubes whose outlines are not those of the drawing: a sleeve, a ring, a cable along a leg.
+
+Each side of a tube has a shift of its own at each station, for light shifts outlines (shading), and
+a tube has a radius with its tolerance. Shifts have Student's distribution: most are small, and a
+line that is far off is let go, so that the machine hardly suffers. What is too far off for any
+light is told: all lines of a tube outward alike are another radius, one line alone is something
+that stands beside the tube.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.identify.assembly import lines
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.line_shading import SHADING_FREEDOM
+from pkmcal.identify.score import Score
+from pkmcal.measurements import Effect, Measurements, ModelViolation
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.session.load import Session
+
+DISTANCE_SAMPLE_EDGES = 4000
+"""Edges, spread over all, by which it is told how far away each line is."""
+OF_MEDIAN = 1.25
+"""Deviation of a median in that of a mean, of normal numbers."""
+OF_MIDDLE = 1.48
+"""Standard deviation of normal numbers in the median of their distances from the middle."""
+
+
+class Outline(NamedTuple):
+    """A tube's departure, its score by its own distribution, and the value that the middle of its
+    lines tells, m, of which some may be other than the rest; sigma : its standard deviation.
+    """
+
+    violation: ModelViolation
+    score: Score
+    value: float
+    sigma: float
+
+
+def outlines(
+    session: Session, measurements: Measurements, estimate: Estimate, level: float
+) -> Iterator[Outline]:
+    """Tubes of another radius than drawn, then single lines that are off, the surest first, at a
+    level of chance of all together.
+    """
+    from scipy.special import ndtr, stdtr
+
+    keys, number = lines(measurements)
+    if len(estimate.line_shift) != len(keys) or not len(keys):
+        return
+    size = _metres(measurements, estimate, number, len(keys))
+    usual = estimate.statistics.shading
+    shift, sigma = estimate.line_shift, np.hypot(usual, estimate.line_shift_sigma)
+    table, file = session.machine.parameters, session.document["mechanism"]
+    grown = estimate.machine.values - table.drawing
+    station, leg, tube = keys[:, :3].T
+    tubes = np.unique(keys[:, 1:3], axis=0)
+    edge = float(np.max(estimate.edge_shift_sigma, initial=0.0))
+    results: list[tuple[Score, Integers, float, float]] = []
+    for j, t in tubes.tolist():
+        mine = np.flatnonzero((leg == j) & (tube == t))
+        radius = session.machine.layout.radius[j][t]
+        each = grown[radius] + shift[mine] * size[mine]
+        if not (each > 0).all() and not (each < 0).all():
+            continue  # another radius moves all alike
+        value = float(np.median(each))
+        own = OF_MEDIAN * np.median(sigma[mine] * size[mine]) / np.sqrt(len(mine))
+        scale = float(np.hypot(own, edge * np.median(size[mine])))
+        z = float(abs(value) / np.hypot(scale, table.tolerance[radius]))
+        chance = float(2 * ndtr(-z))
+        score = Score(z**2, 1, chance, min(2 * len(tubes) * chance, 1.0))
+        # as told: lines of one tube can be as unlike as its light and what covers it
+        spread = OF_MEDIAN * OF_MIDDLE * np.median(np.abs(each - value)) / np.sqrt(len(mine))
+        results.append((score, mine, value, float(max(scale, spread))))
+    thick = sorted((one for one in results if one[0].adjusted < level), key=lambda x: x[0].chance)
+    outlined: list[int] = []
+    for score, mine, value, scale in thick:
+        outlined += mine.tolist()
+        j, t = keys[mine[0], 1:3].tolist()
+        by = _effect(measurements, number, mine, size)
+        name = f"legs[{j + 1}].tubes[{t + 1}]"
+        violation = ModelViolation("tube.radius", name, _tube(j, t, file=file), by)
+        yield Outline(violation, score, value, scale)
+    z = np.abs(shift) / sigma
+    chance = np.where(np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
+    for k in np.argsort(chance, kind="stable").tolist():
+        adjusted = 2 * len(keys) * float(chance[k])
+        if adjusted > level:
+            break
+        score = Score(float(z[k] ** 2), 1, float(chance[k]), adjusted)
+        j, t, of = int(leg[k]), int(tube[k]), session.station_names[station[k]]
+        by = _effect(measurements, number, np.array([k]), size)
+        name = f"legs[{j + 1}].tubes[{t + 1}], {of}"
+        violation = ModelViolation("tube.edge", name, _tube(j, t, station=of), by)
+        information = estimate.line_shift_sigma[k]
+        yield Outline(violation, score, float(shift[k] * size[k]), float(information * size[k]))
+
+
+def _tube(leg: int, tube: int, **more: str) -> Callable[[Array, Array], dict[str, Any]]:
+    """Facts about a tube, numbered from 0."""
+    return lambda value, sigma: {
+        "leg": leg + 1, "tube": tube + 1, "value": value[0], "sigma": sigma[0], **more
+    }  # fmt: skip
+
+
+def _effect(measurements: Measurements, number: Integers, mine: Integers, size: Array) -> Effect:
+    """Of a tube that is larger by a metre at some of its lines: its edges should have been seen
+    farther in.
+    """
+    which = np.isin(number, mine)
+    away = np.where(which, 1 / size[np.maximum(number, 0)], 0.0)
+    return Effect(edges=(-away[:, None] * measurements.edges.shift)[..., None])
+
+
+def _metres(measurements: Measurements, estimate: Estimate, number: Integers, count: int) -> Array:
+    """Metres (n,) on each line's tube that a pixel is."""
+    edges, state = measurements.edges, estimate.state
+    each, first = np.unique(number, return_index=True)
+    some = np.union1d(
+        first[each >= 0], np.arange(0, len(number), -(-len(number) // DISTANCE_SAMPLE_EDGES))
+    )
+    some = some[number[some] >= 0]
+    rows = edges.configuration[some]
+    legs = legs_in_camera(
+        estimate.machine,
+        state.T_camera_base[edges.station[some]],
+        state.T_base_platform[rows],
+        measurements.joints[rows],
+    )
+    at = np.arange(len(some)), edges.leg[some]
+    a, u = legs.a[at], legs.u[at]
+    away = np.linalg.norm(a - np.sum(a * u, axis=-1, keepdims=True) * u, axis=-1)
+    turn = np.linalg.norm(edges.shift[some], axis=-1)
+    total = np.bincount(number[some], away * turn, minlength=count)
+    return total / np.bincount(number[some], minlength=count)

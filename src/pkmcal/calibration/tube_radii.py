@@ -1,0 +1,69 @@
+"""Diameters that were taken for radii.
+
+Thick tubes of half the width are found in the photographs all the same: their edges lie on what is
+seen inside of the right ones, and the camera at another distance. A search in the picture does not
+tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
+joint estimate: with the drawing's radii few edges are found, which disagree with the machine, now
+and then by no more than is accepted of a result, or are no more than chance offers; with half of
+them there are more, and they agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.calibration.camera_refinement import refinement_of
+from pkmcal.calibration.case import Case
+from pkmcal.calibration.faults import CURED_MISFIT_SHARE
+from pkmcal.calibration.handheld import localize_case
+from pkmcal.calibration.refinement import refine_alternating
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.verdict import TOO_NOISY
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.document import Leg
+from pkmcal.mechanisms.machine import machine_from_document
+from pkmcal.observe.hypotheses import diameters
+from pkmcal.outcome.finding import Finding, note
+
+
+def check_radii(
+    case: Case, estimate: Estimate | None, by_chance: bool, refine_camera: bool, seed: int
+) -> tuple[Finding, ...]:
+    """Raise `InputError` where edges disagree with the machine more than with one whose mistake is
+    put right, and more of them agree with a machine of half the radii; a note where the machine of
+    half the radii has no estimate.
+
+    estimate : with the drawing's radii, None where there is none. by_chance : whether chance may
+    have offered its edges, which then agree with anything. refine_camera : whether it estimated the
+    cameras. seed : of the search for the stations.
+    """
+    agree = CURED_MISFIT_SHARE * TOO_NOISY
+    bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
+    if not bad or not case.photographs:
+        return ()
+    thinner = replace(case.session, machine=_of_half_the_radii(case.session.machine))
+    try:
+        rng = np.random.default_rng(seed)
+        again = localize_case(thinner, case.photographs, case.boards, rng)
+        cameras = refinement_of(again.session, refine_camera)
+        turns = refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
+    except PkmcalError as error:  # it is not found in these images, or they do not determine it
+        mechanism = case.session.document["mechanism"]
+        return (note("tube.diameter_untested", mechanism, why=str(error).rstrip(".")),)
+    value = turns.estimate
+    cured = value.statistics.noise_scale <= agree
+    inliers = 0.0 if estimate is None else estimate.edge_weights.sum()
+    if cured and value.edge_weights.sum() > inliers:
+        raise diameters(case.session.document["mechanism"])
+    return ()
+
+
+def _of_half_the_radii(machine: Machine) -> Machine:
+    legs: list[Leg] = []
+    for leg in machine.document.legs:
+        tubes = [tube.model_copy(update={"radius": tube.radius / 2}) for tube in leg.tubes]
+        legs.append(leg.model_copy(update={"tubes": tuple(tubes)}))
+    return machine_from_document(machine.document.model_copy(update={"legs": tuple(legs)}))

@@ -1,0 +1,161 @@
+"""What is wrong with a control by the legs, in sentences; and whether it may be used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.control.analysis import Subset
+from pkmcal.control.study import Study, Trials
+from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
+from pkmcal.wording import named
+
+ENOUGH_REACHED_SHARE = 0.9
+"""Part of the runs with the identified geometry that must reach their goal."""
+UNMENTIONED_HIDDEN_SHARE = 0.05
+"""Part of the poses at which a leg may stand behind another without a warning."""
+UNMENTIONED_OVERSHOOT = 0.05
+"""Part of the way by which a platform may pass its goal without a word."""
+UNMENTIONED_DEVIATION = 0.01
+"""Part of the way by which a platform may leave it without a word."""
+UNMENTIONED_GOAL_NOISE = 0.02
+"""Noise at the goal, as a part of the usual way, that deserves a word."""
+
+
+def judgement(study: Study) -> Verdict:
+    """The study in words."""
+    own, good = study.own, study.outcome("identified")
+    reasons = (*_blind(study), *_failures(good))
+    share = good.reached / len(good.runs.end)
+    usable = not own.blind and share >= ENOUGH_REACHED_SHARE
+    law = study.plan.loop.law
+    legs = chosen_legs(own, study)
+    headline = (
+        f"Control by the {law} of {legs} brings the platform to its goal in {good.reached} of"
+        f" {len(good.runs.end)} runs with the identified geometry."
+    )
+    if not usable:
+        why = (
+            "these legs do not show every motion of the platform."
+            if own.blind
+            else f"{good.reached} of {len(good.runs.end)} runs reach the goal."
+        )
+        headline = f"Control by the {law} of {legs} should not be used: {why}"
+    warnings = (*_fading(study), *_others(study), *_hidden(study), *_by_hand(study), *_noise(study))
+    if usable:
+        reasons = tuple(replace(one, level=Level.DOUBTFUL) for one in reasons)
+    return Verdict(usable, headline, (*reasons, *warnings, *_advice(study)))
+
+
+def chosen_legs(choice: Subset, study: Study) -> str:
+    """``all legs``, ``legs 1, 3 and 5``."""
+    return named(choice.legs, study.scene.machine.n_legs)
+
+
+def _blind(study: Study) -> tuple[Finding, ...]:
+    """Motions that are never seen."""
+    if not study.own.blind:
+        return ()
+    law, legs = study.plan.loop.law, chosen_legs(study.own, study)
+    return (wrong("servo.blind", legs, law=law, legs=legs),)
+
+
+def _failures(outcome: Trials) -> tuple[Finding, ...]:
+    """How runs failed, the most frequent first."""
+    n = len(outcome.runs.end)
+    return tuple(
+        wrong("servo.failures", number=count, of=n, end=end.sentence)
+        for end, count in outcome.ends.items()
+        if not end.good
+    )
+
+
+def _fading(study: Study) -> tuple[Finding, ...]:
+    own = study.own
+    if own.blind or not own.fading:
+        return ()
+    legs = chosen_legs(own, study)
+    return (doubtful("servo.fading", legs, legs=legs, percent=100 * own.worst / own.usual),)
+
+
+def _others(study: Study) -> Iterator[Finding]:
+    """Other equilibria."""
+    equilibria, legs = study.equilibria, chosen_legs(study.own, study)
+    for same_edges, part in ((True, equilibria.same_image), (False, equilibria.cancelled)):
+        rows = equilibria.same_edges == same_edges
+        if rows.any():
+            yield doubtful(
+                "servo.other_equilibrium",
+                legs,
+                legs=legs,
+                share=part,
+                why="alike" if same_edges else "cancelled",
+                distance=float(equilibria.distance[rows].min()),
+                readings=float(equilibria.readings[rows].min()),
+                units=study.scene.machine.joint_units[:1],
+            )
+
+
+def _hidden(study: Study) -> tuple[Finding, ...]:
+    legs = [
+        f"leg {j + 1} ({100 * part:.0f} %)"
+        for j, part in zip(study.eye.true.legs, study.hidden, strict=True)
+        if part > UNMENTIONED_HIDDEN_SHARE
+    ]
+    if not legs:
+        return ()
+    return (doubtful("servo.hidden", legs=", ".join(legs)),)
+
+
+def _by_hand(study: Study) -> Iterator[Finding]:
+    """What calibration is good for here."""
+    hand, n = study.outcome("hand"), study.plan.runs
+    failed = n - hand.reached
+    if failed > study.plan.runs - study.outcome("identified").reached:
+        worst = next(end for end in hand.ends if not end.good)
+        yield doubtful("servo.by_hand_fails", number=failed, of=n, end=worst.what)
+    good = hand.runs.reached
+    off, own = (
+        float(np.median(o.astray[o.runs.reached])) if o.reached else 0.0
+        for o in (hand, study.outcome("identified"))
+    )
+    if off > max(UNMENTIONED_DEVIATION * float(np.median(hand.runs.travel[:, 0])), 2 * own):
+        most = float(hand.astray[good].max())
+        yield doubtful("servo.by_hand_astray", median=off, most=most, identified=own)
+    over = float(hand.overshoot[good].max(initial=0.0))
+    if over > max(
+        UNMENTIONED_OVERSHOOT, 2 * float(study.outcome("identified").overshoot.max(initial=0.0))
+    ):
+        yield doubtful("servo.by_hand_overshoots", share=over)
+
+
+def _noise(study: Study) -> tuple[Finding, ...]:
+    direction = float(np.median(study.outcome("true").runs.travel[:, 0]))
+    held = float(np.sqrt(np.mean(study.held.joints**2)))
+    if not direction > 0 or held < UNMENTIONED_GOAL_NOISE * direction:
+        return ()
+    return (doubtful("servo.noise", rms=held, law=study.plan.loop.law),)
+
+
+def _advice(study: Study) -> Iterator[Finding]:
+    """Which legs would do better, where something is wrong with those seen."""
+    own = study.own
+    if not (
+        own.blind or own.fading or study.equilibria.same_image + study.equilibria.cancelled > 0
+    ):
+        return
+    more = [c for c in study.choices if len(c.legs) == len(own.legs) + 1]
+    more = [c for c in more if set(own.legs) < set(c.legs) and c.worst > 2 * own.worst]
+    same = [c for c in study.choices if len(c.legs) == len(own.legs) and c.worst > 2 * own.worst]
+    if more:
+        best = max(more, key=lambda c: c.worst)
+        extra = chosen_legs(Subset(tuple(set(best.legs) - set(own.legs)), 0, 0), study)
+        yield note("servo.more_legs", extra, legs=extra, before=own.worst, after=best.worst)
+    if same:
+        legs = chosen_legs(same[0], study)
+        yield note("servo.other_legs", legs, legs=legs, number=len(own.legs), worst=same[0].worst)
+    if own.blind and not more and study.plan.loop.law == "directions":
+        yield note("servo.by_edges")

@@ -1,0 +1,157 @@
+"""What differs between two estimates of one machine, and how much of that chance explains.
+
+Frames are conventions, so the two are told in those in which they differ least: by least squares
+over all free parameters, each in its tolerance. What is then left, y, has no frames in it.
+
+Both estimates lean on the same drawing where they have the same one, and on the same photographs
+as far as they share them. With the drawing's covariance 1 (in tolerances), and what the data of
+each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
+
+    cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,
+
+without the 1 where the drawings differ. Of data that tell unequally much of a direction, the shared
+part is no more than the lesser: an estimate by the same data, but not as good, differs by
+C_a - C_b (Hausman, 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.identify.estimate import State
+from pkmcal.identify.gauge import (
+    BestFit,
+    alignment,
+    carried_errors,
+    freedoms,
+    generators,
+    moved_centres,
+)
+from pkmcal.mechanisms import Machine
+
+NULL_VARIANCE_SHARE = 0.99
+"""Part of the drawing's variance that is left, from which on data say nothing of a direction."""
+SETTLED_ESTIMATE_SHARE = 0.01
+"""Of a standard deviation: to which the search for an estimate settles, so that two from the same
+data are never held against a spread of nothing."""
+CHANGE_VARIANCE_FLOOR = 1e-9
+"""Of a tolerance squared: a variance below it is rounding."""
+
+
+@dataclass(frozen=True)
+class MachineChange:
+    """Machine b less machine a, told in a's frames, in which they differ least.
+
+    machine : a with b's values in these frames. change : (P,) of the parameters, m and rad.
+    covariance : (P, P) of that by chance alone; zeros between drawings. chi2, dof : of all that the
+    data tell of the change; dof is 0 between drawings.
+    """
+
+    machine: Machine
+    change: Array
+    covariance: Array
+    chi2: float
+    dof: int
+
+    __repr__ = short_repr
+
+    @property
+    def sigma(self) -> Array:
+        """(P,) standard deviations of the change by chance."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def machine_change(
+    a: Machine,
+    b: Machine,
+    covariances: tuple[Array | None, Array | None],
+    *,
+    one_drawing: bool = True,
+    shared: float = 0.0,
+) -> MachineChange:
+    """What differs between two machines of the same parameters.
+
+    covariances : (P, P) of either's parameters in any frames; None for a drawing, which is taken
+    at its word. one_drawing : whether both calibrations lean on the same one. shared : of the data
+    of the one that has less, the share that the other saw as well.
+    """
+    held = replace(a, parameters=replace(a.parameters, drawing=a.values))
+    table, layout = held.parameters, held.layout
+    before = _state(table.unit_axes(b.values))
+    e, f = alignment(held, before, BestFit())
+    there = moved_centres(layout, before.theta, e, f)
+    carried = carried_errors(layout, before, e, f)
+    cov_a, cov_b = covariances
+    if cov_b is not None:
+        cov_b = carried @ cov_b @ carried.T
+    # in tolerances, the free numbers alone, frames taken out
+    tolerance = table.tolerances_free()
+    inward = np.linalg.pinv(table.free_matrix()) / tolerance[:, None]
+    frames = generators(layout, a.values) @ freedoms(held)
+    own = inward @ frames
+    remainder, s, _ = np.linalg.svd(own)
+    rest = remainder[:, np.count_nonzero(s > 1e-9 * max(float(s.max(initial=0.0)), 1e-12)) :]
+    step = np.linalg.lstsq(own, inward @ (there - a.values), rcond=1e-9)[0]
+    there = there - frames @ step
+    change = there - a.values
+    invariant = rest.T @ inward
+    y = invariant @ change
+    spreads = [None if c is None else invariant @ c @ invariant.T for c in (cov_a, cov_b)]
+    spread, null_space = _spread(spreads, y.size, one_drawing, shared)
+    outward = table.free_matrix() * tolerance @ rest
+    return MachineChange(
+        machine=held.with_values(there),
+        change=change,
+        covariance=outward @ spread @ outward.T,
+        chi2=_chi2(null_space.T @ y, null_space.T @ spread @ null_space),
+        dof=null_space.shape[1],
+    )
+
+
+def _state(theta: Array) -> State:
+    none = np.zeros((0, 4, 4))
+    return State(theta, none, none, np.zeros(0))
+
+
+def _spread(
+    spreads: Sequence[Array | None], size: int, one_drawing: bool, shared: float
+) -> tuple[Array, Array]:
+    """Covariance (r, r) of the difference by chance, and the directions (r, k) that data tell."""
+    reference_values = [c for c in spreads if c is not None]
+    if not reference_values:
+        return np.zeros((size, size)), np.zeros((size, 0))
+    values, vectors = np.linalg.eigh(np.mean(reference_values, axis=0))
+    null_vectors = vectors[:, values < NULL_VARIANCE_SHARE]
+    if len(reference_values) == 1:
+        return reference_values[0], null_vectors
+    one, other = (_firm(c) for c in reference_values)
+    inverse_one, inverse_other = np.linalg.inv(one), np.linalg.inv(other)
+    lesser = _lesser(inverse_one, inverse_other)
+    unit = np.eye(len(one))
+    joint = shared * (lesser - unit) + (unit if one_drawing else 0.0)
+    cross = one @ joint @ other
+    spread = one + other - cross - cross.T + SETTLED_ESTIMATE_SHARE**2 * (one + other)
+    return spread, null_vectors
+
+
+def _firm(covariance: Array) -> Array:
+    """A covariance in tolerances, no larger than the drawing's and no smaller than rounding."""
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    return (vectors * np.clip(values, CHANGE_VARIANCE_FLOOR, 1.0)) @ vectors.T
+
+
+def _lesser(one: Array, other: Array) -> Array:
+    """The lesser of two informations in each of the directions in which both are diagonal."""
+    root = np.linalg.cholesky(other)
+    back = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(back @ one @ back.T)
+    outward = root @ vectors
+    return (outward * np.minimum(values, 1.0)) @ outward.T
+
+
+def _chi2(y: Array, covariance: Array) -> float:
+    return float(y @ np.linalg.solve(covariance, y)) if y.size else 0.0

@@ -1,0 +1,491 @@
+"""What judgements say: is the calibrated machine better than its drawing, by how much, and how sure
+(validate); is it still so, has it changed and where, or do the data tell too little (watch).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import compress
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.judge.changes import (
+    DETECTION_POWER,
+    Change,
+    ChangeTests,
+    Explanation,
+    LegTest,
+    StationTest,
+    Suspect,
+)
+from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, improvement_ratio
+from pkmcal.judge.holdouts import HoldOut
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
+from pkmcal.outcome.finding import Finding, doubtful, note, wrong
+from pkmcal.wording import (
+    DISPLAY_UNITS,
+    amount,
+    brief,
+    count,
+    decimals,
+    listed,
+    named,
+    number,
+    with_unit,
+)
+
+MOSTLY_NOISE = 2**0.5
+"""Factor on the photographs' noise within which that is more than half of the mean square."""
+POOR_REGION_FACTOR = 2.0
+"""Factor by which a region's errors must exceed those of the configurations in use to be told."""
+NOISIER_PHOTOGRAPHS_FACTOR = 1.5
+"""Times the calibration's noise from which on the photographs are no longer the same kind."""
+STEEL_EXPANSION = 12e-6
+"""Expansion of steel, 1/K, for a picture of what a common scale means."""
+UNEXPLAINED_CHANCE = 1e-3
+"""Chance below which what the findings leave is said to be more than noise."""
+MOST_OTHERS = 4
+"""Causes named beside the best; more are a table's."""
+
+
+def factor(value: float) -> str:
+    """A factor with the digits that it deserves."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def better(gain: Ratio) -> str:
+    """``14 (±3)``."""
+    return f"{factor(gain.value)} (±{factor(gain.sigma)})"
+
+
+def validation_verdict(
+    judged: BesideDrawing | None,
+    holdouts: Sequence[HoldOut],
+    machine: Machine,
+    measurements: Measurements,
+    repeated: Booleans | None = None,
+) -> Verdict:
+    """The verdict on new data, or, without any, on the regions held out, pooled.
+
+    measurements : of all configurations. repeated : (K,) those that the session has at poses that
+    the calibration used; None for nowhere.
+    """
+    units = machine.joint_units
+    unit = units[0] if len(set(units)) == 1 else None
+    groups = [judged] if judged else [h.left_out for h in holdouts]
+    before, after = (
+        np.concatenate([getattr(g, name) for g in groups]) for name in ("before", "after")
+    )
+    floor = finite_rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
+    gain = improvement_ratio(before, after)
+    reasons = [*_not_better(gain), *_broken(groups, units)]
+    again = int(repeated[judged.rows].sum()) if judged and repeated is not None else 0
+    every = judged is not None and again == len(judged.rows)
+    where = " of regions that it did not see" if judged is None else ""
+    if every:
+        where = " at the poses that it was calibrated from"
+    headline = _validation_headline(gain, before, after, unit, where)
+    warnings = _regions(holdouts, unit)
+    if judged and again:
+        warnings.insert(0, doubtful("validation.same_poses", number=again, of=len(judged.rows)))
+    if judged and gain.better:
+        warnings += _weak_words(judged, units)
+    noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
+    return Verdict(not reasons, headline, (*reasons, *warnings, *noise))
+
+
+def _validation_headline(
+    gain: Ratio, before: Array, after: Array, unit: str | None, where: str
+) -> str:
+    if gain.high < 1:
+        core = (
+            f"The drawing predicts the readings{where} {factor(1 / gain.value)} times better than"
+            " the calibrated machine"
+        )
+    elif gain.better:
+        core = (
+            f"The calibrated machine predicts the readings{where} {better(gain)} times better than"
+            " the drawing"
+        )
+    else:
+        core = (
+            f"The calibrated machine is not shown to predict the readings{where} better than the"
+            f" drawing: {better(gain)} times"
+        )
+    if unit is None:
+        return core + "."
+    sign = "," if not gain.better and gain.high >= 1 else ":"
+    return f"{core}{sign} {against(after, before, unit)}."
+
+
+def against(new: Array, old: Array, unit: str) -> str:
+    """Root mean squares of residuals (n,), m or rad: ``0.07 mm against 0.9 mm``."""
+    return f"{amount(finite_rms(new), unit)} against {amount(finite_rms(old), unit)}"
+
+
+def _not_better(gain: Ratio) -> list[Finding]:
+    if gain.better:
+        return []
+    facts = {"value": gain.value, "low": gain.low, "high": gain.high}
+    if gain.high < 1:
+        return [wrong("validation.worse", **facts)]
+    words = {"low_words": factor(gain.low), "high_words": factor(gain.high)}
+    return [wrong("validation.not_better", **facts, **words)]
+
+
+def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
+    """Residuals that the deviations do not promise: the first group's that has such."""
+    for group in groups:
+        if not group.promise.usual:
+            return [_too_large(group, units)]
+        if not group.promise.steady:
+            return [_in_common(group, units)]
+    return []
+
+
+def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+    one = len(set(units)) == 1
+    return wrong(
+        "validation.residuals_too_large",
+        value=group.promise.factor,
+        times=factor(group.promise.factor),
+        rms=finite_rms(group.figures(group.calibrated).joint_rms) if one else None,
+        promised=finite_rms(group.promise.joint_rms) if one else None,
+        unit=units[0],
+    )
+
+
+def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
+    """Where plain root mean squares contradict the verdict, which weighs what was seen better."""
+    by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
+    worse = by_calibrated.joint_rms > by_drawing.joint_rms
+    if not worse.any() and by_calibrated.position <= by_drawing.position:
+        return []
+    joint = int(np.argmax(np.where(worse, by_calibrated.joint_rms, -np.inf)))
+    promised = float(group.promise.joint_rms[joint])
+    facts: dict[str, Any] = {}
+    if worse.any():
+        facts = {"joint": joint + 1, "sigma": promised, "unit": units[joint]}
+    return [doubtful("validation.hardly_seen", **facts)]
+
+
+def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+    test = group.promise
+    worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
+    return wrong(
+        "validation.joint_offset",
+        f"joint {worst + 1}",
+        joint=worst + 1,
+        value=float(test.common[worst]),
+        sigma=float(test.common_sigma[worst]),
+        unit=units[worst],
+    )
+
+
+def _noise(
+    after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
+) -> tuple[Finding, ...]:
+    """That what is left of configurations ``rows`` is noise, and what would lessen it."""
+    if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
+        return ()
+    visible = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
+    edges, poses = measurements.edges, measurements.poses
+    poses = poses.select(measurements.on_platform[poses.mount])
+    for one in (edges, poses):
+        visible[one.configuration, one.station] = True
+    stations = int(visible[rows].any(axis=0).sum())
+    once = int(np.sum(visible[rows].sum(axis=1) == 1))
+    facts = {"noise": floor, "unit": unit, "stations": stations, "number": once, "of": len(rows)}
+    if stations == 1:
+        return (note("validation.noise_one_station", **facts),)
+    if once == len(rows):
+        return (note("validation.noise_each_once", **facts),)
+    if once:
+        return (note("validation.noise_some_once", **facts),)
+    return (note("validation.noise_several", **facts),)
+
+
+def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
+    """Regions in which a calibration of the rest is poor."""
+    out: list[Finding] = []
+    for item in holdouts:
+        off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
+        if off >= POOR_REGION_FACTOR * usual:
+            out.append(
+                doubtful(
+                    "validation.extrapolation",
+                    item.region.name,
+                    number=len(item.left_out.rows),
+                    rms=off,
+                    rms_used=usual,
+                    unit=unit,
+                )
+            )
+    return out
+
+
+@dataclass(frozen=True)
+class Names:
+    """What cameras and stations are called, by their numbers."""
+
+    cameras: tuple[str, ...] = ()
+    stations: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ComparedSession:
+    """What a verdict says besides the tests.
+
+    configurations : K names. calibrated, observed : (K,) used by the calibration, and looked at.
+    noisier : times the calibration's factor on the stated noise of edges. stations_moved : cameras
+    that were said to have been left in place.
+    """
+
+    configurations: tuple[str, ...]
+    calibrated: Booleans
+    observed: Booleans
+    noisier: float
+    names: Names = Names()
+    stations_moved: tuple[StationTest, ...] = ()
+
+
+def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
+    """The verdict; usable means still as calibrated."""
+    warnings = _warnings(around)
+    if judged.changed:
+        return _changed(judged, around, warnings)
+    blind = [leg for leg in judged.legs if is_blind(leg)]
+    if blind:
+        return Verdict(
+            False,
+            "These data are too few to tell whether the machine is still as calibrated.",
+            (*_blind(blind), *warnings, note("watch.more_configurations")),
+        )
+    new = int(np.sum(around.observed & ~around.calibrated))
+    headline = (
+        f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
+        f" {_would_have(judged)}."
+    )
+    silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
+    advice = [note("watch.no_reading", _of(silent), legs=_of(silent))] if silent else []
+    return Verdict(True, headline, (*warnings, *advice))
+
+
+def is_blind(leg: LegTest) -> bool:
+    """Whether not even a change as large as the drawing's tolerance would have been found."""
+    if leg.zero is None:
+        return leg.whole.dof == 0
+    return not leg.detects_zero <= leg.tolerance
+
+
+def cause_words(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
+    """A cause with the change it would have made, as a part of a sentence.
+
+    short : how far a joint moved, but not along what.
+    """
+    cause, value, sigma = suspect.cause, suspect.change.value, suspect.change.sigma
+    who = named(cause.legs) if cause.legs else ""
+    if cause.part == "scale":
+        return f"all lengths against the readings by {_ratio(value[0], sigma[0])}"
+    if cause.part == "camera":
+        above_limit = cause.camera < len(names.cameras)
+        name = names.cameras[cause.camera] if above_limit else "a camera"
+        return f"the focal length of {name} by {_ratio(value[0], sigma[0])}"
+    if cause.part == "station":
+        return f"the place of the camera {names.stations[cause.station]}{_place(suspect.change)}"
+    if cause.part in ("base", "platform"):
+        joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
+        together = " together" if len(cause.legs) > 1 else ""
+        return f"{joint}{together}{_vector(suspect, short)}"
+    if cause.part == "lead":
+        return f"the scale of {who}'s reading by {_ratio(value[0], sigma[0])}"
+    parts = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
+    what = parts.get(cause.part, f"the {cause.part} of {who}")
+    if len(value) > 1:
+        return f"{what}{_vector(suspect, short)}"
+    return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
+
+
+def signed(value: float, sigma: float, unit: str) -> str:
+    """``+0.31 mm (±0.04)``."""
+    scale, name = DISPLAY_UNITS[unit]
+    if not np.isfinite(sigma):
+        return "an amount that these data do not tell"
+    places = decimals(sigma * scale)
+    size = with_unit(number(value * scale, places, signed=True), name)
+    return f"{size} (±{number(sigma * scale, places)})"
+
+
+def _ratio(value: float, sigma: float) -> str:
+    """``+120 µm/m (±15)``."""
+    places = decimals(sigma * 1e6)
+    return f"{number(value * 1e6, places, signed=True)} µm/m (±{number(sigma * 1e6, places)})"
+
+
+def _vector(suspect: Suspect, short: bool) -> str:
+    """How far a joint moved, if the data tell that, and along what."""
+    cause, change = suspect.cause, suspect.change
+    size = float(np.linalg.norm(change.value[:3]))
+    if len(change.value) != 3 or size == 0 or not np.isfinite(change.sigma).all():
+        return ""
+    along = change.value / size
+    sigma = float(np.sqrt(along @ change.covariance @ along))
+    places = decimals(sigma * 1e3)
+    text = f" by {number(size * 1e3, places)} mm (±{number(sigma * 1e3, places)})"
+    if short:
+        return text
+    parts = ", ".join(number(v * 1e3, places, signed=True) for v in change.value)
+    return f"{text}, ({parts}) mm in the {cause.part} frame"
+
+
+def _place(change: Change) -> str:
+    """How far a camera moved and turned, as far as that is told."""
+    out: list[str] = []
+    for part, unit, factor in ((slice(3, 6), "mm", 1e3), (slice(0, 3), "°", 180 / np.pi)):
+        value, covariance = change.value[part], change.covariance[part, part]
+        size = float(np.linalg.norm(value))
+        if size == 0 or not np.isfinite(change.sigma[part]).all():
+            continue
+        sigma = float(np.sqrt(value @ covariance @ value)) / size * factor
+        places = decimals(sigma)
+        text = with_unit(number(size * factor, places), unit)
+        out.append(f"{text} (±{number(sigma, places)})")
+    return f" by {' and '.join(out)}" if out else ""
+
+
+def _changed(
+    judged: ChangeTests, around: ComparedSession, warnings: tuple[Finding, ...]
+) -> Verdict:
+    names = around.names
+    findings = judged.findings
+    if not findings:
+        headline = "The machine is not as calibrated."
+        return Verdict(False, headline, (_unnamed(judged), *warnings))
+    lens = all(f.suspect.cause.part == "camera" for f in findings)
+    if lens:
+        headline = (
+            "The photographs do not fit the calibration, and a camera explains that better than"
+            " the machine: whether the machine is as calibrated cannot be told."
+        )
+    else:
+        headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
+    reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
+    if judged.rest.dof and judged.rest.chance < UNEXPLAINED_CHANCE:
+        remainder = {"chi2": judged.rest.chi2, "dof": judged.rest.dof, "chance": judged.rest.chance}
+        reasons.append(wrong("watch.unexplained", **remainder))
+    return Verdict(False, headline, (*reasons, *warnings, _next(findings)))
+
+
+def _changes_headline(findings: Sequence[Explanation]) -> str:
+    """What changed, in short."""
+    causes = [f.suspect.cause for f in findings if f.suspect.cause.part not in ("scale", "camera")]
+    if not causes:
+        return "all its lengths have another scale"
+    legs = {leg for cause in causes for leg in cause.legs}
+    rivals = {leg for f in findings for o in f.others for leg in o.cause.legs} - legs
+    verb = "has" if len(legs) == 1 else "have"
+    return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
+
+
+def _reason(value: Explanation, place: int, names: Names) -> Finding:
+    """One finding: what, how much, as after what, and what it may be instead."""
+    cause, change = value.suspect.cause, value.suspect.change
+    alternatives = [cause_words(other, names, short=True) for other in value.others[:MOST_OTHERS]]
+    if more := len(value.others) - len(alternatives):
+        alternatives.append(count(more, "other cause"))
+    facts: dict[str, Any] = {
+        "place": "first" if place == 0 else "further",
+        "part": cause.part,
+        "legs": [leg + 1 for leg in cause.legs],
+        "value": change.value,
+        "sigma": change.sigma,
+        "what": cause_words(value.suspect, names),
+        "others": "; or ".join(alternatives) or None,
+    }
+    subject = named(cause.legs) if cause.legs else ""
+    if cause.part in ("base", "platform"):
+        return wrong("watch.mount" if len(cause.legs) > 1 else "watch.joint", subject, **facts)
+    if cause.part == "scale":
+        kelvin = brief(abs(change.value[0]) / STEEL_EXPANSION)
+        return wrong("watch.scale", **facts, kelvin=kelvin, way=change.value[0])
+    if cause.part in ("zero", "lead", "camera"):
+        return wrong(f"watch.{cause.part}", subject, **facts)
+    return wrong("watch.part", subject, **facts)
+
+
+def _unnamed(judged: ChangeTests) -> Finding:
+    """Something changed, and no single cause stands out."""
+    legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
+    if legs:
+        return wrong("watch.leg_test_fails", _of(legs), legs=_of(legs))
+    return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
+
+
+def _next(findings: Sequence[Explanation]) -> Finding:
+    parts = {f.suspect.cause.part for f in findings}
+    if parts == {"camera"}:
+        return note("watch.next_camera")
+    if parts == {"scale"}:
+        return note("watch.next_scale")
+    if any(f.others for f in findings):
+        return note("watch.next_several")
+    return note("watch.next_part")
+
+
+def _would_have(judged: ChangeTests) -> str:
+    """What would have been found, in words."""
+    zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
+    if not zeros:
+        return "no test of a leg fails"
+    what = "leg's length" if zeros[0].unit == "m" else "motor's zero"
+    return (
+        f"a change of any {what} by {with_unit(*least_size(zeros))}, depending on the leg, would"
+        f" have been found with a probability of {DETECTION_POWER:.0%}"
+    )
+
+
+def least_size(legs: Sequence[LegTest]) -> tuple[str, str]:
+    """Smallest changes of the legs' zeros that would be found, such as ``0.3 to 0.5``, and unit."""
+    scale, name = DISPLAY_UNITS[legs[0].unit]
+    sizes = [brief(f(leg.detects_zero for leg in legs) * scale) for f in (min, max)]
+    return " to ".join(dict.fromkeys(sizes)), name
+
+
+def _blind(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
+    """Why these data are too few, of legs about which they say too little."""
+    nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
+    little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
+    out: list[Finding] = []
+    if nothing:
+        out.append(wrong("watch.leg_blind", _of(nothing), legs=_of(nothing)))
+    if little:
+        least = with_unit(*least_size(little))
+        out.append(wrong("watch.leg_weak", _of(little), legs=_of(little), least=least))
+    return tuple(out)
+
+
+def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
+    out: list[Finding] = []
+    for s in around.stations_moved:
+        name = around.names.stations[s.station]
+        facts = {"station": name, "by": _place(s.change), "value": s.change.value}
+        out.append(doubtful("watch.station_moved", name, **facts))
+    both = around.calibrated & around.observed
+    if both.any():
+        names = [*compress(around.configurations, both)]
+        out.append(doubtful("watch.known_configurations", listed(names, 4), names=names))
+    if around.noisier > NOISIER_PHOTOGRAPHS_FACTOR:
+        out.append(doubtful("watch.noisier", scale=around.noisier))
+    return tuple(out)
+
+
+def _of(tests: Sequence[LegTest]) -> str:
+    """The legs that tests are of."""
+    return named(j for test in tests for j in test.legs)

@@ -1,0 +1,346 @@
+"""Picture edges of one station's photographs, ready to be looked up: how far is the nearest?
+
+Photographs are reduced, picture edges found, and for each of a few directions the distance to
+the nearest edge of about that direction is tabulated, as soon as one is asked for. A predicted
+silhouette then scores by the distances under its points, smooth enough to be descended from a
+hundred pixels away. Where a station took several photographs, edges that never move are left out:
+the floor and the wall do not say where the machine is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import THREADS, Array, Booleans, Integers
+from pkmcal.observe.grey_levels import MOST_ROWS_INTERPOLATED, interpolated
+
+EDGE_DIRECTIONS = 8
+"""Edge directions told apart; each table takes the neighbouring directions in as well."""
+WORKING_WIDTH = 256
+"""Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
+apart, coarse enough to search quickly."""
+STILL_LEVEL_DIFFERENCE = 5.0
+"""Levels from the station's median photograph within which a place counts as still."""
+ENOUGH_TO_COMPARE = 4
+"""Photographs from which a median is a picture of the background."""
+CANNY_SLOPES = (20, 40)
+"""Sobel slopes from which an edge goes on and begins: five times what the noise of a level, that a
+reduced photograph has at most, makes of it; from half of that to the double, little changes."""
+FURTHEST_EDGE_DISTANCE = 32.0
+"""Reduced pixels beyond which distances are not told apart."""
+NO_EDGE_DISTANCE = 1e3
+"""Reduced pixels where a photograph has no edge of a direction."""
+CHANCE_DISTANCE_BIN = 0.5
+"""Reduced pixels of a bin of the distances that chance gives."""
+
+
+class PictureEdges(NamedTuple):
+    """Edge points of one reduced photograph: pixel (n, 2), reduced px, and unit normal (n, 2)."""
+
+    pixel: Array
+    normal: Array
+
+
+@dataclass(frozen=True)
+class DirectionTables:
+    """The tables of photographs. What belongs to a direction is worked out when an edge of that
+    direction is first looked for: the silhouettes of most machines have half of them.
+
+    place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
+    direction numbers (n,). picture : (rows, h, columns, EDGE_DIRECTIONS, w), in which the n-th
+    photograph's tables lie in row n % rows and column n // rows. chance : (EDGE_DIRECTIONS, bins)
+    of CHANCE_DISTANCE_BIN: how often a place taken anywhere has that distance. ready :
+    (EDGE_DIRECTIONS,) whether both are worked out.
+    """
+
+    place: tuple[Integers, ...]
+    number: tuple[Integers, ...]
+    picture: Array
+    chance: Array
+    ready: Booleans
+
+    @classmethod
+    def of_edges(
+        cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
+    ) -> DirectionTables:
+        """Those of edge points, none ready. shape : EDGE_DIRECTIONS, h, w."""
+        directions, height, width = shape
+        rows = min(len(place), MOST_ROWS_INTERPOLATED // height)
+        columns = -(-len(place) // rows)
+        picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
+        chance = np.zeros(
+            (directions, round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)), dtype=np.float32
+        )
+        return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
+
+    def get_ready(self, direction: Integers) -> None:
+        """Work out what there is not yet of directions (...)."""
+        if self.ready.take(direction).all():
+            return
+        missing = [k for k in np.unique(direction) if not self.ready[k]]
+        with ThreadPoolExecutor(THREADS) as pool:
+            list(pool.map(self._work_out, missing))
+
+    def _work_out(self, direction: int) -> None:
+        rows, taken_in = len(self.picture), bin_neighbours(direction, len(self.ready))
+        counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
+        for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
+            table = self.picture[n % rows, :, n // rows, direction]
+            write_distances(place[taken_in.take(number)], table)
+        for first in range(0, len(self.place), rows):  # so many at once, for threads take turns
+            tables = self.picture[: len(self.place) - first, :, first // rows, direction]
+            counted += _counted(tables)
+        self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
+        self.ready[direction] = True  # at last, as others may look beside
+
+    def mirrored(self) -> DirectionTables:
+        """With left and right exchanged, none ready."""
+        _, height, _, directions, width = self.picture.shape
+        place = [p + width - 1 - 2 * (p % width) for p in self.place]
+        # the direction a becomes pi - a
+        number = [directions - 1 - n for n in self.number]
+        return self.of_edges(place, number, (directions, height, width))
+
+
+@dataclass(frozen=True)
+class DistanceTables:
+    """Distances in reduced pixels and the reduction factor.
+
+    row : (K,) each photograph's number in the tables. edges : of each photograph.
+    moving : (h, w) share of the photographs in which each place differs from the others; where a
+    single one cannot tell, where it has edges. against : (n, h, w) of each in the tables, 1 where a
+    place is brighter than in the median photograph, -1 darker, 0 much the same, or where there is
+    no median.
+    """
+
+    tables: DirectionTables
+    row: Integers
+    scale: float
+    edges: tuple[PictureEdges, ...]
+    moving: Array
+    against: Integers
+
+    def direction(self, normal: Array) -> Integers:
+        """Direction number of edges whose image normals are (..., 2)."""
+        return direction_of(normal, len(self.tables.ready))
+
+    def look_up(
+        self, direction: Integers, pixel: Array, photograph: Integers, between: bool = False
+    ) -> tuple[Array, Booleans]:
+        """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
+
+        direction, photograph : (...) table numbers. between : bilinear between table entries, else
+        the nearest.
+        """
+        import cv2
+
+        x, y, inside = self._place(direction, pixel, photograph)
+        how = cv2.INTER_LINEAR if between else cv2.INTER_NEAREST
+        return self._interpolated(x, y, how), inside
+
+    def look_along(
+        self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
+    ) -> tuple[Array, Array, Booleans]:
+        """As :meth:`look`, bilinear between table entries; with it how much the distance grows a
+        pixel along unit vectors (..., 2), from the entries a reduced pixel to both sides.
+        """
+        import cv2
+
+        x, y, inside = self._place(direction, pixel, photograph)
+        right, down = outward[..., 0], outward[..., 1]
+        here = self._interpolated(x, y, cv2.INTER_LINEAR)
+        ahead = self._interpolated(x + right, y + down, cv2.INTER_LINEAR)
+        behind = self._interpolated(x - right, y - down, cv2.INTER_LINEAR)
+        return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
+
+    def brighter(self, pixel: Array, photograph: Integers) -> tuple[Integers, Booleans]:
+        """Whether places at full-size pixels (..., 2) are brighter (1) or darker (-1) than in the
+        median photograph, 0 outside, and which lie in the photograph.
+        """
+        height, width = self.against.shape[1:]
+        x, y = ((pixel[..., i] + 0.5) / self.scale for i in (0, 1))
+        with np.errstate(invalid="ignore"):
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        x, y = (np.where(inside, v, 0.0).astype(np.intp) for v in (x, y))
+        return np.where(inside, self.against[self.row[photograph], y, x], 0), inside
+
+    def _place(
+        self, direction: Integers, pixel: Array, photograph: Integers
+    ) -> tuple[Array, Array, Booleans]:
+        """Column and row (...) in the picture of all tables, and whether in the photograph."""
+        self.tables.get_ready(direction)
+        rows, height, _, count, width = self.tables.picture.shape
+        x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
+        with np.errstate(invalid="ignore"):
+            inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
+        # in the single precision of a search, in which columns and rows below 2**15 lose nothing
+        number = self.row[photograph].astype(np.int32)
+        column = ((number // rows * count + direction) * width).astype(np.float32)
+        line = (number % rows * height).astype(np.float32)
+        x, y = (np.where(inside, v, 0.0) for v in (x + column, y + line))
+        return x, y, inside
+
+    def _interpolated(self, x: Array, y: Array, how: int) -> Array:
+        """The picture of all tables at columns and rows (...)."""
+        tables = self.tables.picture
+        return interpolated(tables.reshape(tables.shape[0] * tables.shape[1], -1), x, y, how)
+
+    def by_chance(self, direction: Integers, values: Array) -> Array:
+        """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
+        self.tables.get_ready(direction)
+        bins = self.tables.chance.shape[1]
+        number = np.minimum(values / np.float32(CHANCE_DISTANCE_BIN), bins - 1).astype(np.int32)
+        return self.tables.chance.take(direction * bins + number)
+
+    def select(self, photographs: Integers) -> DistanceTables:
+        """Of some of the photographs; what moves and what chance gives, as all show it."""
+        edges = tuple(self.edges[k] for k in photographs)
+        return replace(self, row=self.row[photographs], edges=edges)
+
+    def mirrored(self) -> DistanceTables:
+        """Of the photographs with left and right exchanged."""
+        width = self.moving.shape[1]
+        edges = (
+            PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
+        )
+        return DistanceTables(
+            self.tables.mirrored(),
+            self.row,
+            self.scale,
+            tuple(edges),
+            self.moving[:, ::-1],
+            self.against[..., ::-1],
+        )
+
+
+def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
+    """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
+    matter.
+    """
+    turn = np.arctan2(normal[..., 1], normal[..., 0]) * (count / np.pi)
+    with np.errstate(invalid="ignore"):  # what is no number has any
+        return np.floor(turn).astype(np.int32) % count
+
+
+def bin_neighbours(direction: int, count: int) -> Booleans:
+    """Which direction numbers, of ``count``, a direction's table takes in: its own and the
+    neighbours'.
+    """
+    return (np.arange(count) - (direction - 1)) % count < 3
+
+
+def write_distances(place: Integers, out: Array) -> None:
+    """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
+    into ``out``, in single precision and each row in one piece.
+    """
+    import cv2
+
+    if not len(place):
+        out[...] = NO_EDGE_DISTANCE
+        return
+    mask = np.ones(out.shape, dtype=np.uint8)
+    mask.reshape(-1)[place] = 0
+    table: Any = out
+    cv2.distanceTransform(mask, cv2.DIST_L2, 3, dst=table)
+
+
+def distance_tables(
+    images: Sequence[Integers],
+    width: int = WORKING_WIDTH,
+    directions: int = EDGE_DIRECTIONS,
+) -> DistanceTables:
+    """Tables of one station's photographs, K arrays (height, width) uint8 of one size, which are
+    looked at on threads.
+    """
+    import cv2
+
+    def reduced(number: int) -> tuple[Integers, float]:
+        image = images[number]  # each is decoded once, and only its reduction kept
+        scale = max(image.shape[1] / width, 1.0)
+        size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
+        return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        pairs = list(pool.map(reduced, range(len(images))))
+        small, scale = [image for image, _ in pairs], pairs[0][1]
+        height, across = small[0].shape
+        against = np.zeros((len(small), height, across), dtype=np.int8)
+        differs = None
+        if len(small) >= ENOUGH_TO_COMPARE:
+            against = _against_median(np.stack(small))
+            differs = against != 0
+        each = [None] * len(small) if differs is None else differs
+        edges = tuple(pool.map(_edges_of, small, each))
+    moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
+    place = [e.pixel.astype(int) @ (1, across) for e in edges]
+    number = [direction_of(e.normal, directions) for e in edges]
+    tables = DirectionTables.of_edges(place, number, (directions, height, across))
+    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, against)
+
+
+def _against_median(small: Integers) -> Integers:
+    """Where photographs (K, h, w) are brighter (1) or darker (-1) than the median of all."""
+    # neighbours exchanged until all are in order: over pictures, thirty times as fast as sorting
+    # the levels of one place after the other
+    order = small.copy()
+    for turn in range(len(order)):
+        low, high = order[turn % 2 : -1 : 2], order[turn % 2 + 1 :: 2]
+        less = np.minimum(low, high)
+        np.maximum(low, high, out=high)
+        low[...] = less
+    n = len(order)
+    # twice the median, in whole levels
+    twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
+    off = 2 * small.astype(np.int16) - twice
+    return (off > 2 * STILL_LEVEL_DIFFERENCE).astype(np.int8) - (off < -2 * STILL_LEVEL_DIFFERENCE)
+
+
+def _moving(small: Integers, edges: PictureEdges) -> Array:
+    """Share (h, w) of photographs too few for a median in which each place differs from the others;
+    of one alone, where it has edges.
+    """
+    if len(small) > 1:
+        return (np.ptp(small.astype(float), axis=0) > STILL_LEVEL_DIFFERENCE).astype(float)
+    out = np.zeros(small.shape[1:])
+    x, y = edges.pixel.astype(int).T
+    out[y, x] = 1.0
+    return out
+
+
+def _counted(tables: Array) -> Integers:
+    """How often each distance occurs in tables (n, h, w), (bins,); at every other place of every
+    other row: from fewer, what chance gives would differ between explanations of one picture.
+    """
+    bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
+    number = tables[:, ::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN)
+    number = np.minimum(number, bins - 1).astype(np.intp)
+    return np.bincount(number.ravel(), minlength=bins)
+
+
+def _levels(image: Any) -> Integers:
+    """Grey levels (h, w) whose noise is even: a sensor's grows with the root of the light. So a
+    dark machine before a dark wall stands out as a bright one does in the sun.
+    """
+    return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
+
+
+def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
+    """Edge points of one reduced photograph, where it differs from the others (h, w)."""
+    import cv2
+
+    dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
+    dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
+    edges = cv2.Canny(dx, dy, *CANNY_SLOPES) > 0
+    if moving is not None:
+        edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    y, x = np.divmod(np.flatnonzero(edges), edges.shape[1])  # faster than np.nonzero
+    normal = np.stack([dx[y, x], dy[y, x]], axis=-1).astype(float)
+    return PictureEdges(
+        np.stack([x, y], axis=-1).astype(float),
+        normal / np.hypot(normal[:, 0], normal[:, 1])[:, None],
+    )

@@ -1,0 +1,246 @@
+"""What is drawn over a photograph: silhouettes of legs and joint centres, in pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import apply, dot
+from pkmcal.measurements import EdgeSet
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.predict import (
+    LegsInCamera,
+    TubeList,
+    edge_points,
+    legs_in_camera,
+    normals_of_edges,
+    tubes_of,
+    unobstructed,
+)
+from pkmcal.wording import number
+
+EDGE_CURVE_POINTS = 13
+"""Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+EDGE_SIDE_NAMES = ("right", "left")
+"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
+EDGE_CURVE_FRACTIONS = np.linspace(0, 1, EDGE_CURVE_POINTS)
+STRAIGHT_CURVE_DEVIATION = 0.1
+"""Curves that stay within this many pixels of their chord are written as two points."""
+FINE_EDGE_CURVE_POINTS = 65
+"""Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
+LEG_NUMBER_WIDTH = 0.04
+"""Width of a leg's number with its joint, in picture widths."""
+INLIER_WEIGHT = 0.5
+"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A fitted edge as a polyline in pixels, (n, 2) in ``points``."""
+
+    leg: int
+    points: tuple[tuple[float, float], ...]
+    quiet: bool
+    tip: str
+
+    @cached_property
+    def path(self) -> str:
+        """SVG path data."""
+        return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+
+
+def edge_name(leg: int, tube: int, side: int) -> str:
+    """One edge of a leg's tube in words; all count from 0 here."""
+    return f"leg {leg + 1}, tube {tube + 1}, {EDGE_SIDE_NAMES[side]} edge"
+
+
+def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str) -> Drawn | None:
+    """What is drawn through points that are seen, of :func:`straightened`; leg : from 0."""
+    if len(points) < 2:
+        return None
+    return Drawn(leg + 1, tuple((x, y) for x, y in points), quiet, tip)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A joint centre in pixels: where the calibrated model sees it, and where the drawing does."""
+
+    leg: int
+    end: str
+    calibrated: tuple[float, float]
+    drawing: tuple[float, float] | None
+    labelled: bool
+
+    @property
+    def tip(self) -> str:
+        """What it is, and how far the two are apart."""
+        if self.drawing is None:
+            return f"Leg {self.leg}, {self.end} joint"
+        away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
+        return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """From a place in a picture, px, as far as it is drawn: from a board's corner, where it was
+    found, to where it is expected, or a cell's mean residual. lead : a link to what it is of.
+    """
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+    quiet: bool = False
+    tip: str = ""
+    lead: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
+    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
+    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
+    the page.
+    """
+
+    station: str
+    configuration: str
+    width: int
+    height: int
+    jpeg: str
+    edges: tuple[Drawn, ...] = ()
+    spots: tuple[Spot, ...] = ()
+    why: str = ""
+    caption: str = ""
+    kind: str = "measured"
+    anchor: str = ""
+    large: str = ""
+    missed: tuple[Drawn, ...] = ()
+    corners: tuple[Arrow, ...] = ()
+
+
+def machine_laid_over(
+    machine: Machine,
+    camera: Camera,
+    T_camera_base: Array,
+    joints: Array,
+    T_base_platform: Array,
+) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+    """Silhouettes of a machine's tubes in a photograph, where no other leg hides them, and its
+    joint centres.
+
+    joints : (m,) readings. T_base_platform : (4, 4).
+    """
+    tubes = tubes_of(machine)
+    legs = legs_in_camera(machine, T_camera_base, T_base_platform[None], joints[None])
+    points = edge_points(machine, camera, legs, tubes, FINE_EDGE_CURVE_POINTS)
+    clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
+    edges: list[Drawn] = []
+    for e, (curve, visible) in enumerate(zip(points.pixel[0], clear, strict=True)):
+        leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
+        parts = (straightened(curve[None, start:stop])[0] for start, stop in _runs(visible))
+        lines = (polyline(leg, part, False, tip) for part in parts)
+        edges += [line for line in lines if line]
+    ends = machine.ends_at(joints, T_base_platform)
+    both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
+    return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
+
+
+def measured_curves(
+    machine: Machine,
+    camera: Camera,
+    legs: LegsInCamera,
+    photograph: Integers,
+    edges: EdgeSet,
+    fraction: Array = EDGE_CURVE_FRACTIONS,
+) -> Array:
+    """Curves (n, m, 2) px of measured edges in photographs of one station, at fractions (m,) of
+    their span.
+
+    legs : (K, L, 3) in each photograph. photograph : (n,) the edges' among them. The predicted
+    contour's rays, each turned into the measured plane: r - (r . n) n.
+    """
+    along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
+    radius = machine.radii_of(edges.leg, edges.tube)
+    at = photograph, edges.leg
+    axis = legs.a[at][:, None] + along[..., None] * legs.u[at][:, None]
+    normal = edges.normal[:, None]
+    rays = axis + radius[:, None, None] * normal
+    rays = rays - dot(rays, normal)[..., None] * normal
+    return camera.project(rays)
+
+
+def own_edges(
+    machine: Machine, legs: LegsInCamera, photograph: Integers, edges: EdgeSet
+) -> EdgeSet:
+    """The edges as the machine itself would show them, as for :func:`measured_curves`."""
+    radius = machine.layout.radius_of(edges.leg, edges.tube)
+    start, stop = edges.span.T
+    each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
+    at = photograph, edges.leg
+    own, _ = normals_of_edges(legs.a[at], legs.u[at], machine.values[radius], each)
+    return replace(edges, normal=own)
+
+
+def offsets_across_curves(expected: Array, measured: Array) -> tuple[Array, Array]:
+    """Unit normals (n, m, 2) of curves (n, m, 2), px, and how far (n, m) others lie along them."""
+    tangent = np.gradient(expected, axis=1)
+    normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return normal, dot(normal, measured - expected)
+
+
+def residual_words(shift: float, tilt: float, weight: float) -> str:
+    """An edge's residual, in standard deviations, and its robust weight."""
+    return (
+        f"residual {number(shift, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
+        f" weight {number(weight, 2)}"
+    )
+
+
+def straightened(curves: Array) -> list[list[list[float]]]:
+    """Of each curve (n, m, 2) the points that are seen, which are finite; both ends alone of one
+    that is straight between them.
+    """
+    finite: Booleans = np.asarray(np.isfinite(curves).all(axis=-1))
+    row = np.arange(len(curves))
+    curves = np.where(finite[..., None], curves, np.nan)
+    first = curves[row, np.argmax(finite, axis=1)]
+    last = curves[row, -1 - np.argmax(finite[:, ::-1], axis=1)]
+    chord, off = last - first, curves - first[:, None]
+    area = np.abs(chord[:, :1] * off[..., 1] - chord[:, 1:] * off[..., 0])
+    most = np.max(area, axis=1, where=finite, initial=0.0)
+    straight = (most <= STRAIGHT_CURVE_DEVIATION * np.hypot(*chord.T)) & (finite.sum(axis=1) > 2)
+    ends = np.stack([first, last], axis=1).tolist()
+    return [ends[k] if straight[k] else curves[k, finite[k]].tolist() for k in row]
+
+
+def _spots(pixel: Array, visible: Booleans, width: int) -> tuple[Spot, ...]:
+    """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
+    another number.
+    """
+    room, labels, spots = width * LEG_NUMBER_WIDTH, list[Array](), list[Spot]()
+    for j in range(pixel.shape[1]):
+        free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
+        at = [end for end in (0, 1) if visible[end, j]]
+        # at the base, where there is room
+        best = max(at, key=lambda end: (min(free[end], room), -end), default=None)
+        for end in at:
+            x, y = pixel[end, j]
+            place = round(float(x), 1), round(float(y), 1)
+            spots.append(Spot(j + 1, ("base", "platform")[end], place, None, end == best))
+        if best is not None:
+            labels.append(pixel[best, j])
+    return tuple(spots)
+
+
+def _runs(visible: Booleans) -> list[tuple[int, int]]:
+    """Stretches (n,) of True that are longer than a point, first and one after the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]])))
+    return [(a, b) for a, b in pairwise(ends.tolist()) if visible[a] and b - a > 1]

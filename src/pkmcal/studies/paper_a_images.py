@@ -1,0 +1,62 @@
+"""[A] Table 1 on rendered photographs: six configurations, each taken five times."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from pkmcal.calibration.repeats import LegScatter, study_repeats
+from pkmcal.mechanisms import load_mechanism, machine_from_document, with_exact_scales
+from pkmcal.papers.axis_measurements import AxisNoise
+from pkmcal.simulation import Settings, simulate_session
+from pkmcal.simulation.demo import DEMO_MECHANISM, camera_of_size
+
+PAPER_A_PICTURE_SIZE = (1024, 768)
+"""[A] 4.2: pixels; the lens of 6 mm is the demonstration's too."""
+PAPER_A_SESSION_SETTINGS = Settings(stations=3, configurations=6, repeats=5)
+"""Six orientations of the legs, [A] 4.2. Three stations, so that the session can be calibrated."""
+RENDERING_PROGRESS_SHARE = 0.8
+
+
+class MeasuredNoise(NamedTuple):
+    """Standard deviations of one photograph of a leg: median and largest over the legs.
+
+    edge : of an edge as a whole, px, median.
+    """
+
+    middle: AxisNoise
+    bound: AxisNoise
+    edge: float
+
+
+def measured_noise(seed: int, progress: Callable[[str, float], None]) -> MeasuredNoise:
+    """Render the photographs, calibrate them, and see how they scatter."""
+
+    def rendered(done: int, total: int) -> None:
+        progress(f"Photograph {done} of {total}", RENDERING_PROGRESS_SHARE * done / total)
+
+    with tempfile.TemporaryDirectory(prefix="pkmcal-") as name:
+        folder = Path(name) / "session"
+        machine = machine_from_document(with_exact_scales(load_mechanism(DEMO_MECHANISM).document))
+        simulate_session(
+            folder,
+            machine,
+            camera_of_size(PAPER_A_PICTURE_SIZE),
+            PAPER_A_SESSION_SETTINGS,
+            seed=seed,
+            progress=rendered,
+        )
+        value = study_repeats(
+            folder,
+            seed=seed,
+            progress=lambda text, share: progress(
+                text, RENDERING_PROGRESS_SHARE + (1 - RENDERING_PROGRESS_SHARE) * share
+            ),
+        )
+    return MeasuredNoise(_noise(value.middle), _noise(value.bound), value.middle.shift)
+
+
+def _noise(row: LegScatter) -> AxisNoise:
+    return AxisNoise(row.psi, row.theta, row.x, row.z, images=1)

@@ -1,0 +1,186 @@
+"""What is shown: a session, photograph by photograph, and its calibration where there is one.
+
+Nothing is read or worked out of a photograph before somebody looks at it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.cameras import Camera, load_camera
+from pkmcal.cameras.files import written_camera
+from pkmcal.cameras.response import Response
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.images import decode
+from pkmcal.session.image_files import Photograph, label_of
+from pkmcal.session.load import Session, Station
+
+if TYPE_CHECKING:
+    from pkmcal.boards.board import Board, Detection
+    from pkmcal.calibration.saved_calibration import SavedCalibration
+    from pkmcal.observe.pose_likelihood import StationView
+
+DECODED_IMAGES_CACHED = 16
+"""Decoded photographs that are kept: those that one goes back and forth between."""
+WIDEST_VIEWED_PICTURE = 1600
+"""px; a screen shows no more of a telephone's picture beside two columns."""
+VIEWED_JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A machine before a camera: what is laid over one photograph.
+
+    joints : (m,) readings. T_base_platform, T_camera_base : (4, 4). response : how the photograph
+    codes light.
+    """
+
+    machine: Machine
+    camera: Camera
+    joints: Array
+    T_base_platform: Array
+    T_camera_base: Array
+    response: Response
+
+    @property
+    def points(self) -> Array:
+        """Joint centres (2, L, 3) on base and platform, base frame, m."""
+        machine = self.machine
+        ends = machine.ends_at(self.joints, self.T_base_platform)
+        return np.stack([ends.a, ends.b])
+
+
+class Viewed:
+    """A session and, where there is one, its calibration.
+
+    calibration : folder that `pkmcal calibrate` wrote; None for none.
+    """
+
+    def __init__(self, session: Session, calibration: Path | None) -> None:
+        self.session = session
+        self.calibration = calibration
+        self.image = lru_cache(DECODED_IMAGES_CACHED)(self._image)
+        self.corners = lru_cache(DECODED_IMAGES_CACHED)(self._corners)
+        self.start = cache(self._start)
+        self.views: dict[int, StationView] = {}
+
+    def station(self, s: int) -> Station:
+        """A station by its number. Raises InputError where there is none."""
+        if not 0 <= s < len(self.session.stations):
+            raise InputError("there is no such station", found=s + 1)
+        return self.session.stations[s]
+
+    def photograph(self, s: int, k: int) -> Photograph:
+        """A station's photograph by its number. Raises InputError where there is none."""
+        photographs = self.station(s).photographs
+        if not 0 <= k < len(photographs):
+            raise InputError(f"station {self.station(s).name} has no such photograph", found=k + 1)
+        return photographs[k]
+
+    def _image(self, s: int, k: int) -> Integers:
+        """A photograph as grey levels (height, width). Raises InputError as `decode`."""
+        path = self.photograph(s, k).path
+        return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
+
+    def jpeg(self, s: int, k: int) -> bytes:
+        """A photograph at a size for the screen."""
+        from pkmcal.pages.jpegs import coded, narrowed
+
+        return coded(narrowed(self.image(s, k), WIDEST_VIEWED_PICTURE), VIEWED_JPEG_QUALITY)
+
+    def drawn(self, s: int, k: int) -> Pane:
+        """The drawing's machine before a station's camera."""
+        row, station = self.photograph(s, k).configuration, self.station(s)
+        machine, joints = self.session.machine, self.session.joints[row]
+        there = station.T_camera_base
+        there = self.start(s) if there is None else there
+        return Pane(machine, station.camera, joints, self.poses[row], there, station.response)
+
+    def _start(self, s: int) -> Array:
+        """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it:
+        before the machine, far enough to have all of it in the picture.
+        """
+        from pkmcal.simulation.placement import default_stations
+
+        machine, camera = self.session.machine, self.station(s).camera
+        (place,) = default_stations(machine, (camera,), np.random.default_rng(0))
+        return place.T_camera_base()
+
+    @cached_property
+    def poses(self) -> Array:
+        """T_base_platform (K, 4, 4) by the drawing: the nearest ones, where it does not close."""
+        try:
+            return self.session.machine.forward_result(self.session.joints).T_base_platform
+        except GeometryError as error:  # the drawing is the user's: it is at fault
+            raise error.as_input(self.session.document["mechanism"]) from None
+
+    def calibrated(self, s: int, k: int) -> Pane:
+        """The calibrated machine, as the calibration left it, before the camera as it found it.
+
+        Raises InputError where the calibration is another session's, or has not this station.
+        """
+        saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
+        number = self.number(s)
+        T_camera_base = inverse(saved.stations[number].T_base_camera)
+        refined = saved.path.parent / written_camera(station.camera_file)
+        camera = load_camera(refined) if refined.is_file() else station.camera
+        excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
+        camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
+        pose = saved.T_base_platform[row]
+        response = saved.document["stations"][number].get("response") or station.response
+        joints = saved.joints[row]
+        return Pane(saved.machine, camera, joints, pose, T_camera_base, response)
+
+    @cached_property
+    def saved(self) -> SavedCalibration:
+        """The calibration. Raises InputError where there is none, or it is another session's."""
+        from pkmcal.calibration.saved_calibration import load
+
+        if self.calibration is None:
+            raise InputError(
+                "there is no calibration of this session",
+                where=str(self.session.folder),
+                next_step="Run pkmcal calibrate, or name its folder with --calibration",
+            )
+        saved = load(self.calibration)
+        same = saved.configurations == self.session.configurations
+        if not same or not np.allclose(saved.joints, self.session.joints):
+            raise InputError(
+                "this is the calibration of another session, or the readings changed since",
+                where=str(saved.path),
+                expected=f"the configurations and readings of {self.session.folder}",
+                next_step="Calibrate again, or name another folder with --calibration",
+            )
+        return saved
+
+    def number(self, s: int) -> int:
+        """A station's number in the calibration, which may have left some out."""
+        names = [station.name for station in self.saved.stations]
+        if (name := self.station(s).name) not in names:
+            raise InputError(
+                f"the calibration has no station {name}: it was left out, or added since",
+                where=str(self.saved.path),
+            )
+        return names.index(name)
+
+    @cached_property
+    def _board(self) -> Board | None:
+        from pkmcal.boards.stations import board_of
+
+        return board_of(self.session)
+
+    def _corners(self, s: int, k: int) -> Detection | None:
+        """The board in a photograph of a station that observes it; None of one that does not."""
+        from pkmcal.boards.find import detect_board
+
+        if self._board is None or "board" not in self.station(s).observe:
+            return None
+        return detect_board(self.image(s, k), self._board)

@@ -1,0 +1,208 @@
+"""What is found in one photograph: edges of legs, those that are not, and a board's corners.
+
+The same looks as `calibrate` takes: of the drawing, each leg as a whole within a few pixels; of a
+calibrated machine, each edge by itself to sub-pixel. What the calibration made of it is read from
+its file.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import dot
+from pkmcal.measurements import EdgeSet, Rejection
+from pkmcal.observe import legs
+from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
+from pkmcal.pages.overlays import (
+    EDGE_CURVE_POINTS,
+    INLIER_WEIGHT,
+    edge_name,
+    measured_curves,
+    offsets_across_curves,
+    own_edges,
+    polyline,
+    residual_words,
+    straightened,
+)
+from pkmcal.view.content import Pane, Viewed
+from pkmcal.view.overlay import placed_by_hand
+from pkmcal.view.requests import ViewRequest
+from pkmcal.wording import count, number
+
+MIDDLE_EDGE_SIGMAS = 2.0
+"""Standard deviations, of drawing and search, within which the middle edge has to lie."""
+
+
+class _Judged(NamedTuple):
+    """What a calibration made of an edge: weight and residuals (standard deviations)."""
+
+    weight: float
+    shift: float
+    tilt: float
+
+
+def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+    """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
+    board's corners, and all that in words.
+    """
+    pane = placed_by_hand(viewed, request)
+    texts: list[str] = []
+    out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": texts, "median": None}
+    if "legs" in viewed.station(request.station).observe and len(tubes_of(pane.machine)):
+        _legs(viewed, request, pane, out)
+    detection = viewed.corners(request.station, request.photograph)
+    if detection is not None:
+        out["corners"] = np.round(detection.pixels, 1)
+        corners = count(len(detection.ids), "corner")
+        texts.append(f"The board: {corners} found." if detection.success else
+                    f"The board is not found: {detection.reason}.")  # fmt: skip
+    return out
+
+
+def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any]) -> None:
+    """What is found of the legs, put into the answer."""
+    row = viewed.photograph(request.station, request.photograph).configuration
+    taken = Photographs(
+        request.station,
+        pane.camera,
+        np.array([row]),
+        pane.joints[None],
+        [viewed.image(request.station, request.photograph)],
+        pane.response,
+        legs.first_binning(pane.camera.image_size),
+    )
+    take = legs.measure if request.shown == "calibration" else legs.search
+    in_view = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
+    judged, reasons = _judged(viewed, request)
+    curves, away = _off(pane, in_view.edges)
+    for n, points in enumerate(straightened(curves)):
+        place = (int(in_view.edges.leg[n]), int(in_view.edges.tube[n]), int(in_view.edges.side[n]))
+        shift = number(float(away[n]), 2, signed=True)
+        tip = f"{edge_name(*place).capitalize()}: {shift} px outward"
+        quiet = False
+        if (of := judged.get(place)) is not None:
+            quiet = of.weight < INLIER_WEIGHT
+            tip += f"; {residual_words(of.shift, of.tilt, of.weight)}"
+        if place in reasons:
+            quiet, tip = True, f"{tip}; {reasons[place]}"
+        drawn = polyline(place[0], points, quiet, tip)
+        if drawn:
+            out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
+    missed = _missed(pane, in_view.edges, in_view.rejected, reasons)
+    out["missed"] = missed
+    out["median"] = float(np.median(np.abs(away))) if len(away) else None
+    out["told"] += _words(pane, request, len(curves), len(missed), out["median"])
+
+
+def _judged(
+    viewed: Viewed, request: ViewRequest
+) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
+    """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
+    and side from 0; -1 where all of them are meant.
+    """
+    if request.shown != "calibration":
+        return {}, {}
+    document, s = viewed.saved.document, viewed.number(request.station) + 1
+    k = viewed.photograph(request.station, request.photograph).configuration
+    rows = (document.get("residuals") or {}).get("edges") or []
+    judged = {
+        (int(leg) - 1, int(tube) - 1, int(side) - 1): _Judged(weight, shift, tilt)
+        for station, row, leg, tube, side, weight, shift, tilt, *_ in rows
+        if (station, row) == (s, k + 1)
+    }
+    own = [viewed.station(request.station).name, viewed.session.configurations[k]]
+    reasons = {
+        (leg - 1, tube - 1, side - 1): group["reason"]
+        for group in document.get("rejected") or []
+        for *where, leg, tube, side in group["cases"]
+        if where == own
+    }
+    return judged, reasons
+
+
+def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
+    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and how far outward (n,) px of the
+    machine's own they lie in the middle.
+    """
+    if not len(edges):
+        return np.zeros((0, EDGE_CURVE_POINTS, 2)), np.zeros(0)
+    machine, one = pane.machine, np.zeros(len(edges), dtype=int)
+    pose, joints = pane.T_base_platform[None], pane.joints[None]
+    axes = legs_in_camera(machine, pane.T_camera_base, pose, joints)
+    measured, drawn = (
+        measured_curves(machine, pane.camera, axes, one, part)
+        for part in (edges, own_edges(machine, axes, one, edges))
+    )
+    # outward of the leg: away from where its axis is seen
+    a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
+    axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
+    middle = EDGE_CURVE_POINTS // 2
+    normal, off = offsets_across_curves(drawn, measured)
+    outward = np.sign(dot(normal[:, middle], drawn[:, middle] - axis))
+    return measured, outward * off[:, middle]
+
+
+def _missed(
+    pane: Pane,
+    edges: EdgeSet,
+    rejected: tuple[Rejection, ...],
+    reasons: dict[tuple[int, int, int], str],
+) -> list[dict[str, Any]]:
+    """Edges of the machine that were looked for and not found, as they should lie, each with why;
+    those of which a part would be in the picture.
+    """
+    tubes = tubes_of(pane.machine)
+    pixel = _contours(pane, EDGE_CURVE_POINTS).pixel
+    in_view = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
+    now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
+    out: list[dict[str, Any]] = []
+    inside = np.where(pane.camera.in_image(pixel)[..., None], pixel, np.nan)
+    for e, points in enumerate(straightened(inside)):
+        place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
+        if place in in_view:
+            continue
+        whole = (place[0], -1, -1)
+        why = reasons.get(place) or now.get(place) or reasons.get(whole) or now.get(whole)
+        why = why or "too little of it is seen"
+        tip = f"{edge_name(*place).capitalize()}: {why}"
+        drawn = polyline(place[0], points, True, tip)
+        if drawn:
+            out.append({"leg": drawn.leg, "d": drawn.path, "tip": drawn.tip, "reason": why})
+    return out
+
+
+def _contours(pane: Pane, samples: int) -> EdgePoints:
+    """Points of the machine's own edges."""
+    legs = legs_in_camera(pane.machine, pane.T_camera_base, pane.T_base_platform, pane.joints)
+    return edge_points(pane.machine, pane.camera, legs, tubes_of(pane.machine), samples)
+
+
+def _words(
+    pane: Pane, request: ViewRequest, in_view: int, missed: int, median: float | None
+) -> list[str]:
+    """How well the machine lies on what is seen."""
+    if in_view + missed == 0:
+        return ["No leg of the machine would be in this photograph at this pose."]
+    text = f"{in_view} of {in_view + missed} edges of legs are found"
+    if median is None:
+        return [f"It does not fit: {text}."]
+    if request.shown == "calibration":
+        return [f"{text}; the middle one lies {number(median, 2)} px from the calibrated machine."]
+    tolerance = pane.machine.document.tolerance.center
+    gain = _contours(pane, 3).gain
+    allowed = tolerance * float(np.nanmedian(gain))
+    near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
+    # other things' edges lie near by chance, too, though not most of them
+    verdict = (
+        "It fits" if near and in_view > missed else "It may fit" if near else "It does not fit"
+    )
+    # the search goes by whole pixels
+    off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
+    return [
+        f"{verdict}: {text}, and the middle one lies {off} from the drawing. The drawing's"
+        f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
+    ]

@@ -1,0 +1,146 @@
+"""Edges that chance offers tell no machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration import calibrate, chance_matches
+from pkmcal.calibration.chance_matches import IMAGE_OFFSET, by_chance, chance_match_reason
+from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.measurements import Observation, concatenate
+from pkmcal.observe.legs import OUT_OF_SIGHT_REASON, measure
+from pkmcal.observe.profiles import USUAL_BLUR
+from test_observe_drawing import FRONT, machine, poses
+from test_observe_measure import taken
+
+
+def turns_of(photographs, keep=1.0):
+    """What a look left, or a share of it; the rest as if it had not been found."""
+    state = SimpleNamespace(T_camera_base=FRONT[None], T_base_platform=poses())
+    station_edges = measure(photographs, machine(), FRONT, poses())
+    count = round(keep * len(station_edges.edges))
+    lost = tuple(
+        station_edges.edges.rejection(k, "faint") for k in range(count, len(station_edges.edges))
+    )
+    edges = station_edges.edges.select(np.arange(count))
+    visible = Observation(
+        edges,
+        station_edges.rejected + lost,
+        station_edges.points,
+        station_edges.point_edge,
+        FRONT[None],
+        None,
+        np.ones(1),
+    )
+    estimate = SimpleNamespace(machine=machine(), state=state, edge_weights=np.ones(count))
+    return RefinementResult(visible, None, estimate, None, photographs=[photographs], blur={})
+
+
+def aside(photographs, px):
+    """As if the machine were elsewhere in the picture."""
+    parameters = photographs.camera.parameters.copy()
+    parameters[2] += px
+    return replace(photographs, camera=replace(photographs.camera, parameters=parameters))
+
+
+def test_few_edges_of_the_right_machine_are_no_chance():
+    assert chance_match_reason(turns_of(taken(), keep=0.2)) == ()
+
+
+def test_edges_of_a_machine_that_is_elsewhere_are():
+    (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
+    assert "may not be the machine in the photographs" in why
+    in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
+    hidden = sum(r.reason == OUT_OF_SIGHT_REASON for r in in_view.rejected)
+    in_sight = len(in_view.edges) + len(in_view.rejected) - hidden
+    assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why
+
+
+def test_nothing_is_asked_where_most_were_measured(monkeypatch):
+    def query(*_):
+        pytest.fail("asked")
+
+    monkeypatch.setattr(chance_matches, "_count", query)
+    assert chance_match_reason(turns_of(taken())) == ()
+
+
+def test_repeats_count_once():
+    """Aside as where the machine is: what was measured is told after repeats were averaged."""
+    once = aside(taken(), 2.5 * IMAGE_OFFSET)
+    twice = once.select(np.repeat(np.arange(len(once.images)), 2))
+    turns = turns_of(once)._replace(blur={0: USUAL_BLUR})
+    assert (
+        chance_match_reason(turns._replace(photographs=[twice])) == chance_match_reason(turns) != ()
+    )
+
+
+def test_chance_that_offers_more_is_told_in_words(monkeypatch):
+    """A chance of a half or more is not "once in 1 times"."""
+    few = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET))
+    counts = iter([9, 8, 10, 9, 9, 8, 10, 9, 9])
+    monkeypatch.setattr(chance_matches, "_count", lambda *_: next(counts))
+    (why,) = chance_match_reason(few)
+    assert "chance offers as many as a rule" in why
+
+
+def two_stations(second, **values):
+    """The turns of two stations, of which the first is right, and their session."""
+    one, other = turns_of(taken()), turns_of(second)
+    at, in_view = other.observation.edges, other.observation
+    in_view = Observation(
+        concatenate([one.observation.edges, replace(at, station=at.station + 1)]),
+        one.observation.rejected + tuple(replace(r, station=1) for r in in_view.rejected),
+        one.observation.points, one.observation.point_edge, np.stack([FRONT, FRONT]), None,
+        np.ones(2),
+    )  # fmt: skip
+    state = SimpleNamespace(T_camera_base=np.stack([FRONT, FRONT]), T_base_platform=poses())
+    estimate = SimpleNamespace(
+        machine=machine(), state=state, edge_weights=np.ones(len(in_view.edges))
+    )
+    both = [*one.photographs, replace(second, station=1)]
+    measured = SimpleNamespace(poses=SimpleNamespace(station=np.array(values.pop("boards", []))))
+    turns = RefinementResult(in_view, measured, estimate, None, photographs=both, blur={})
+    station = SimpleNamespace(**{"handheld": False, "T_camera_base": None, **values})
+    return SimpleNamespace(stations=(station, station)), turns
+
+
+def test_a_station_that_may_stand_elsewhere_is_told_with_why():
+    session, turns = two_stations(aside(taken(), 2.5 * IMAGE_OFFSET))
+    ((number, why),) = by_chance(session, turns).items()
+    assert number == 1
+    (measured,) = {int(np.sum(turns.observation.edges.station == 1))}
+    assert why.startswith(f"only {measured} of ")
+    assert why.endswith("it may stand elsewhere; a pose by hand would tell")
+    session, turns = two_stations(aside(taken(), 2.5 * IMAGE_OFFSET), T_camera_base=FRONT)
+    assert by_chance(session, turns)[1].endswith("it may stand elsewhere")
+
+
+def test_a_station_is_kept_that_shows_the_machine_or_whose_place_is_told_otherwise():
+    wrong = aside(taken(), 2.5 * IMAGE_OFFSET)
+    assert by_chance(*two_stations(taken())) == {}
+    assert by_chance(*two_stations(wrong, boards=[1])) == {}
+    assert by_chance(*two_stations(wrong, handheld=True)) == {}
+
+
+def test_the_only_station_is_not_left_out_but_doubted():
+    session, turns = two_stations(taken())
+    alone = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET))
+    alone = alone._replace(measurements=turns.measurements)
+    assert by_chance(session, alone) == {}
+    assert chance_match_reason(alone)
+
+
+@pytest.mark.slow
+def test_the_machine_is_told_by_the_other_stations(demo, monkeypatch):
+    """A station that may stand elsewhere is left out with its reason, and the rest identified."""
+    item = iter([{1: "it may stand elsewhere"}])
+    monkeypatch.setattr(calibrate, "by_chance", lambda *_: next(item, {}))
+    calibration = calibrate.calibrate_session(demo.session)
+    assert [station.name for station in calibration.session.stations] == ["station1", "station3"]
+    assert "station2: left out, for it may stand elsewhere." in calibration.session.warnings
+    assert compare_with_truth(calibration, demo.session).calibrated.centre < 1e-3
