@@ -263,7 +263,7 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
 def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
     """[A] 4.3 with other values."""
     own: dict[str, Any] = {
-        {"configurations": "poses", "legs": "legs_seen", "reading_noise": "joint_noise"}.get(
+        {"configurations": "poses", "legs": "legs_observed", "reading_noise": "joint_noise"}.get(
             name, name
         ): value
         for name, value in values.items()
