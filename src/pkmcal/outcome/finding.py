@@ -78,9 +78,9 @@ class Finding:
     level: Level
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
     subject: str = ""
-    error: PkmcalError | None = None
-    saved_text: str = ""
-    saved_next_step: str = ""
+    error: PkmcalError | None = field(default=None, repr=False)
+    saved_text: str = field(default="", repr=False)
+    saved_next_step: str = field(default="", repr=False)
 
     @cached_property
     def text(self) -> str:
