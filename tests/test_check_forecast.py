@@ -152,8 +152,8 @@ def test_stations_on_one_side_are_told(found):
     first = found.look.stations[0]
     middle = found.look.poses[:, :3, 3].mean(axis=0)
     turn = rotation(np.array([0, 0, np.deg2rad(25)]))
-    beside = first.found @ inverse(pose(turn, middle - turn @ middle))
-    near = replace(found.look, stations=(first, replace(first, name="b", found=beside)))
+    beside = first.T_camera_base @ inverse(pose(turn, middle - turn @ middle))
+    near = replace(found.look, stations=(first, replace(first, name="b", T_camera_base=beside)))
     (text,) = words._from_one_side(near)
     assert text.code == "images.one_side"
     assert 20 < text.facts["degrees"] < 25.5

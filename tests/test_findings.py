@@ -66,19 +66,19 @@ def calls() -> list[tuple[str, set[str], set[str]]]:
     """Every place where a finding is made: its file and line, codes, and the facts given."""
     texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
     trees = {
-        p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|Departure", text)
+        p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|ModelViolation", text)
     }
     del trees[SOURCE / "outcome" / "finding.py"]
     detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))
     out: list[tuple[str, set[str], set[str]]] = []
     for path, tree in trees.items():
         nodes = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
-        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS | {"Departure"}]
+        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS | {"ModelViolation"}]
         inside = keys(tree) if made else set[str]()
         for node in made:
             facts = {k.arg for k in node.keywords if k.arg} | {"subject"}
             others = any(k.arg is None for k in node.keywords)
-            if others or getattr(node.func, "id", "") == "Departure":
+            if others or getattr(node.func, "id", "") == "ModelViolation":
                 facts |= inside | detections
             where = f"{path.relative_to(SOURCE)}:{node.lineno}"
             out.append((where, codes_of(node.args[0], facts), facts))

@@ -108,8 +108,8 @@ def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
     camera = calibrated.session.stations[0].camera.turned_by_half()
     one = UpsideDown("cameras/camera.yaml", ("station1",), camera, np.log(376.0))
     assert not one.sure
-    assert "may be upside down against cameras/camera.yaml" in one.sentence
-    assert "at odds of 376 to 1" in one.sentence
+    assert "may be upside down against cameras/camera.yaml" in one.finding.text
+    assert "at odds of 376 to 1" in one.finding.text
 
 
 def lens(session, centre, covariance=None):

@@ -233,9 +233,9 @@ def test_what_differs_and_what_fails():
 
     offset = figure(PAPER_A_JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
     assert not offset.differs
-    assert offset._replace(found=Summary(0.0640, 0.0010)).differs
-    assert offset._replace(found=Summary(0.0640, 0.0010)).tolerable
-    assert not offset._replace(found=Summary(0.0780, 0.0010)).tolerable
+    assert offset._replace(measured=Summary(0.0640, 0.0010)).differs
+    assert offset._replace(measured=Summary(0.0640, 0.0010)).tolerable
+    assert not offset._replace(measured=Summary(0.0780, 0.0010)).tolerable
     # what follows the drawing's error may differ more, nothing else
     assert figure(FOUR_STEPS_PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005).tolerable
     assert not figure(FOUR_STEPS_PRINTED, "base_xy", 2.3, 0.01, 1.79, 0.005).tolerable

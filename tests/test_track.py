@@ -98,9 +98,9 @@ def test_a_photograph_late_by_a_millimetre_is_followed(view):
     second = track(sight, first.state, image, later)
     truth = true_edges(sight.view, AT)
     for at in (first, second):
-        assert at.found.sum() >= 4
+        assert at.valid.sum() >= 4
         turn = np.swapaxes(at.lines.basis, -1, -2) @ truth[..., None]
-        whitened = np.linalg.solve(root(at.lines)[at.found], turn[at.found])
+        whitened = np.linalg.solve(root(at.lines)[at.valid], turn[at.valid])
         assert np.abs(whitened).max() < 4.5
     miss, start = (
         np.linalg.norm(MACHINE.inverse(T[None])[0] - READINGS)

@@ -204,7 +204,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
     every, factor = whole_machine(watched.true), []
     for k in range(8):
         rng = np.random.default_rng([k, 8])
-        calibrated, data = watched.calibrated(rng), watched.observed(watched.true, rng)
+        calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
         start = start_state(calibrated, data, watched.pool.T_camera_base)
         held = hold(calibrated, data, start, Trust.full(data))
         exact = change_evidence(held, CalibrationPrior(0 * watched.covariance))
@@ -216,7 +216,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
 def test_other_frames_and_cameras_change_nothing(watched):
     """A test knows neither where the base frame is nor where the camera stands."""
     rng = np.random.default_rng(2)
-    data, calibrated = watched.observed(watched.true, rng), watched.calibrated(rng)
+    data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
     first = change_evidence(
         hold(calibrated, data, start, Trust.full(data)), CalibrationPrior(watched.covariance)
@@ -238,7 +238,7 @@ def test_other_frames_and_cameras_change_nothing(watched):
 def test_the_regression_predicts_what_a_change_does(watched, by):
     """The same data, seen with a machine that has changed: w moves by X times the change."""
     rng = np.random.default_rng(6)
-    data = watched.observed(watched.true, rng)
+    data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     in_view = [
         change_evidence(
@@ -484,7 +484,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
 
 def test_poses_that_cannot_be_found(watched, monkeypatch):
     rng = np.random.default_rng(1)
-    data = watched.observed(watched.true, rng)
+    data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     module = "pkmcal.judge.fixed_machine.minimise"
     monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))
