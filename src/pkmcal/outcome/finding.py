@@ -51,7 +51,7 @@ from pkmcal.wording import (
     with_unit,
 )
 
-_OPTIONAL_PART = re.compile(r"\[\[(.*?)\]\]", re.DOTALL)
+_OPTIONAL_PART = re.compile(r"\[\[([^\[\]]*)\]\]")
 _UNITS = {name: scale for scale, name in DISPLAY_UNITS.values()}
 
 
