@@ -54,11 +54,11 @@ def test_few_edges_of_the_right_machine_are_no_chance():
 
 def test_edges_of_a_machine_that_is_elsewhere_are():
     (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
-    assert "may not be the machine in the photographs" in why
+    assert "may not be the machine in the photographs" in why.text
     in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
     hidden = sum(r.reason == OUT_OF_SIGHT_REASON for r in in_view.rejected)
     in_sight = len(in_view.edges) + len(in_view.rejected) - hidden
-    assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why
+    assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
 
 
 def test_nothing_is_asked_where_most_were_measured(monkeypatch):
@@ -85,7 +85,7 @@ def test_chance_that_offers_more_is_told_in_words(monkeypatch):
     counts = iter([9, 8, 10, 9, 9, 8, 10, 9, 9])
     monkeypatch.setattr(chance_matches, "_count", lambda *_: next(counts))
     (why,) = chance_match_reason(few)
-    assert "chance offers as many as a rule" in why
+    assert "chance offers as many as a rule" in why.text
 
 
 def two_stations(second, **values):

@@ -299,10 +299,10 @@ def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
     rng, readings = np.random.default_rng(0), machine().inverse(poses())
     localization = LocalizedPose(rough_pose(4), 0.5, 1.0, 0.02, has_prior=True)
     two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(
-        found=localization
+        localization=localization
     )
 
-    def confirmed(view, _start, _rng, closely):
+    def confirmed(view, _start, _rng, near_prior):
         return replace(localization, by_chance=by_chance)
 
     monkeypatch.setattr(hypotheses, "find_station", confirmed)

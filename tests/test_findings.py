@@ -66,7 +66,9 @@ def calls() -> list[tuple[str, set[str], set[str]]]:
     """Every place where a finding is made: its file and line, codes, and the facts given."""
     texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
     trees = {
-        p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|ModelViolation", text)
+        p: ast.parse(text)
+        for p, text in texts.items()
+        if re.search(r"finding|ModelViolation", text)
     }
     del trees[SOURCE / "outcome" / "finding.py"]
     detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))

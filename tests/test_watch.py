@@ -32,7 +32,7 @@ from pkmcal.judge.changes import (
     detectable,
     explained,
     made_tests,
-    test_for_changes,
+    detect_changes,
     twice_log_odds,
 )
 from pkmcal.judge.fixed_machine import Evidence, Trust, change_evidence, hold
@@ -258,7 +258,7 @@ def test_the_regression_predicts_what_a_change_does(watched, by):
 
 def test_a_changed_offset_is_found_and_named(watched):
     rng = np.random.default_rng(21)
-    judged = test_for_changes(
+    judged = detect_changes(
         watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
     )
     verdict = watch_verdict(judged, looked())
@@ -277,7 +277,7 @@ def test_a_joint_that_moved(watched):
     rng = np.random.default_rng(22)
     now = moved(watched.true, leg2_base__center__x=2e-3, leg2_base__center__y=-1e-3)
     value = watched.evidence(now, rng, few=8)
-    judged = test_for_changes(value, watched.true, ALPHA)
+    judged = detect_changes(value, watched.true, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
@@ -291,7 +291,7 @@ def test_two_changes_are_both_named(watched):
     """The first single cause that is found resembles both; all pairs tell."""
     rng = np.random.default_rng(23)
     now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
-    judged = test_for_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
+    judged = detect_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
     verdict = watch_verdict(judged, looked(8))
@@ -303,7 +303,7 @@ def test_warming_is_told_from_a_leg(watched):
     machine = watched.true
     lengths = np.array([k not in ("radius", "scale") for k in machine.parameters.kinds])
     warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
-    judged = test_for_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
+    judged = detect_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
     verdict = watch_verdict(judged, looked())
@@ -315,7 +315,7 @@ def test_causes_that_look_alike_are_all_named(watched):
     """Three configurations hardly tell a leg's zero from its joints."""
     rng = np.random.default_rng(26)
     now = moved(watched.true, leg4_platform__center__z=1.2e-3)
-    judged = test_for_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
+    judged = detect_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
     finding = judged.findings[0]
     similar = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
     assert ("platform", (3,)) in similar
@@ -420,13 +420,13 @@ def test_passive_legs_have_no_zero():
 def test_an_h4_by_its_board(h4):
     true, estimate, rng = h4
     poses = papers_poses()[rng.permutation(81)]
-    same = test_for_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
+    same = detect_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(same, looked(5))
     assert verdict.usable, verdict
     assert "motor's zero by 0." in verdict.headline
     assert "°" in verdict.headline
     now = moved(true, leg2_base__angle=0.02)
-    judged = test_for_changes(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
+    judged = detect_changes(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (1,))
     assert abs(first.change.value[0] - 0.02) < 4 * first.change.sigma[0]
@@ -435,7 +435,7 @@ def test_an_h4_by_its_board(h4):
 def test_too_few_poses_of_a_board(h4):
     """One pose of a board tells no more than where camera and board are."""
     true, estimate, rng = h4
-    judged = test_for_changes(
+    judged = detect_changes(
         by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA
     )
     verdict = watch_verdict(judged, looked(1))
@@ -456,10 +456,10 @@ def test_a_planar_machine_by_its_board():
     case = measured(true, poses[:50], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    same = test_for_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
+    same = detect_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
     assert not same.changed
     now = moved(true, leg2_length__offset=3e-3)
-    judged = test_for_changes(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
+    judged = detect_changes(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
     first = judged.findings[0]
     similar = {(s.cause.part, s.cause.legs) for s in (first.suspect, *first.others)}
     assert ("zero", (1,)) in similar
@@ -475,7 +475,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     case = measured(true, poses[:40], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    judged = test_for_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
+    judged = detect_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(judged, looked(3))
     assert not verdict.usable
     assert not judged.changed
@@ -495,7 +495,7 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
 def test_a_family_that_sees_nothing():
     machine = load_mechanism("gough-stewart")
     blind = Evidence(np.zeros(3), np.zeros((3, len(machine.parameters))))
-    judged = test_for_changes(blind, machine, ALPHA)
+    judged = detect_changes(blind, machine, ALPHA)
     assert judged.tests == ()
     assert not judged.changed
     verdict = watch_verdict(judged, looked(1))

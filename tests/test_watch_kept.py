@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
-from pkmcal.judge.changes import change, chi_square, detectable, test_for_changes
+from pkmcal.judge.changes import change, chi_square, detectable, detect_changes
 from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch import tests_with_fixed_stations as judged_with_kept
@@ -190,7 +190,7 @@ def test_false_alarms_of_200_sessions(left):
     """At 0.01, 0.05 and 0.1."""
     chances = []
     for k in range(200):
-        judged = test_for_changes(
+        judged = detect_changes(
             left.evidence(left.true, np.random.default_rng([k, 13])), left.true, ALPHA
         )
         chances.append(min(t.adjusted for t in judged.tests))

@@ -194,7 +194,7 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Fa
             failures[f"{hypothesis.code} {hypothesis.motors}"] = str(error)
             return np.inf
 
-    def doubt_of(hypothesis: ReadingHypothesis, failure: str = "") -> Fault:
+    def fault_of(hypothesis: ReadingHypothesis, failure: str = "") -> Fault:
         kind = "sign" if hypothesis.code == "readings.reversed" else "order"
         motor, *other = hypothesis.motors
         return Fault(
@@ -211,13 +211,13 @@ def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Fa
     limit = CURED_MISFIT_SHARE * _first_misfit(machine, measurements)
     for first, hypothesis in sorted(hypotheses, key=lambda item: item[0]):
         if first == np.inf:
-            yield doubt_of(hypothesis, failures[f"{hypothesis.code} {hypothesis.motors}"])
+            yield fault_of(hypothesis, failures[f"{hypothesis.code} {hypothesis.motors}"])
         if first > limit:
             continue
         if hypothesis.constant:  # the best of the motor's; its offset, estimated, takes up the rest
             hypothesis = min(reversed_[hypothesis.motors[0]], key=misfit)
         other_readings = replace(measurements, joints=hypothesis.joints)
-        yield _tried(doubt_of(hypothesis), machine, other_readings)[0]
+        yield _tried(fault_of(hypothesis), machine, other_readings)[0]
 
 
 def _first_misfit(machine: Machine, measurements: Measurements) -> float:

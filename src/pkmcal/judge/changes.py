@@ -366,7 +366,7 @@ def made_tests(
     return tuple(map(test, causes)), tuple(test(cause) if cause else None for cause in zero), level
 
 
-def test_for_changes(evidence: Evidence, machine: Machine, alpha: float) -> ChangeTests:
+def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> ChangeTests:
     """Every test on new data, and what explains a change.
 
     alpha : share of machines that did not change that may be flagged.

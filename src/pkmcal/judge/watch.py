@@ -25,7 +25,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.identify.assembly import observed_configurations
 from pkmcal.judge.causes import magnified
-from pkmcal.judge.changes import ChangeTests, StationTest, test_for_changes
+from pkmcal.judge.changes import ChangeTests, StationTest, detect_changes
 from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
 from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
@@ -216,7 +216,7 @@ def tests_with_fixed_stations(
     """
     shifted: list[StationTest] = []
     while True:
-        judged = test_for_changes(change_evidence(held, prior), held.machine, alpha)
+        judged = detect_changes(change_evidence(held, prior), held.machine, alpha)
         if not judged.moved:
             return judged, prior, tuple(shifted)
         shifted += [s for s in judged.stations if s.station in judged.moved]
