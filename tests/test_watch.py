@@ -29,10 +29,10 @@ from pkmcal.judge.changes import (
     change,
     chi_square,
     common_level,
+    detect_changes,
     detectable,
     explained,
     made_tests,
-    detect_changes,
     twice_log_odds,
 )
 from pkmcal.judge.fixed_machine import Evidence, Trust, change_evidence, hold

@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
-from pkmcal.judge.changes import change, chi_square, detectable, detect_changes
+from pkmcal.judge.changes import change, chi_square, detect_changes, detectable
 from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch import tests_with_fixed_stations as judged_with_kept

@@ -41,9 +41,9 @@ LENGTH_STEP = 1.5
 """Factor from one correlation length of the bed to the next, from the points' mean distance, below
 which unevenness is noise, to LONGEST_BED_LENGTH, from which on it is nearly a parabola."""
 LONGEST_BED_LENGTH = 1.0
-"""In the root mean square distance of the points from their middle. Over longer lengths a surface is
-what the machine's own parameters bend as well, and its size is anybody's guess: a kit whose towers
-lean was refused for it."""
+"""In the root mean square distance of the points from their middle. Over longer lengths a surface
+is what the machine's own parameters bend as well, and the data do not determine its size: a kit
+whose towers lean was refused for it."""
 LANDMARK_POSES = 200
 """Poses, evenly of all, by which the functions are made where there are more."""
 PLACES_ALONG_EDGE_SPAN = 9
