@@ -236,16 +236,16 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
         truth = drawn(rng, of_a_kit)
         readings = printers.felt(truth.machine, printers.bed(n, RADIUS), noise, rng)
         readings[n // 2] += wrong
-        readings = truth.sentence.homed - printers.STEP * np.round(
-            (truth.sentence.homed - readings) / printers.STEP
+        readings = truth.says.homed - printers.STEP * np.round(
+            (truth.says.homed - readings) / printers.STEP
         )
         told_tolerance = KIT if of_a_kit else IDEAL
-        calibration = calibrated(truth.sentence, readings, noise, told_tolerance)
+        calibration = calibrated(truth.says, readings, noise, told_tolerance)
         ours, usable = exported(calibration), calibration.verdict.usable
         bed = calibration.findings.bed
         pasted = {
-            "before": truth.sentence,
-            "Klipper": by_klipper(truth.sentence, readings),
+            "before": truth.says,
+            "Klipper": by_klipper(truth.says, readings),
             "pkmcal": ours,
         }
         for name, settings in pasted.items():

@@ -118,7 +118,7 @@ def judged(
     )
     readings[int(rng.integers(n))] += wrong
     try:
-        value = calibrated(truth.sentence, readings, centre_tolerance=tolerance)
+        value = calibrated(truth.says, readings, centre_tolerance=tolerance)
     except PkmcalError as fault:
         return "refused", str(fault)
     bed = value.findings.bed
