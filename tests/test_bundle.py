@@ -519,8 +519,8 @@ def test_what_looks_scatter_by_is_in_the_deviations_and_nowhere_else():
     more = bundle(scene.machine, measurements, scene.state())
     np.testing.assert_array_equal(more.state.theta, fit.state.theta)
     np.testing.assert_array_equal(more.edge_residuals, fit.edge_residuals)
-    assert more.statistics.imputation_scatter == pytest.approx(np.sqrt(0.5))
-    assert fit.statistics.imputation_scatter == 0
+    assert more.statistics.look_scatter == pytest.approx(np.sqrt(0.5))
+    assert fit.statistics.look_scatter == 0
     larger = np.linalg.eigvalsh(more.joint_covariance - fit.joint_covariance)
     assert larger.min() > -1e-9 * larger.max()
     n = len(fit.data_share)

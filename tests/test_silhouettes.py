@@ -169,7 +169,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     # what depends on where they were looked for is in the deviations, and said
     variance = calibration.measurements.imputation_covariance
     assert 0.02 < variance < 2
-    assert calibration.estimate.statistics.imputation_scatter == pytest.approx(np.sqrt(variance))
+    assert calibration.estimate.statistics.look_scatter == pytest.approx(np.sqrt(variance))
     assert f"results scatter by {np.sqrt(variance):.1f} of the deviations" in page
 
 
@@ -234,7 +234,7 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibratio
     ]
     value = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
     ended = looked_from_machines_as_likely(tripod_calibration, value)
-    assert ended.estimate.statistics.imputation_scatter == 1
+    assert ended.estimate.statistics.look_scatter == 1
 
 
 @pytest.fixture(scope="module")

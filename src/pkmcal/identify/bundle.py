@@ -603,7 +603,7 @@ def _statistics(
         dof_links=freedom[LINK_ROWS_KIND],
         link_range=_range(noise_shares(result.info, LINK_ROWS_KIND), result.scale.links),
         shading=float(np.median(problem.data.shading[0])),
-        imputation_scatter=float(np.sqrt(imputation_covariance)),
+        look_scatter=float(np.sqrt(imputation_covariance)),
     )
 
 

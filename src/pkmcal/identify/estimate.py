@@ -62,7 +62,7 @@ class Statistics:
     standard deviation of what the edges of one side of a tube at one station have in common.
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
     reading_range, pose_range : factors on the stated noise that the data allow, smallest and
-    largest, None for no end (:mod:`pkmcal.identify.noise`). imputation_scatter : what the result
+    largest, None for no end (:mod:`pkmcal.identify.noise`). look_scatter : what the result
     scatters by with where edges were looked for, in the deviations that noise gives it; they
     contain it. chi2_links, n_links, dof_links, link_scale, link_range : of measurements that link
     two configurations, as those of poses.
@@ -89,7 +89,7 @@ class Statistics:
     reading_scale: float = 1.0
     reading_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
     pose_range: tuple[float, float | None] = field(default=(0.0, None), repr=False)
-    imputation_scatter: float = 0.0
+    look_scatter: float = 0.0
     chi2_links: float = field(default=0.0, repr=False)
     n_links: float = field(default=0.0, repr=False)
     dof_links: float = field(default=0.0, repr=False)

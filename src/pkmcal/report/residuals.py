@@ -246,7 +246,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
             f"Edges that lie off in the same way in every photograph, {joined(shaded)}: shading, a "
             "surface that is not round, or a neighbour taken for the edge."
         )
-    if scatter := estimate.statistics.imputation_scatter:
+    if scatter := estimate.statistics.look_scatter:
         out.append(
             "Which border is a leg's depends on where it is looked for: from machines as likely as"
             f" this one, results scatter by {number(scatter, 1)} of the deviations that noise gives"
