@@ -167,6 +167,22 @@ def test_an_error_here_is_told(one_process):
         engine.run(Counting("input"), 10, 0)
 
 
+class Caching(Counting):
+    """A setting that fills a cache while it works, as machines do."""
+
+    def draw(self, batch: Batch):
+        vars(self)["cache"] = len(vars(self))
+        return super().draw(batch)
+
+
+def test_work_in_this_process_changes_no_shared_task(one_process):
+    """Other threads pickle the tasks meanwhile, which fails on an object that grows."""
+    setting = Caching()
+    before = dict(vars(setting))
+    workers.on_cores([Job(setting, batch_of(setting))], lambda _number, _result: None)
+    assert vars(setting) == before
+
+
 def test_what_is_kept_is_what_was_done(tmp_path):
     setting = Counting()
     task = Job(setting, batch_of(setting, 5))

@@ -102,10 +102,12 @@ class _Pool:
             self.finished(number, result)
 
     def here(self) -> None:
-        """Work in this process."""
+        """Work in this process, on copies: work fills the caches of a task's machine, and tasks
+        share it with those that other threads are pickling.
+        """
         try:
             while (number := self.next()) is not None:
-                self.done(number, work(self.tasks[number]))
+                self.done(number, work(pickle.loads(pickle.dumps(self.tasks[number]))))
         except BaseException as error:  # noqa: BLE001 - raised again where the study was begun
             self.failed(error)
 
