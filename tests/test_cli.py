@@ -20,6 +20,7 @@ import pytest
 
 import pkmcal
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
@@ -175,6 +176,7 @@ def test_demo(demo):
     result = demo.run.json
     assert demo.run.code == result["exit_code"] == 0
     assert demo.run.err == ""
+    assert_keys("demo --json", result)
     before, after = result["comparison"]["drawing"], result["comparison"]["calibrated"]
     assert after["centre"] < before["centre"] / 3
     assert after["position"] < before["position"] / 2
@@ -365,6 +367,7 @@ def test_check_as_json(session, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     count = run("check", session, "--json").json
     assert count["exit_code"] == 0
+    assert_keys("check --json", count)
     names = [station["name"] for station in count["stations"]]
     assert names == ["station1", "station2", "station3"]
     assert all(station["recognised"] for station in count["stations"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.cameras import load_camera
 from test_boards import board_of, camera_of, render
 from test_camera_calibration import poses_for
@@ -31,6 +32,7 @@ def test_a_camera_is_calibrated(boards, tmp_path):
     assert done.code == 0, done.err
     value = load_camera(tmp_path / "out" / "camera.yaml")
     assert value.model == done.json["camera"]["model"] == "pinhole"
+    assert_keys("camera --json", done.json)
     sigma = np.sqrt(np.diag(value.covariance))
     off = (value.parameters - TRUTH.parameters)[:4] / sigma[:4]
     # four numbers of eight pictures; beyond four deviations the deviations would be wrong

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
@@ -255,6 +256,7 @@ def test_the_command(demo, tmp_path):
     assert {path.name for path in out.iterdir()} == {"diff.html", "diff.json"}
     done = run("diff", demo.calibration, "gough-stewart", "-o", out, "--json")
     values = done.json
+    assert_keys("diff --json", values)
     assert (done.code, values["exit_code"]) == (1, 1)
     assert (values["a"]["kind"], values["b"]["kind"]) == ("calibration", "drawing")
     assert values["changed"] is True

@@ -11,6 +11,7 @@ import pytest
 import distance_sessions
 import printers
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import refinement_of
@@ -145,6 +146,7 @@ def test_commands_say_what_was_measured(kit):
     assert "heights and distances" in done.out
     saved = json.loads((kit / "calibration" / "calibration.json").read_text())
     assert saved["statistics"]["n_links"] == pytest.approx(18, abs=0.5)
+    assert_keys("calibration.json of distances", saved)
     rows = saved["residuals"]["distances"]
     assert len(rows) == 18
     names = [c["name"] for c in saved["configurations"]]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
 from pkmcal.commands.cli import COMMANDS_IN_ORDER, app
@@ -216,6 +217,7 @@ def test_keys_of_a_calibration_are_explained(demo):
     document = read_json(demo.calibration / "calibration.json").data
     keys = written_keys(document, FREE)
     assert {"parameters", "sigma", "noise_scale", "T_base_camera"} <= keys
+    assert_keys("calibration.json", document)
     assert keys <= quoted(text_of("docs/files.md"))
 
 
@@ -223,7 +225,9 @@ def test_keys_of_a_truth_are_explained(demo):
     document = read_json(demo.session / "truth.json").data
     keys = set(document)
     for group in ("stations", "configurations"):
-        keys |= set(next(iter(document[group].values())))
+        entry = next(iter(document[group].values()))
+        assert_keys(f"truth.json: {group}", entry)
+        keys |= set(entry)
     assert keys <= quoted(text_of("docs/files.md"))
 
 

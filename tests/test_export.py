@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from conftest import run
+from document_keys import assert_keys
 from export_sources import CAMERA, built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.cameras.files import load_camera
@@ -236,6 +237,7 @@ def test_the_command(tmp_path, monkeypatch):
     done = run("export", "h4", "--to", "json", "--json")
     assert done.code == 0
     assert done.json["machine"] == "h4"
+    assert_keys("export --json", done.json)
     assert not done.json["calibrated"]
     assert (tmp_path / "export-json" / "machine.json").is_file()
     assert all(d["largest"] <= d["limit"] for d in done.json["differences"])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.pages.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_c_expected as expected
@@ -182,6 +183,7 @@ def test_the_command(tmp_path, monkeypatch, found):
     assert (done.code, done.err) == (0, "")
     c = done.json["papers"]["c"]
     assert c == json.loads((tmp_path / "paper-c.json").read_text())
+    assert_keys("paper-c.json", c)
     assert c["before"]["shift"] == pytest.approx(0.0259, abs=2e-4)
     assert len(c["validation"][f"design, {EQ3_AS_PRINTED}"]["control_rms"]) == 4
     done = run("reproduce", "c", "-o", tmp_path)

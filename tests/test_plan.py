@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
@@ -331,6 +332,7 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     result = run("plan", str(session), "-n", "4")
     assert result.code == 0, result.out + result.err
     values = json.loads((session / "plan" / "plan.json").read_text())
+    assert_keys("plan.json", values)
     table = read_csv(session / "plan" / "plan.csv")
     loaded = load_session(session)
     assert len(table.names) == 12

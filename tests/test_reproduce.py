@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.commands.reproduce import Paper
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check
@@ -67,6 +68,7 @@ def test_the_command(tmp_path):
     assert result["files"] == [str(out / name) for name in ("paper-a.html", "paper-a.json")]
     a = result["papers"]["a"]
     assert a == json.loads((out / "paper-a.json").read_text())
+    assert_keys("paper-a.json", a)
     assert (a["runs"], a["seed"], a["converged"]) == (RUNS, 0, RUNS)
     assert set(a["methods"]) == set(PAPER_A_METHODS)
     joint = a["methods"][PAPER_A_JOINT]

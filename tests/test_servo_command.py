@@ -10,6 +10,7 @@ import subprocess
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.cameras.files import camera_text
 from pkmcal.simulation.demo import demo_camera
 
@@ -34,6 +35,8 @@ def test_a_built_in_machine(studied):
     assert sorted(p.name for p in folder.iterdir()) == ["servo.html", "servo.json"]
     document = json.loads((folder / "servo.json").read_text())
     assert document["estimates"] == done.json["estimates"]
+    assert_keys("servo.json", document)
+    assert_keys("servo --json", done.json)
     count = document["estimates"]
     assert count["true"]["astray_largest"] == 0
     assert count["hand"]["astray_median"] > 5 * count["identified"]["astray_median"] > 0

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.studies import engine
@@ -309,6 +310,7 @@ def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
     assert "nan" not in done.out
     values = json.loads((tmp_path / "study.json").read_text())
     good, bad = values["combinations"]
+    assert_keys("study.json", values)
     assert good["deviations_hold"] is True
     assert bad["deviations_hold"] is None
     assert bad["position"] == {"value": None, "standard_error": None}

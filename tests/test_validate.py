@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from faults import replaced
 from pkmcal.calibration.holdout import (
     by_region,
@@ -460,6 +461,7 @@ def kept(demo, tmp_path_factory):
 def test_calibrate_with_some_held_out(kept):
     out = kept.made.json["holdout"]
     assert len(out["left_out"]["configurations"]) == 3
+    assert_keys("calibrate --json", kept.made.json)
     document = json.loads((kept.folder / "c" / "calibration.json").read_text())
     unused = [c["name"] for c in document["configurations"] if not c["used"]]
     assert unused == out["left_out"]["configurations"]
@@ -480,6 +482,7 @@ def test_calibrate_with_some_held_out(kept):
 def test_validate_on_what_was_held_out(kept, demo):
     assert kept.found.err == ""
     result = kept.found.json
+    assert_keys("validate --json", result)
     out = kept.made.json["holdout"]["left_out"]["configurations"]
     assert result["new_data"]["configurations"] == out
     assert set(result["known_configurations"]).isdisjoint(out)

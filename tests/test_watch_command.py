@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from document_keys import assert_keys
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.cameras import load_camera
@@ -92,6 +93,7 @@ def test_an_unchanged_machine(demo, later):
     done = run("watch", demo.calibration, later.same, "-o", later.folder / "w", "--json")
     assert done.err == ""
     assert done.code == done.json["exit_code"] == 0
+    assert_keys("watch --json", done.json)
     assert done.json["verdict"]["headline"].startswith(
         "Still as calibrated, as far as 4 new configurations can tell: a change of any leg's length"
     )
