@@ -1,11 +1,11 @@
-"""Klipper's printer.cfg: the delta's values, and the bed as DELTA_CALIBRATE felt it.
+"""Klipper's printer.cfg: geometry of the delta, and bed points of DELTA_CALIBRATE.
 
-Meaning: Klipper's configuration reference, klippy/kinematics/delta.py and
-klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``; of what
-stands above as well, that above counts; where one line below SAVE_CONFIG's header is without that
-mark, or one with it stands above the header, nothing that was saved counts (klippy/configfile.py,
-_find_autosave_data). ``heightN_pos`` are steps of the three motors since their end switches,
-``heightN`` the height of the nozzle above the bed there.
+Semantics: Klipper's configuration reference, klippy/kinematics/delta.py and
+klippy/extras/delta_calibrate.py. SAVE_CONFIG writes lines that begin with ``#*#``. A value that
+also occurs above SAVE_CONFIG's block is taken from above. If a line below SAVE_CONFIG's header
+lacks the mark, or a marked line precedes the header, Klipper ignores the whole saved block
+(klippy/configfile.py, _find_autosave_data). ``heightN_pos`` are steps of the three motors from
+their end switches, ``heightN`` is the height of the nozzle above the bed there.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from pkmcal.printers.printer import CARRIAGE_STEP, LARGEST_PRINTER_VALUE, Printe
 SAVED_LINE_MARK = "#*#"
 _HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 FULL_STEPS = 200.0
-"""Steps a turn of a motor whose section says nothing else, as in Klipper."""
+"""Default full steps per motor revolution, as in Klipper."""
 MOST_CARRIAGE_STEPS = 1e9
-"""From an end switch: kilometres of a carriage's way."""
+"""Bound on steps from an end switch; more would be kilometres of carriage travel."""
 _SECTION = re.compile(r"\[([^\]]+)\]")
 _ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=](.*)")
 
 Sections = dict[str, dict[str, tuple[str, str]]]
-"""Entries by section and name: their text, and where it stands."""
+"""Entries by section and name: the text of each, and its place in the file."""
 
 
 def is_one(text: str) -> bool:
@@ -50,7 +50,11 @@ def is_one(text: str) -> bool:
 
 
 def printer(text: str, label: str) -> Printer:
-    """The printer of a printer.cfg, checked field by field."""
+    """Printer of a printer.cfg.
+
+    Raises InputError for kinematics other than delta, for missing or impossible values, and for a
+    saved block that Klipper would ignore.
+    """
     _check_saved(text, label)
     result = sections(text, label)
     kinematics = result["printer"].get("kinematics", ("", f"{label}, [printer]"))
@@ -70,6 +74,7 @@ def printer(text: str, label: str) -> Printer:
         _number(result, label, f"stepper_{s}", "angle", default)
         for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
     ]
+    # the export's formulas read a ConfigParser; values are text there
     config = ConfigParser()
     config.read_dict(
         {
@@ -102,7 +107,7 @@ def printer(text: str, label: str) -> Printer:
 
 
 def _check_saved(text: str, label: str) -> None:
-    """Raises InputError where Klipper would take nothing of what SAVE_CONFIG wrote."""
+    """Raise InputError if Klipper would ignore the block that SAVE_CONFIG wrote."""
     lines = [line.rstrip("\r") for line in text.rstrip().splitlines()]
     header = next((n for n, line in enumerate(lines) if _HEADER.match(line)), len(lines))
     for n, line in enumerate(lines):
@@ -126,7 +131,7 @@ def _check_saved(text: str, label: str) -> None:
 
 
 def sections(text: str, label: str) -> Sections:
-    """What a configuration says; where SAVE_CONFIG wrote what stands above as well, that above."""
+    """Entries of a configuration; the user's own lines take precedence over SAVE_CONFIG's."""
     lines = [(n, line.rstrip()) for n, line in enumerate(text.splitlines(), 1)]
     own = [(n, line) for n, line in lines if not line.startswith(SAVED_LINE_MARK)]
     saved = [
@@ -149,7 +154,7 @@ def sections(text: str, label: str) -> Sections:
 def _of_tower(
     config: Sections, label: str, k: int, name: str, value: Callable[..., float]
 ) -> float:
-    """A tower's value; the second and the third have the first's unless they say otherwise."""
+    """Value of a tower; the default for the second and the third tower is the first tower's."""
     first = value(config, label, "stepper_a", name)
     return value(config, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
 
@@ -157,7 +162,10 @@ def _of_tower(
 def _number(
     config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
-    """A value of a section; raises InputError where it is no number, or absent without default."""
+    """Number in a section.
+
+    Raises InputError if it is not a number within bounds, or missing without a default.
+    """
     if name not in config.get(section, {}):
         if default is not None:
             return default
@@ -185,7 +193,7 @@ def _number(
 def _positive(
     config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
-    """A value of a section that is above zero on every machine."""
+    """Number in a section that must be positive. Raises InputError otherwise."""
     value = _number(config, label, section, name, default)
     if value <= 0:
         text, where = config[section][name]
@@ -199,7 +207,7 @@ def _positive(
 
 
 def _probe(config: Sections, label: str) -> tuple[float, float, float]:
-    """Where a probe is from the nozzle, mm; nowhere else where there is none."""
+    """Offset (x, y, z) of the probe from the nozzle, mm; zeros without a probe."""
     for section, entries in config.items():
         if "z_offset" in entries:
             x, y = (_number(config, label, section, f"{c}_offset", 0.0) for c in "xy")
@@ -208,7 +216,7 @@ def _probe(config: Sections, label: str) -> tuple[float, float, float]:
 
 
 def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
-    """The points that DELTA_CALIBRATE kept, and those entered by hand."""
+    """Bed points that DELTA_CALIBRATE saved, and those entered by hand; None without any."""
     section = "delta_calibrate"
     entries = config.get(section, {})
     names = [
@@ -226,7 +234,7 @@ def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
 
 
 def _step(config: Sections, label: str, section: str) -> float:
-    """Mm of a carriage for a step of its motor."""
+    """Carriage travel per motor step, mm."""
     own = {**config.get("stepper_a", {}), **config.get(section, {})}
     both = {section: own}
     turn = _positive(both, label, section, "rotation_distance")
@@ -245,7 +253,7 @@ def _step(config: Sections, label: str, section: str) -> float:
 
 
 def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
-    """Three numbers with commas between them."""
+    """Three comma-separated motor positions, in steps. Raises InputError for anything else."""
     text, where = entries.get(name, ("", f"{label}, [delta_calibrate]"))
     try:
         values = [float(x) for x in text.split(",")]

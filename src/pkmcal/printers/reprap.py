@@ -1,6 +1,6 @@
-"""RepRapFirmware's M665 and M666, of config.g or of config-override.g, which M500 writes.
+"""RepRapFirmware's M665 and M666, in config.g or in config-override.g, which M500 writes.
 
-Meaning: as told in :mod:`pkmcal.export.reprap`.
+Semantics: see :mod:`pkmcal.export.reprap`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ def is_one(text: str) -> bool:
 
 
 def printer(text: str, label: str) -> Printer:
-    """The printer of a file with M665 and M666; what stands later counts."""
+    """Printer of a file with M665 and M666; of repeated values the last counts.
+
+    Raises InputError for missing, malformed or impossible values.
+    """
     words, places = _numbers(text, label)
     rod, radius, height, reach = (
         _words(words, label, "665" + letter, size)
@@ -67,7 +70,10 @@ def printer(text: str, label: str) -> Printer:
 
 
 def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """Values by command and letter, of M665 and M666 alone, and where each stands."""
+    """Values by command and letter, of M665 and M666 only, and the line of each.
+
+    Raises InputError for a line that holds no numbers within bounds.
+    """
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
     words: dict[str, Array] = {}
     places: dict[str, str] = {}
@@ -89,7 +95,10 @@ def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
 
 
 def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
-    """A command's values (size,), of which one may stand for all."""
+    """Values (size,) of a word; a single one stands for all.
+
+    Raises InputError for any other number of values.
+    """
     values = words.get(name, np.zeros(0))
     if len(values) not in (1, size):
         raise InputError(

@@ -1,4 +1,4 @@
-"""The session of a delta printer: its drawing by the firmware, and its heights or a board."""
+"""Session of a delta printer: nominal model from its firmware, with bed heights or a board."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ from pkmcal.session.starter import (
 from pkmcal.wording import count
 
 CARRIAGE_MARGIN_BELOW = 5.0
-"""mm that carriages may go below what the bed's edge needs: for beds that hang lower than said."""
+"""Margin below the lowest carriage position that the bed's edge needs, mm.
+
+The bed may hang lower than the firmware's values place it.
+"""
 PRINTER_DRAWING_TEXT = """\
 # {name}, a linear delta, by the values in {label}. A firmware knows only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
@@ -121,11 +124,14 @@ def write_printer_session(
     in_view: Literal["board"] | None = None,
     places: int = 1,
 ) -> tuple[str, ...]:
-    """Write a printer's session into a new or empty folder; returns its files.
+    """Write a printer's session into a new or empty folder and return the names of its files.
 
-    printer : its configuration. probed : points of its bed; without them those that its
-    configuration keeps. in_view : None of heights, or ``board``, then from so many places. Raises
-    InputError for files that do not tell what is needed.
+    printer : its configuration file.
+    probed : file with bed points; None for the points in the configuration file.
+    in_view : ``board`` for a session with a board on the tool; None for a session of heights.
+    places : number of stations of a session with a board.
+
+    Raises InputError for files that lack necessary values.
     """
     value = read_printer(printer)
     if in_view is None:
@@ -137,13 +143,14 @@ def write_printer_session(
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
-    """The files of a session with a board on the tool, to fill in."""
+    """Files by name of a session with a board on the tool, to be filled in by the user."""
     texts = session_texts("linear-delta", "board", places)
     drawing = drawing_text(printer) + PLATFORM_FIXED_TEXT
     document = parse_yaml(drawing, Path("mechanism.yaml"))
     machine = checked_machine(validated_document(document, MechanismDocument), document)
     heads = [f"{motor} [mm]" for motor in printer.motors]
-    # corners stay within the print radius where the tool goes half as far: room is beside no tower
+    # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
+    # only there no tower is in the way
     square = int(printer.reach / np.hypot(7, 5))
     head = CARRIED_BOARD_SESSION_TEXT.format(
         where=WHERE_CARRIAGES_STAND[printer.program],
@@ -161,7 +168,7 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
 
 
 def _resolution(printer: Printer) -> dict[str, str]:
-    """How well a carriage is known, in words: no finer than motors hold their steps."""
+    """Standard deviation and step of the carriages, in words: at least that of a motor step."""
     step = max(printer.step, CARRIAGE_STEP)
     return {
         "noise": f"{step / np.sqrt(12):.1g}",
@@ -170,7 +177,10 @@ def _resolution(printer: Printer) -> dict[str, str]:
 
 
 def _enough(printer: Printer, touches: Touches | None) -> Touches:
-    """Raises InputError where too little of the bed was felt."""
+    """The points, unchanged.
+
+    Raises InputError for too few points, and for points that contradict the printer's values.
+    """
     if touches is None:
         raise InputError(
             "nothing tells where the bed is",
@@ -196,7 +206,8 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
             found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
             expected=f"points that belong to the values in {printer.label}",
         )
-    # a rod that touches the bed has its upper end above it; a bed may hang, by less than a rod
+    # the upper end of a rod is above the bed when the lower one touches it; a bed may hang lower
+    # than the origin, but by less than a rod
     below = -(touches.carriages / printer.rod).min(axis=0) - 1
     if below.max() > 0:
         motor = int(np.argmax(below))
@@ -210,7 +221,7 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
 
 
 def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
-    """The files of a session of heights."""
+    """Files by name of a session of bed heights."""
     names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
     to = "klipper" if printer.program == "Klipper" else "reprap"
     heads = [f"{motor} [mm]" for motor in printer.motors]
@@ -225,7 +236,10 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
 
 
 def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
-    """The printer's drawing, without what it holds fixed."""
+    """Nominal model of the printer as a mechanism file, without its key ``fixed``.
+
+    touches : probed points that the ranges of the carriages have to include.
+    """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
     edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
@@ -246,11 +260,11 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
 
 
 def _lowest(at_edge: Sequence[Array], touches: Touches | None) -> float:
-    """Where carriages go down to, mm: for the bed's edge, and for what was felt."""
+    """Lowest position of the carriages, mm, at the bed's edge and at the probed points."""
     reached = [*at_edge] if touches is None else [*at_edge, touches.carriages]
     return float(np.nanmin(np.concatenate(reached))) - CARRIAGE_MARGIN_BELOW
 
 
 def _mm(value: float) -> str:
-    """A length in mm, to a tenth of a micrometre."""
+    """Length in mm with four decimals, trailing zeros dropped."""
     return f"{value:.4f}".rstrip("0").rstrip(".")
