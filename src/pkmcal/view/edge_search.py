@@ -1,8 +1,8 @@
-"""What is found in one photograph: edges of legs, those that are not, and a board's corners.
+"""Measurements in one image: edges of legs, rejected edges, and corners of the board.
 
-The same looks as `calibrate` takes: of the drawing, each leg as a whole within a few pixels; of a
-calibrated machine, each edge by itself to sub-pixel. What the calibration made of it is read from
-its file.
+Edges are measured as `calibrate` does: for the nominal model each leg as a whole within a few
+pixels, for a calibrated machine each edge by itself to sub-pixel accuracy. Weights and residuals
+of the calibration are read from its file.
 """
 
 from __future__ import annotations
@@ -34,11 +34,14 @@ from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import count, number
 
 MIDDLE_EDGE_SIGMAS = 2.0
-"""Standard deviations, of drawing and search, within which the middle edge has to lie."""
+"""Largest median offset of a fitting machine, in standard deviations.
+
+Those of the nominal model and of the search count, added in squares.
+"""
 
 
 class _Judged(NamedTuple):
-    """What a calibration made of an edge: weight and residuals (standard deviations)."""
+    """Weight of an edge in the calibration, and its residuals in standard deviations."""
 
     weight: float
     shift: float
@@ -46,8 +49,9 @@ class _Judged(NamedTuple):
 
 
 def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
-    board's corners, and all that in words.
+    """Edges with their offsets (px) from the overlaid machine, edges not found, and board corners.
+
+    Edges that are not found have a reason. Sentences summarize the result.
     """
     pane = placed_by_hand(viewed, request)
     texts: list[str] = []
@@ -64,7 +68,7 @@ def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
 
 
 def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any]) -> None:
-    """What is found of the legs, put into the answer."""
+    """Measure the legs' edges and add them to the answer."""
     row = viewed.photograph(request.station, request.photograph).configuration
     taken = Photographs(
         request.station,
@@ -101,8 +105,9 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
 def _judged(
     viewed: Viewed, request: ViewRequest
 ) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
-    """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
-    and side from 0; -1 where all of them are meant.
+    """Weights and residuals of an image's edges in the calibration, and reasons of rejections.
+
+    Both by leg, tube and side from 0; -1 stands for all. Empty without a calibration.
     """
     if request.shown != "calibration":
         return {}, {}
@@ -125,8 +130,9 @@ def _judged(
 
 
 def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
-    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and how far outward (n,) px of the
-    machine's own they lie in the middle.
+    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and their outward offsets (n,) px.
+
+    The offset is that from the machine's own edge, at the middle of the curve.
     """
     if not len(edges):
         return np.zeros((0, EDGE_CURVE_POINTS, 2)), np.zeros(0)
@@ -137,7 +143,7 @@ def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
         measured_curves(machine, pane.camera, axes, one, part)
         for part in (edges, own_edges(machine, axes, one, edges))
     )
-    # outward of the leg: away from where its axis is seen
+    # outward: away from the image of the leg's axis
     a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
     axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
     middle = EDGE_CURVE_POINTS // 2
@@ -152,9 +158,7 @@ def _missed(
     rejected: tuple[Rejection, ...],
     reasons: dict[tuple[int, int, int], str],
 ) -> list[dict[str, Any]]:
-    """Edges of the machine that were looked for and not found, as they should lie, each with why;
-    those of which a part would be in the picture.
-    """
+    """Predicted edges within the image that were not measured, each with the reason."""
     tubes = tubes_of(pane.machine)
     pixel = _contours(pane, EDGE_CURVE_POINTS).pixel
     in_view = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
@@ -176,7 +180,7 @@ def _missed(
 
 
 def _contours(pane: Pane, samples: int) -> EdgePoints:
-    """Points of the machine's own edges."""
+    """Points of the machine's predicted edges."""
     legs = legs_in_camera(pane.machine, pane.T_camera_base, pane.T_base_platform, pane.joints)
     return edge_points(pane.machine, pane.camera, legs, tubes_of(pane.machine), samples)
 
@@ -184,7 +188,7 @@ def _contours(pane: Pane, samples: int) -> EdgePoints:
 def _words(
     pane: Pane, request: ViewRequest, in_view: int, missed: int, median: float | None
 ) -> list[str]:
-    """How well the machine lies on what is seen."""
+    """Sentences on the agreement of the machine with the image."""
     if in_view + missed == 0:
         return ["No leg of the machine would be in this photograph at this pose."]
     text = f"{in_view} of {in_view + missed} edges of legs are found"
@@ -196,11 +200,11 @@ def _words(
     gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
     near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
-    # other things' edges lie near by chance, too, though not most of them
+    # some background edges lie near by chance, but not most of the machine's
     verdict = (
         "It fits" if near and in_view > missed else "It may fit" if near else "It does not fit"
     )
-    # the search goes by whole pixels
+    # the search has a resolution of whole pixels
     off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
     return [
         f"{verdict}: {text}, and the middle one lies {off} from the drawing. The drawing's"

@@ -1,4 +1,4 @@
-"""The machine recognised in a station's photographs from a pose by hand, as `calibrate` begins."""
+"""Localization of a station in its images from a pose set by hand, as `calibrate` begins."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import brief, count
 
 FIT_PHOTOGRAPHS = 16
-"""Photographs of a station that take part: a search looks at eight and asks the others, in about a
-second; `calibrate` asks up to 64."""
+"""Images of a station that are used.
+
+A search uses eight and verifies with the others, in about a second; `calibrate` uses up to 64.
+"""
 FEWEST_FITTED_TOGETHER = 2
-"""Photographs from which some can be asked what the others found."""
+"""Fewest images of which some can verify the pose that the others give."""
 LEAST_CHANCE_DISPLAYED = 1e-9
-"""Probability below which no digits are told."""
+"""Probability below which no digits are displayed."""
 
 
 def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """The pose at which the machine is recognised, from the one given or from anywhere, what it
-    lays over, and how sure that is, in words; where it is not recognised, the pose stays.
+    """Localized pose with its overlay, and in words how certain the pose is.
+
+    The search starts at the request's pose, or everywhere. Without success the pose remains
+    unchanged. Raises InputError for a station without legs to be localized by.
     """
     station = viewed.station(request.station)
     if "legs" not in station.observe or not len(tubes_of(viewed.session.machine)):
@@ -56,7 +60,7 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
 
 
 def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
-    """From several photographs."""
+    """Localization from several images: pose, success, and a sentence."""
     pose = find_station(view, start, np.random.default_rng(0))
     shots = count(len(view.configuration), "photograph")
     if pose.good:
@@ -80,7 +84,7 @@ def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]
 
 
 def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, str]:
-    """From one photograph, which is searched from everywhere."""
+    """Localization from one image, with a global search: pose, success, and a sentence."""
     value = localize_image(view, image)
     best = value.T_camera_base[0]
     if value.rival_probability < RIVAL_POSE_PROBABILITY:
@@ -90,7 +94,7 @@ def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, st
 
 
 def _view(viewed: Viewed, s: int) -> StationView:
-    """What the search looks at; kept, for one fits again and again."""
+    """Data of a station for the search, cached because the user fits repeatedly."""
     retained: dict[int, StationView] = viewed.views
     if s not in retained:
         session, station = viewed.session, viewed.station(s)
