@@ -1,4 +1,4 @@
-"""A model of bodies read again, beside the machine it was made of."""
+"""Comparison of an exported multibody model, read again, with its machine."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pkmcal.mechanisms.closure import limb_ends
 AGREEMENT_POSES = 8
 MODEL_GEOMETRY_ROUNDING = 1e-12
 MODEL_POSE_ROUNDING = 1e-9
-"""m, rad: rounding of 1e-14 in a length, told through the poses' nearness to singular ones."""
+"""Tolerance of poses, m and rad: rounding of 1e-14 in a length, amplified near singular poses."""
 
 
 def differences(model: ReadModel, machine: Machine) -> list[Difference]:
-    """Joint centres at home, loops there and at other poses, radii."""
+    """Differences of joint centres at home, loop closure, radii, and platform poses by readings."""
     turned, shifted, n = _forward(model, machine)
     reference_values = {
         f"leg{j + 1}_tube{t + 1}": float(radius)
@@ -42,7 +42,7 @@ def differences(model: ReadModel, machine: Machine) -> list[Difference]:
 
 
 def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
-    """Limbs' ends at home beside the machine's at the keyframe's pose and readings."""
+    """Differences of joint centres and readings at the pose of the model's keyframe."""
     T = model.places(model.key)["platform"]
     fk = machine.forward_result(model.ctrl, T)
     ends = limb_ends(machine.layout, machine.values, model.ctrl, T, fk.internal)
@@ -59,8 +59,9 @@ def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
 
 
 def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
-    """How far, rad and m, the model's platform is from the machine's where both have the same
-    readings, and at how many poses.
+    """Largest rotation (rad) and translation (m) between the platforms, and the number of poses.
+
+    Model and machine have equal readings. NaN where the model's loops do not close.
     """
     poses, readings = samples(machine, AGREEMENT_POSES)
     x = model.at(readings, poses)

@@ -1,5 +1,6 @@
-"""A URDF read again, as its documentation tells links and joints, as far as
-:mod:`pkmcal.export.urdf` uses them; loops by the text beside it.
+"""Reader of URDF, as far as :mod:`pkmcal.export.urdf` uses it, with its file of loops.
+
+Links and joints have the meaning of URDF's documentation.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "sl
 
 
 def read_urdf(text: str, loops: str) -> ReadModel:
-    """The model of a URDF and of the text that tells its loops."""
+    """Model of a URDF text and its file of loops."""
     root, beside = fromstring(text), yaml.safe_load(loops)
     results = {node.attrib["name"]: node for node in root.findall("link")}
     above = {_link(node, "child"): node for node in root.findall("joint")}
@@ -26,7 +27,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
     joints: dict[str, ReadJoint] = {}
 
     def put(link: str) -> int:
-        """The number of a link's body, which comes after its parent's."""
+        """Index of a link's body, added after its parent's if necessary."""
         if link in numbers:
             return numbers[link]
         node = above.get(link)
@@ -86,11 +87,13 @@ def read_urdf(text: str, loops: str) -> ReadModel:
 
 
 def _link(joint: Element, which: str) -> str:
+    """Name of a joint's parent or child link."""
     node = joint.find(which)
     return "" if node is None else node.attrib["link"]
 
 
 def _place(node: Element) -> Array:
+    """Pose (4, 4) of a joint's origin."""
     origin = node.find("origin")
     return pose(
         from_roll_pitch_yaw(_vector(origin, "rpy", "0 0 0")), _vector(origin, "xyz", "0 0 0")
@@ -98,5 +101,6 @@ def _place(node: Element) -> Array:
 
 
 def _vector(node: Element | None, key: str, default: str) -> Array:
+    """Numbers of an attribute, or of the default."""
     text = default if node is None else node.get(key, default)
     return np.array([float(v) for v in text.split()])
