@@ -1,4 +1,4 @@
-"""What a camera's calibration found, as an outcome: intrinsics, corners over photographs, field."""
+"""Camera calibration as an outcome: intrinsics, corners in the images, residuals over the field."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
-"""Length of a large residual's arrow as a share of the picture's width."""
+"""Length of a large residual's arrow, in image widths."""
 ANGLE_STEP = 5.0
-"""degrees of the angle from the axis that one bar of the histogram holds."""
+"""Width of a bar in the histogram of angles from the axis, degrees."""
 FIELD_CELLS = (16, 12)
 INTRINSIC_UNITS = {"focal": "px", "center": "px"}
 INTRINSIC_WORDS = {
@@ -51,17 +51,17 @@ def outcome_of(
     paths: Sequence[Path | str] = (),
     others: Sequence[tuple[str, str]] = (),
 ) -> Outcome:
-    """Everything that `pkmcal camera` tells and writes.
+    """Outcome of `pkmcal camera`.
 
-    paths : the photographs, to show them; by name. others : other programs' camera files, names
-    and forms.
+    paths : image files to be shown; matched by name.
+    others : names and formats of camera files for other programs.
     """
     c = calibration
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
     factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
-    # with its covariance, so that `calibrate --refine-camera` knows how far to move it
+    # with its covariance, which is the prior of `calibrate --refine-camera`
     measured = replace(c.camera, covariance=c.covariance)
     return Outcome(
         command="camera",
@@ -108,7 +108,7 @@ def outcome_of(
 
 
 def camera_headline(c: CameraCalibration) -> str:
-    """The result in one sentence."""
+    """Result in one sentence."""
     focal, sigma = c.camera.parameters[:2].mean(), c.sigma[:2].mean()
     kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
     return (
@@ -118,7 +118,7 @@ def camera_headline(c: CameraCalibration) -> str:
 
 
 def _intrinsics(c: CameraCalibration) -> Table:
-    """The intrinsics with two digits of their sigma."""
+    """Table of the intrinsics, with two digits of their sigma."""
     rows: list[Row] = []
     values = zip(
         c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
@@ -136,6 +136,7 @@ def _intrinsics(c: CameraCalibration) -> Table:
 
 
 def _compared(c: CameraCalibration) -> Table:
+    """Table of the compared models."""
     rows = [
         Row(
             one.model,
@@ -154,6 +155,7 @@ def _compared(c: CameraCalibration) -> Table:
 
 
 def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
+    """Main numbers."""
     share = float(np.max(c.sigma[:2] / c.camera.parameters[:2])) * 100
     tilt = tilts(c.T_camera_board, c.board.points)
     covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
@@ -201,7 +203,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
 
 
 def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
-    """All views, each by its file's name."""
+    """All views with their images, found by file name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
@@ -210,7 +212,7 @@ def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tupl
 
 
 def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
-    """One view with the corners found in it."""
+    """One view with its detected corners."""
     finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
     corners: list[Arrow] = []
     for i in finite.tolist():
@@ -241,8 +243,9 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
 
 
 def _field(c: CameraCalibration) -> Markup:
-    """Corners a cell, and the mean residual of cells with three or more, enlarged by a factor of
-    their own: they are smaller than single corners' residuals.
+    """Number of corners in each cell, and mean residuals of cells with three or more.
+
+    The means have an enlargement of their own, as they are smaller than single residuals.
     """
     width, height = c.camera.image_size
     columns, rows = FIELD_CELLS
@@ -271,7 +274,7 @@ def _field(c: CameraCalibration) -> Markup:
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """Held-out error a view; the fit's own beside it in the tooltip."""
+    """Held-out error of each view; the fit's own error is in the tooltip."""
     squares = np.where(c.inliers, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
     fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.inliers.sum(axis=1), 1))
     middle = float(np.median(c.held_out.by_view))
@@ -291,7 +294,7 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
 
 
 def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """How far from the axis the corners lie."""
+    """Histogram of the corners' angles from the optical axis."""
     rays = c.camera.ray(c.pixels[c.inliers])
     angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
     angle = angle[np.isfinite(angle)]

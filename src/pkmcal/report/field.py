@@ -1,7 +1,7 @@
-"""Residuals against their place in the picture: what a wrong lens leaves there has an order.
+"""Residuals over the image: a wrong camera model leaves a systematic pattern there.
 
-An edge tells nothing along itself, so a cell's mean shift is the one (least squares) that its edges
-and corners, each across its own direction, agree on best.
+An edge constrains only the direction across itself, so a cell's mean shift is the least-squares
+solution of the offsets of its edges and corners along their own directions.
 """
 
 from __future__ import annotations
@@ -33,18 +33,20 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
 FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
-"""Places on an edge, in parts of its span: an edge crosses several cells."""
+"""Positions on an edge, as fractions of its span: an edge crosses several cells."""
 FIELD_CELLS_ACROSS = 14
-"""Cells across the picture."""
+"""Cells across the image."""
 FEWEST_IN_A_CELL = 5
-"""Edges and corners' coordinates from which a cell is shown."""
+"""Fewest edges and corner coordinates in a cell that is shown."""
 LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
-"""Part of a cell's weight that must lie across a direction for it to be shown: of edges within 15
-degrees of one another, what is left along them is their noise, enlarged four times."""
+"""Least share of a cell's information in a direction in which the shift is shown.
+
+Edges within 15 degrees of one another have no more along themselves: noise, enlarged fourfold.
+"""
 CELL_BY_CHANCE_SHARE = 0.01
-"""Share of cells that stand out by chance alone, where edges err independently."""
+"""Share of cells that are significant by chance, if edges err independently."""
 FIELD_ARROW_LENGTH = 0.06
-"""Length of a large mean shift as drawn, in picture widths."""
+"""Length of a large mean shift as drawn, in image widths."""
 FIELD_READING_TEXT = (
     "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
     " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
@@ -56,8 +58,9 @@ FIELD_READING_TEXT = (
 
 @dataclass(frozen=True)
 class ImageField:
-    """The mean residuals over one camera's picture, those within chance quiet. middle : its centre,
-    px.
+    """Mean residuals over the image of a camera; insignificant ones are quiet.
+
+    middle : principal point, px.
     """
 
     title: str
@@ -69,8 +72,13 @@ class ImageField:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Residuals in pictures: (n,) px along unit directions (n, 2) at pixels (n, 2), with what they
-    are of: station, configuration, and a number for each edge or corner, (n,).
+    """Residuals in images, (n,) each.
+
+    station, configuration : indices.
+    thing : number of the edge or corner.
+    pixel : (n, 2) position.
+    direction : (n, 2) unit vectors.
+    value : px along the direction.
     """
 
     station: Integers
@@ -81,7 +89,7 @@ class Offsets:
     value: Array
 
     def select(self, keep: Booleans) -> Offsets:
-        """Those of a mask."""
+        """Offsets of a mask."""
         return Offsets(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
 
@@ -92,7 +100,7 @@ def section(
     corners: BoardCorners,
     links: Links,
 ) -> Part | None:
-    """The section; None without anything seen."""
+    """Section of the report; None without residuals."""
     value = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
     if not value:
         return None
@@ -108,8 +116,9 @@ def section(
 def field_offsets(
     session: Session, edges: EdgeSet, estimate: Estimate, corners: BoardCorners
 ) -> Offsets:
-    """Of the edges in use, at several places of each, the camera's constant shift taken out, and of
-    the corners in use, in x and y.
+    """Offsets of the inlying edges, at several places of each, and of the used corners in x and y.
+
+    The camera's estimated edge shift is subtracted.
     """
     parts = [
         _of_edges(session, edges, estimate, s)
@@ -135,7 +144,7 @@ def field_offsets(
 
 
 def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
-    """Of one station's edges."""
+    """Offsets of one station's edges."""
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
     mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
@@ -167,8 +176,9 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
 def fields(
     session: Session, value: Offsets, links: Links
 ) -> tuple[tuple[ImageField, ...], float, float] | None:
-    """A field for each station, hand-held photographs of one camera together; the factor by which
-    all arrows are enlarged, and the longest of them, px. None without any cell.
+    """Field of each station, with the arrows' enlargement and the longest arrow, px.
+
+    Hand-held images of one camera share a field. None without a cell.
     """
     entries = [station.entry or station.name for station in session.stations]
     arrows: list[tuple[str, int, list[Arrow]]] = []
@@ -194,6 +204,7 @@ def fields(
 def _field(
     session: Session, entry: str, s: int, cells: Sequence[Arrow], factor: float
 ) -> ImageField:
+    """Field of a station, with enlarged arrows."""
     camera = session.stations[s].camera
     values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
     return ImageField(
@@ -205,14 +216,14 @@ def _field(
 
 
 def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
-    """The mean shifts of the cells of one picture that hold enough, px."""
+    """Mean shifts, px, of the image's cells with enough data."""
     from scipy.special import fdtrc
 
     side = size[0] / FIELD_CELLS_ACROSS
     inside = np.all((result.pixel > -0.5) & (result.pixel < np.array(size) - 0.5), axis=1)
     some = result.select(np.asarray(inside))
     at = np.floor((some.pixel + 0.5) / side).astype(int)
-    # an edge counts once in a cell: its places there are one measurement; a corner twice
+    # places of one edge in a cell are one measurement, corners are two
     steep = np.abs(some.direction).argmax(axis=1)
     keys = np.column_stack([at[:, 1] * FIELD_CELLS_ACROSS + at[:, 0], some.thing, steep])
     each, first, one = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -227,6 +238,8 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
         np.add.at(out, number_of, values)
         return out
 
+    # per cell: least squares for the shift s in sum (d d^T) s = sum d value, restricted to
+    # well-determined directions
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
     above_limit = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
@@ -238,6 +251,7 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     rank = above_limit.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
     residual = np.maximum(total(value**2) - explained, 1e-300)
+    # F-test of the shift against the scatter about it
     loud = fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5

@@ -1,4 +1,4 @@
-"""What the data can tell of the machine: the rank, its words, and the paper's counts."""
+"""Report section on what the data determine: rank and unidentifiable directions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
 
 LEAST_BAR_INFORMATION = 1e-3
-"""Information below which a bar is a stub only: the drawing knows a thousand times more."""
+"""Information below which a bar is only a stub: the nominal model knows a thousand times more."""
 STUB_BAR_HEIGHT = 0.06
-"""Height of such a bar, in decades: seen, and not mistaken for a value."""
+"""Height of a stub, in decades: visible, but not to be read as a value."""
 MOST_NAMES_LISTED = 6
 
 
 def section(findings: Findings, table: ParameterTable) -> Part:
-    """The section of the findings of a machine with these parameters."""
+    """Section on the findings of a machine with these parameters."""
     html = page.filled_template(
         "identifiability.html.j2",
         headline=directions_headline(findings),
@@ -35,7 +35,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
 
 
 def directions_headline(findings: Findings) -> str:
-    """How many of the directions that exist the data fix."""
+    """Number of directions that the data determine, in sentences."""
     ranks = findings.identifiability
     possible = ranks.n_parameters - ranks.n_frames
     frames = f"{ranks.n_parameters} free values less {ranks.n_frames} that only place the frames"
@@ -52,9 +52,7 @@ def directions_headline(findings: Findings) -> str:
 
 
 def spectrum(findings: Findings) -> BarChart | None:
-    """Bars of all directions, best known first, on a logarithmic scale from
-    ``LEAST_BAR_INFORMATION``.
-    """
+    """Bars of the information in all directions, best known first, on a logarithmic scale."""
     values = np.asarray(findings.identifiability.singular_values, dtype=float)
     if values.size == 0:
         return None
@@ -96,14 +94,14 @@ def spectrum(findings: Findings) -> BarChart | None:
 
 
 def _power(exponent: int) -> str:
-    """``1``, ``10``, ``1000``, ``10⁻²``: plain numbers as far as they are short."""
+    """Power of ten: ``1``, ``10``, ``1000`` in full, others as ``10⁻²``."""
     if 0 <= exponent <= 3:
         return str(10**exponent)
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def held_text(findings: Findings, table: ParameterTable) -> str:
-    """What the mechanism file holds, in a sentence; empty where it holds nothing."""
+    """Sentences on the parameters that the mechanism file fixes; empty without any."""
     if not table.fixed:
         return ""
     names = [name for name in table.fixed if name in findings.conventional]
@@ -113,7 +111,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
             f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
             " under fixed, so the drawing's value counts as exact and no direction belongs to it."
         )
-    # some of what is held only chooses frames, or repeats what is free
+    # some fixed parameters only choose frames, or repeat free ones
     others = [name for name in table.fixed if name not in names]
     parts: list[str] = []
     if names:
@@ -144,7 +142,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
 
 
 def tied(table: ParameterTable) -> str:
-    """What changes together, in a sentence; empty where nothing does."""
+    """Sentence on tied parameters; empty without any."""
     groups = [names for names in _together(table) if not names & set(table.fixed)]
     if not groups:
         return ""
@@ -159,7 +157,7 @@ def tied(table: ParameterTable) -> str:
 
 
 def _together(table: ParameterTable) -> list[set[str]]:
-    """Ties, where those that share a name are one."""
+    """Groups of tied parameters; ties that share a name are merged."""
     out: list[set[str]] = []
     for names in table.tied:
         touching = [group for group in out if group & set(names)]
@@ -169,6 +167,7 @@ def _together(table: ParameterTable) -> list[set[str]]:
 
 
 def _listed(table: ParameterTable, names: tuple[str, ...]) -> str:
+    """Names in words, at most ``MOST_NAMES_LISTED`` of them."""
     groups = grouped(table, names)
     words = groups[:MOST_NAMES_LISTED]
     if len(groups) > MOST_NAMES_LISTED:

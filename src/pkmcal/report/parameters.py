@@ -1,4 +1,4 @@
-"""The parameters: their table, what is known of them together, and in words what is open."""
+"""Report sections on the parameters: their table, their correlations, and unidentified ones."""
 
 from __future__ import annotations
 
@@ -37,10 +37,13 @@ from pkmcal.wording import (
 )
 
 TIGHT_CORRELATION = 0.95
-"""Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
+"""Correlation of two parameters above which a sentence reports it.
+
+At this value their combination is known 3.2 times better than each alone.
+"""
 MOST_TIGHT_PAIRS = 6
 MOST_CORRELATIONS = 250
-"""Parameters up to which they are shown: of more, a cell would be less than three pixels."""
+"""Most parameters in the plot of correlations; with more a cell would be below three pixels."""
 RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
 HOW_TOGETHER = (
     "Orange: when one is larger than told, so is the other; blue: the other is smaller. Only their"
@@ -52,7 +55,7 @@ LATEX_SIGNS = {
     "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
     "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
 }  # fmt: skip
-"""Signs that LaTeX reads as something else, or not."""
+"""Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
     "data": "the photographs decide",
     "drawing": "the drawing decides more than the photographs",
@@ -63,10 +66,12 @@ PARAMETER_SOURCES = {
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
+    """Parameter as the table shows it; texts have meaningful digits, numbers are for sorting.
 
-    leg : from 1, None for a parameter of no leg. source : a key of ``PARAMETER_SOURCES``. share :
-    of what is known, from the data; NaN where that means nothing. note : ties, for people.
+    leg : from 1, None for parameters of no leg.
+    source : key of ``PARAMETER_SOURCES``.
+    share : share of the information that comes from the data; NaN where it is not defined.
+    note : ties, in words.
     """
 
     name: str
@@ -84,25 +89,25 @@ class ParameterRow:
 
     @property
     def source_text(self) -> str:
-        """The source in words."""
+        """Source in words."""
         return PARAMETER_SOURCES[self.source]
 
     @property
     def share_text(self) -> str:
-        """The share in percent, empty where it means nothing."""
+        """Share in percent, empty where it is not defined."""
         return percent(self.share) if np.isfinite(self.share) else ""
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """The rows of one leg (None: of the machine)."""
+    """Rows of one leg, or of the machine for leg None."""
 
     leg: int | None
     rows: tuple[ParameterRow, ...]
 
 
 def section(drawing: Machine, estimate: Estimate) -> Part:
-    """The table."""
+    """Section with the table of parameters."""
     visible = estimate.edge_weights.size or estimate.pose_weights.size
     estimates = parameter_estimates(
         drawing.values, estimate.machine, estimate.covariance, estimate.data_share
@@ -125,7 +130,7 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
 
 
 def parameters_csv(estimates: ParameterEstimates) -> str:
-    """The table for a spreadsheet: SI, all digits."""
+    """CSV table in SI units with all digits."""
     stream, rows = io.StringIO(), estimates.records()
     writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -134,7 +139,7 @@ def parameters_csv(estimates: ParameterEstimates) -> str:
 
 
 def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
-    """The table for a paper, as a tabular: rounded as on the page."""
+    """LaTeX tabular, rounded as on the page."""
     lines = [
         r"\begin{tabular}{rlrrrl}",
         r"Leg & Parameter & Drawing & Calibrated & $\sigma$ & Unit \\ \hline",
@@ -146,25 +151,27 @@ def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
 
 
 def _for_tex(text: str) -> str:
+    """Text with LaTeX's special characters replaced."""
     for sign, command in LATEX_SIGNS.items():
         text = text.replace(sign, command)
     return text
 
 
 def _as_link(kind: str, text: str) -> str:
-    """Text as an address that holds it."""
+    """Data URL of a text."""
     packed = base64.b64encode(text.encode("utf-8")).decode("ascii")
     return f"data:{kind};charset=utf-8;base64,{packed}"
 
 
 def parameter_groups(estimates: ParameterEstimates) -> tuple[ParameterGroup, ...]:
-    """All parameters, grouped by leg in the order of the file."""
+    """All parameters, grouped by leg, in the order of the file."""
     rows = [_row(estimates.table, k, one) for k, one in enumerate(estimates)]
     legs = list(dict.fromkeys(row.leg for row in rows))
     return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
 def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
+    """Row of a parameter."""
     factor, unit = DISPLAY_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
     sigma = one.sigma if one.sigma > ROUNDING_SIGMA else 0.0
     numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
@@ -187,13 +194,16 @@ def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
 
 
 def unidentified(estimate: Estimate, findings: Findings) -> tuple[str, ...]:
-    """Sentences: what the data leave open, then pairs that can hardly be told apart."""
+    """Sentences on unidentifiable and weakly determined directions, then on correlated pairs."""
     out = (f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak))
     return (*out, *bound_together(estimate, findings))
 
 
 def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
-    """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
+    """Sentences on tightly correlated pairs.
+
+    Pairs that a finding already names together are left out.
+    """
     table = estimate.machine.parameters
     names = table.names
     results = () if findings is None else findings.unidentified
@@ -207,12 +217,13 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
 
 
 def _whole_axis(name: str) -> str:
-    """The axis that a parameter is a component of, elsewhere the parameter itself."""
+    """Axis of which a parameter is a component; other parameters unchanged."""
     whole = name.rpartition(".")[0]
     return whole if whole.endswith("axis") else name
 
 
 def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
+    """Sentence on two tightly correlated parameters."""
     what = "difference" if rho > 0 else "sum"
     return (
         f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
@@ -221,7 +232,7 @@ def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> st
 
 
 def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
-    """Names in words, one entry for what three legs or more have: ``hinge y of legs 1 to 4``."""
+    """Names in words, with a common entry for three or more legs: ``hinge y of legs 1 to 4``."""
     legs: dict[str, list[int]] = {}
     for name in names:
         leg, path = split_name(name)
@@ -239,11 +250,10 @@ def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
 
 
 def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
-    """Parameters (n,) that have a deviation of their own, their correlations (n, n), and which
-    pairs (n, n) say something: each once, i < j.
+    """Free parameters (n,), their correlations (n, n), and a mask (n, n) of the pairs that matter.
 
-    Of a tie, which is one parameter under several names, the first stands for all; that an axis has
-    unit length says nothing of what its components are bound to.
+    The mask has each pair once, i < j. Of tied parameters the first stands for all; correlations
+    among the components of one axis are excluded, since its unit length implies them.
     """
     table, sigma = estimate.machine.parameters, np.sqrt(np.diag(estimate.covariance).clip(0))
     again = {name for group in table.tied for name in group[1:]}
@@ -255,7 +265,7 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
 
 
 def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
-    """Pairs of parameters (i, j, correlation) beyond ``TIGHT_CORRELATION``, the tightest first."""
+    """Pairs of parameters (i, j, correlation) above ``TIGHT_CORRELATION``, the tightest first."""
     free, rho, pairs = correlations(estimate)
     i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT_CORRELATION))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
@@ -263,7 +273,7 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
 
 
 def correlations_part(estimate: Estimate) -> Part | None:
-    """What is known together; None where nothing was estimated, or too much to be drawn."""
+    """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
     table = estimate.machine.parameters
     display, rho, pairs = correlations(estimate)
     if not 1 < len(display) <= MOST_CORRELATIONS:
@@ -297,8 +307,7 @@ def correlations_part(estimate: Estimate) -> Part | None:
 
 
 def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
-    """The heat map."""
-    # where the first of a leg's, or of a kind, stands
+    """Heat map of correlations."""
     common = {
         **COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "ticks": "",
         "tickfont": {"size": 9}, "automargin": True, "constrain": "domain",

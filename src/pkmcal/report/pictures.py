@@ -1,4 +1,4 @@
-"""Photographs with what was found in them drawn over, [B] Figs. 6 and 8."""
+"""Images with the measured edges and corners drawn over them, as in [B] Figs. 6 and 8."""
 
 from __future__ import annotations
 
@@ -43,18 +43,21 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
 MOST_PAGE_IMAGES = 400
-"""Photographs on a page: browsers take a second to lay out as many."""
+"""Images on a page: browsers take a second to lay out as many."""
 JPEG_CHARACTERS_A_PAGE = 8_000_000
-"""Characters of all their JPEGs."""
+"""Characters of all JPEGs on a page."""
 CORNER_ARROW_LENGTH = 0.03
-"""Length of a large corner's residual as drawn, in picture widths."""
+"""Length of a large corner residual as drawn, in image widths."""
 
 
 @dataclass(frozen=True)
 class Album:
-    """The photographs on the page. rejected : those that do not show where they were taken from.
-    total : how many others there are. factor : enlarges the corners' residuals. corners : of the
-    board, in all photographs.
+    """Images on the page.
+
+    rejected : images that could not be localized.
+    total : number of all other images.
+    factor : enlargement of the corners' residuals.
+    corners : corners of the board in all images.
     """
 
     pictures: tuple[Picture, ...]
@@ -66,7 +69,7 @@ class Album:
 
 
 def section(session: Session, display: Album) -> Part:
-    """The section."""
+    """Section of the report."""
     html = page.filled_template(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
@@ -80,8 +83,11 @@ def section(session: Session, display: Album) -> Part:
 
 
 def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...]) -> Album:
-    """The photographs, those in which nothing is in use first, then by their residuals, the largest
-    first, as many as there is room for. shifts : (N,) px of the edges, for tooltips.
+    """Images with their overlays, as many as there is room for.
+
+    Images without data in use come first, then those with the largest residuals.
+
+    shifts : (N,) px of the edges, for tooltips.
     """
     session, level = calibration.session, levels(calibration.observation, calibration.estimate)
     every = [
@@ -117,8 +123,9 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
 
 
 def _rejected(session: Session, room: int) -> Iterator[Picture]:
-    """Photographs without a place, each with the reason, in ``room`` characters of their JPEGs;
-    what there is no room for is named all the same.
+    """Images that could not be localized, each with the reason, in ``room`` characters of JPEGs.
+
+    Images without room are listed without their JPEG.
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.photographs]
     files = [
@@ -142,20 +149,20 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
 
 
 def _images(session: Session, s: int) -> Pictures:
-    """A station's photographs, decoded when they are looked at."""
+    """Images of a station, decoded on access."""
     return _decoded(session.stations[s])
 
 
 def _decoded(station: Station) -> Pictures:
-    """The same of a station that is not in the session any more."""
+    """Images of a station that need not be in the session any more, decoded on access."""
     paths = [photo.path for photo in station.photographs]
     return Pictures(paths, station.camera.image_size, [path.name for path in paths])
 
 
 def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
-    """Root mean square of each photograph's residuals, in σ: of edges and of the board's pose.
+    """Root mean square residual of each image, in standard deviations, over edges and board poses.
 
-    By all of them alike: edges that were put aside are what a reader wants to see.
+    Unweighted: images with rejected edges are those that a reader has to see.
     """
     edges, poses = observation.edges, observation.poses
     squares = np.concatenate(
@@ -170,9 +177,9 @@ def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
 
 
 class _ImageOverlays:
-    """What is drawn over the chosen photographs, worked out for all of a station at once.
+    """Overlays of the chosen images, computed for all images of a station at once.
 
-    factor : enlarges the corners' residuals.
+    factor : enlargement of the corners' residuals.
     """
 
     def __init__(
@@ -212,7 +219,7 @@ class _ImageOverlays:
     def picture(
         self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
     ) -> Picture:
-        """One photograph with what was found in it."""
+        """Image with its overlays."""
         session = self.calibration.session
         k, station = photo.configuration, session.stations[s]
         p, c = station.photographs.index(photo), self.corners
@@ -245,6 +252,7 @@ class _ImageOverlays:
         )
 
     def _corner(self, corners: BoardCorners, n: int) -> Arrow:
+        """Arrow from a detected corner to its prediction."""
         (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
         tip = (
             f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
@@ -253,7 +261,7 @@ class _ImageOverlays:
         return Arrow(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
 
     def _edges(self, shifts: Array, s: int, configurations: Integers) -> None:
-        """The fitted edges of a station."""
+        """Collect the measured edges of a station."""
         edges, estimate = self.calibration.observation.edges, self.calibration.estimate
         mine = np.flatnonzero((edges.station == s) & np.isin(edges.configuration, configurations))
         curves = straightened(edge_curves(self.calibration, mine, s))
@@ -272,7 +280,7 @@ class _ImageOverlays:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
     def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
-        """Where edges should have been that were left out, each with why."""
+        """Collect predictions of rejected edges, each with the reason."""
         machine, camera = self.calibration.machine, self.calibration.session.stations[s].camera
         row = {int(k): n for n, k in enumerate(configurations)}
         some = [one for one in rejected if one.leg >= 0 and one.configuration in row]
@@ -294,7 +302,9 @@ class _ImageOverlays:
                     self.missed[s, one.configuration].append(drawn)
 
     def _spots(self, centres: tuple[Centres, ...], s: int, configurations: Integers) -> None:
-        """Joint centres, by the result and by the drawing laid over it."""
+        """Collect joint centres of the calibrated machine, and of the nominal one
+        aligned with it.
+        """
         session, state = self.calibration.session, self.calibration.estimate.state
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
@@ -317,14 +327,14 @@ class _ImageOverlays:
 
 
 def edge_curves(c: Calibration, mine: Integers, s: int) -> Array:
-    """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` in the photographs of station s."""
+    """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` (n,) in the images of station s."""
     edges, camera = c.observation.edges.select(mine), c.session.stations[s].camera
     rows, photograph = np.unique(edges.configuration, return_inverse=True)
     return measured_curves(c.machine, camera, _legs(c, s, rows), photograph, edges)
 
 
 def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
-    """The calibrated legs before a station's camera, in some configurations."""
+    """Calibrated legs in the frame of a station's camera, in some configurations."""
     state = c.estimate.state
     return legs_in_camera(
         c.machine, state.T_camera_base[s], state.T_base_platform[rows], c.session.joints[rows]
@@ -332,14 +342,16 @@ def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
 
 
 def _rejected_words(n: int) -> str:
+    """Number of rejected edges as the rest of a sentence."""
     return f", {n} of them put aside" if n else ""
 
 
 def _size(corners: BoardCorners) -> str:
-    """How far corners are off, in words."""
+    """Root mean square residual of corners, in words."""
     rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
     return f"{brief(rms)} px off"
 
 
 def _pair(point: Array) -> tuple[float, float]:
+    """Pixel with one decimal."""
     return round(float(point[0]), 1), round(float(point[1]), 1)

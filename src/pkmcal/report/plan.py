@@ -1,4 +1,4 @@
-"""A plan as an outcome: what to measure next, in which order, from where, and what it will give."""
+"""Measurement plan as an outcome: configurations, their order, stations, and expected accuracy."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ INDEX_NAMES = {
     "O1": "the noise amplification index O1",
 }
 FRUSTUM_LENGTH_SHARE = 0.35
-"""Length of a drawn camera's view, in the distance from the camera to the machine."""
+"""Length of a drawn frustum, in distances between camera and machine."""
 PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
@@ -54,7 +54,7 @@ PLAN_METHOD_TEXT = (
 
 
 def outcome_of(plan: MeasurementPlan) -> Outcome:
-    """Everything that ``pkmcal plan`` tells and writes."""
+    """Outcome of ``pkmcal plan``."""
     texts: dict[str, str | bytes] = {
         PLAN_TABLE_FILE: csv_text(
             plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
@@ -110,7 +110,7 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
 
 
 def _accuracy_cells(accuracy: Accuracy) -> str:
-    """Position and orientation; a platform that does not turn has no orientation to be known."""
+    """Accuracy of position and, if the platform turns, of orientation, in words."""
     words = f"position to {amount(accuracy.position, 'm')}"
     if not accuracy.orientation:
         return words
@@ -118,7 +118,7 @@ def _accuracy_cells(accuracy: Accuracy) -> str:
 
 
 def _purpose(plan: MeasurementPlan) -> str:
-    """What the plan is for, in a sentence."""
+    """Purpose of the plan in a sentence."""
     where = ""
     if len({name for names in plan.stations for name in names}) > 1:
         where = " seen by all stations" if plan.together else " from each place"
@@ -127,7 +127,7 @@ def _purpose(plan: MeasurementPlan) -> str:
 
 
 def _paying(plan: MeasurementPlan) -> Finding:
-    """Where more photographs stop paying."""
+    """Note on the number of configurations beyond which more are not worthwhile."""
     last, until = plan.promised, plan.pays_until
     twice = next(a for a in plan.curve if a.count > last.count)
     facts = {
@@ -141,13 +141,13 @@ def _paying(plan: MeasurementPlan) -> Finding:
 
 
 def _carefully(plan: MeasurementPlan) -> tuple[Finding, ...]:
-    """Configurations to which the straight way is blocked."""
+    """Note on configurations that a straight path does not reach."""
     names = [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]
     return (note("plan.blocked", listed(names), names=names),) if names else ()
 
 
 def _order(plan: MeasurementPlan) -> Part:
-    """The configurations, in their order."""
+    """Section with the configurations in their order."""
     units = plan.subject.rig.machine.joint_units
     columns = [
         f"{name}, {DISPLAY_UNITS[unit][1]}"
@@ -180,7 +180,7 @@ def _order(plan: MeasurementPlan) -> Part:
 
 
 def _curve(plan: MeasurementPlan) -> Part:
-    """How the tool's deviation falls with the number of configurations."""
+    """Section on the tool's standard deviation against the number of configurations."""
     x = [a.count for a in plan.curve]
     y = [a.position * 1e3 for a in plan.curve]
     here, axis = plan.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
@@ -248,7 +248,7 @@ def _curve(plan: MeasurementPlan) -> Part:
 
 
 def _ticks(values: Sequence[float]) -> dict[str, Any]:
-    """Round places along a logarithmic axis, written out."""
+    """Round ticks of a logarithmic axis, without exponents."""
     low, high = min(values), max(values)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     places = [m * 10.0**k for k in decades for m in (1, 2, 5)]
@@ -257,7 +257,7 @@ def _ticks(values: Sequence[float]) -> dict[str, Any]:
 
 
 def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
-    """Cameras of the plan: station, camera and T_camera_base."""
+    """Cameras of the plan: name of the station, camera, and T_camera_base."""
     out: dict[str, tuple[str, Camera, Array]] = {}
     rig = plan.subject.rig
     for one in rig.instruments:
@@ -268,7 +268,7 @@ def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
 
 
 def _places(plan: MeasurementPlan) -> Part:
-    """Where to put the camera, and what the best places would do alone."""
+    """Section on the camera's places, and what the best of them give alone."""
     order = sorted(plan.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
     rows = [
         Row(
@@ -294,7 +294,7 @@ def _places(plan: MeasurementPlan) -> Part:
 
 
 def _where(plan: MeasurementPlan) -> Part:
-    """The drawing: the machine, its configurations, the cameras, and the places tried."""
+    """Section with a plot of the machine, its configurations, cameras, and candidate places."""
     rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
     machine = rig.machine
     ends = machine.ends_at(machine.inverse(home), home)
@@ -341,7 +341,7 @@ def _where(plan: MeasurementPlan) -> Part:
 
 
 def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
-    """Dots at the places that were tried, by what each tells alone."""
+    """Markers at candidate places, coloured by the accuracy that each gives alone."""
     at = np.array([one.place.position for one in tried])
     value = np.array([one.alone for one in tried]) * 1e3
     style = {
@@ -355,7 +355,7 @@ def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
 
 
 def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
-    """The chosen places as entries of session.yaml."""
+    """Chosen places as entries of session.yaml."""
     rig, out = plan.subject.rig, dict[str, Any]()
     for name, _, T_camera_base in _cameras(plan):
         observe = [
@@ -373,7 +373,7 @@ def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
 
 
 def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
-    """Plain data for JSON: m and rad."""
+    """Plan as plain data, m and rad."""
     rig = plan.subject.rig
     joined = zip(
         plan.names, plan.stations, plan.rank, plan.joints, plan.T_base_platform,
@@ -427,6 +427,7 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
 
 
 def _progress_text(accuracy: Accuracy) -> dict[str, float]:
+    """Accuracy as plain data."""
     return {
         "configurations": accuracy.count,
         "position": accuracy.position,

@@ -1,4 +1,4 @@
-"""How the result was made: where the cameras stood, settings, solver; and what was left out."""
+"""Report sections on how the result was made: stations, settings, solver, and rejected data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SIGMA_MEANING_TEXT = Markup(
     " used are the test for the rest."
 )
 NORMAL_FROM_FREEDOMS = 50
-"""Degrees of freedom from which on a Student distribution is told as the normal one."""
+"""Degrees of freedom above which a Student distribution is reported as normal."""
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
@@ -39,8 +39,10 @@ MOST_CASES = 400
 def used_photographs(
     session: Session, observation: Observation, estimate: Estimate
 ) -> tuple[int, ...]:
-    """How many of each station's photographs show something that is in use: a board that was not
-    rejected, or edges of which most were not. Those that were held out do not.
+    """Number of images of each station that are in use.
+
+    An image is in use if its board's pose is an inlier, or at least half of its edges are.
+    Held-out images are not.
     """
     names_so_far = set[tuple[int, int]]()
     for item, weights in (
@@ -61,7 +63,10 @@ def used_photographs(
 def stations(
     session: Session, observation: Observation, estimate: Estimate, space: Plot | None
 ) -> Part:
-    """The machine as it was photographed, and where the cameras stood, one row a station."""
+    """Section with the machine and its cameras.
+
+    The plot in space, and a table with a row for each station.
+    """
     plots, camera = (space,) if space else (), session.camera_of_station
     if not session.station_names:
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
@@ -100,14 +105,15 @@ def stations(
 
 
 def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
-    """A station's place with its deviations (mm), and the deviation of its turn (degrees); what the
-    data do not determine is open.
+    """Position of a station with standard deviations (mm), and that of its orientation (degrees).
+
+    Open where the data do not determine them.
     """
     value, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(value)[:3, 3] * 1e3
     covariance = base_camera_covariance(value, covariance)
     reference = identified(estimate.machine, covariance)
-    # rounding may leave less than none
+    # rounding may leave a negative variance
     sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
@@ -118,6 +124,7 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
 
 
 def _shift_cell(rough: Array | None, values: Array) -> str:
+    """Distance and angle of the estimated pose from the one by hand."""
     if rough is None:
         return "–"
     turn = np.rad2deg(np.linalg.norm(pose_difference(values, rough)[:3]))
@@ -126,7 +133,10 @@ def _shift_cell(rough: Array | None, values: Array) -> str:
 
 
 def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
-    """How it was computed. timings : seconds by step."""
+    """Section on settings, solver and versions.
+
+    timings : seconds by step.
+    """
     html = page.filled_template(
         "how.html.j2",
         model_error=SIGMA_MEANING_TEXT,
@@ -140,7 +150,7 @@ def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> P
 
 
 def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...]:
-    """(what, value) of everything that the result depends on besides the photographs."""
+    """Pairs (name, value) of all that the result depends on besides the images."""
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
@@ -162,7 +172,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             (
                 f"χ² of the {name}",
                 f"{number(chi2, 0)} over {number(n, 0)} numbers"
-                # degrees of freedom that the numbers leave, where they were counted
+                # redundancy of the kind, where it was counted
                 + (f", {count(round(freedom), 'degree')} of freedom" if freedom >= 0.5 else ""),
             )
             for name, chi2, n, freedom in (
@@ -210,18 +220,24 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
 
 
 def link_labels(session: Session) -> str:
-    """What links the session's configurations, in the plural."""
+    """Kinds of links in the session, in the plural."""
     return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
 
 
 def _between(limits: tuple[float, float | None]) -> str:
+    """Interval in words."""
     low, high = limits
     return f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)}"
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One reason. cases : (photograph, what) for the first of ``count`` findings."""
+    """Reason of rejections.
+
+    count : number of rejections.
+    photographs : number of images concerned.
+    cases : (image, rejected part) of the first of them.
+    """
 
     text: str
     count: int
@@ -230,12 +246,12 @@ class Reason:
 
     @property
     def unlisted(self) -> int:
-        """Findings that the list leaves out."""
+        """Number of rejections that the list leaves out."""
         return self.count - len(self.cases)
 
 
 def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estimate) -> Part:
-    """What was rejected, and which values can hardly be told apart."""
+    """Section on rejections, and on tightly correlated parameters."""
     html = page.filled_template(
         "rejected.html.j2",
         reasons=reasons(session, rejected),
@@ -246,7 +262,10 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
 
 
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:
-    """Grouped by reason, the most frequent first; numbers in a reason do not part groups."""
+    """Rejections grouped by reason, the most frequent first.
+
+    Reasons that differ in numbers are one.
+    """
     groups: dict[str, list[Rejection]] = {}
     for item in rejected:
         kind = re.sub(r"[-+−]?\d+(\.\d+)?([eE][-+]?\d+)?", "…", item.reason)
@@ -256,6 +275,7 @@ def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, 
 
 
 def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
+    """Group of rejections."""
     same = len({item.reason for item in items}) == 1
     stations, configurations = session.station_names, session.configurations
     return Reason(
@@ -268,13 +288,13 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
                 _what(i) if same else f"{_what(i)}: {i.reason}",
             )
             for number, i in enumerate(items)
-            if number < MOST_CASES or i.leg < 0  # whole images and boards are all named
+            if number < MOST_CASES or i.leg < 0  # whole images and boards are always listed
         ),
     )
 
 
 def _what(item: Rejection) -> str:
-    """The rejected thing in words; -1 stands for all of them."""
+    """Rejected part in words; -1 stands for all."""
     if item.leg < 0:
         return "board" if item.reason.startswith("the board") else "whole photograph"
     words = [f"leg {item.leg + 1}"]

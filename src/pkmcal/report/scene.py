@@ -1,6 +1,6 @@
-"""The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged.
+"""Geometry before and after calibration, as in [B] Fig. 7: joint centres at home, errors enlarged.
 
-Two plane views as SVG, and one in space as a Plotly figure, whose lengths are millimetres.
+Two plane views as SVG, and one in space as a Plotly figure in millimetres.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
 ELLIPSE_SIGMAS = 2.0
-"""Standard deviations that ellipses and ellipsoids reach."""
+"""Standard deviations of ellipses and ellipsoids."""
 ENLARGED_ERROR_SHARE = 0.22
-"""Part of the machine's radius that the large errors should span once enlarged."""
+"""Length of large errors after enlargement, in radii of the machine."""
 PLANE_VIEW_MARGIN = 30.0
 LABELS_MERGED_WITHIN = 9.0
-"""SVG units within which two labels are written as one."""
+"""Distance, in SVG units, below which two labels become one."""
 ELLIPSOID_RING_POINTS = 25
 """Points of an ellipsoid's ring."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint centre at home, base frame, m.
+    """Joint centre at home, base frame, m.
 
-    drawing, displaced : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
-    covariance. leg : from 1. arm : (2, k, 3) of a joint on the base, from where a motor holds its
-    arm to the joint, by the drawing and enlarged; of another the joint alone.
+    leg : from 1.
+    drawing, displaced : (3,) by the nominal model, and with the enlarged error.
+    spread : (3, 3) enlarged covariance.
+    arm : (2, k, 3) nominal and enlarged; points from where a motor holds the arm to a base joint;
+        a platform joint has only itself.
     """
 
     leg: int
@@ -55,10 +57,11 @@ class Joint:
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """All joint centres, base and platform in turn.
+    """All joint centres, of base, then of platform.
 
-    factor : enlarges the errors. spread_factor : enlarges the ellipses, which would often be
-    hidden by the marks if they were drawn as the errors are.
+    factor : enlargement of errors.
+    spread_factor : enlargement of ellipses, which would be hidden by the markers if it were that
+        of errors.
     """
 
     factor: float
@@ -66,13 +69,16 @@ class BeforeAfter:
     joints: tuple[Joint, ...]
 
     def of_side(self, side: str) -> tuple[Joint, ...]:
-        """The joints of base or platform, by leg."""
+        """Joints of base or platform, by leg."""
         return tuple(joint for joint in self.joints if joint.side == side)
 
 
 @dataclass(frozen=True)
 class JointMark:
-    """A joint in a plane view, SVG units. ellipse : rx, ry, angle in degrees."""
+    """Joint in a plane view, SVG units.
+
+    ellipse : half axes rx and ry, and angle in degrees.
+    """
 
     leg: int
     side: str
@@ -84,9 +90,11 @@ class JointMark:
 
 @dataclass(frozen=True)
 class Projection:
-    """The scene from one direction. limbs : by the drawing, each from its arm to the platform.
+    """Scene in one direction.
 
-    grid : (horizontal?, place, text). labels : (x, y, text).
+    limbs : of the nominal model, each from its arm to the platform.
+    grid : (horizontal?, position, text).
+    labels : (x, y, text).
     """
 
     title: str
@@ -105,7 +113,7 @@ def section(
     estimate: Estimate,
     centres: tuple[Centres, ...],
 ) -> Part:
-    """The section."""
+    """Section of the report."""
     drawn = scene_of(session, estimate, centres)
     return Part(
         "geometry",
@@ -128,10 +136,10 @@ def section(
 
 
 def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> BeforeAfter:
-    """Joint centres at home with their errors enlarged by a round factor."""
+    """Joint centres at home, errors enlarged by a round factor."""
     try:
         home = session.machine.home()
-    except PkmcalError:  # the drawing has none: the first pose that was seen
+    except PkmcalError:  # no home in the nominal model: use the first pose with data
         home = estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
     placed = {"base": np.eye(4), "platform": home}
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
@@ -161,7 +169,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
 
 
 def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
-    """From above, and from the side that parts the base joints best."""
+    """Views from above, and from the side in which the base joints are best separated."""
     base = np.array([joint.drawing for joint in scene.of_side("base")])
     gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
     across = int(np.argmax(gaps))
@@ -172,7 +180,7 @@ def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
 
 
 def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
-    """Project the scene on two axes, the second one upwards."""
+    """Projection of the scene onto two axes, the second one upwards."""
     pick = list(axes)
     drawn = np.array([joint.drawing[pick] for joint in scene.joints])
     visible = np.array([joint.displaced[pick] for joint in scene.joints])
@@ -194,7 +202,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         )
         for j, d, s in zip(scene.joints, drawn, visible, strict=True)
     )
-    half = len(marks) // 2  # base joints first, then the platform's
+    half = len(marks) // 2  # base joints come first, then the platform's
     return Projection(
         title=title,
         alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
@@ -213,7 +221,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
 
 
 def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
-    """Half axes (SVG units) and turn (degrees, y downwards) of ``ELLIPSE_SIGMAS`` sigma."""
+    """Half axes (SVG units) and angle (degrees, y downwards) of the ``ELLIPSE_SIGMAS`` ellipse."""
     values, vectors = np.linalg.eigh(spread)
     ry, rx = ELLIPSE_SIGMAS * scale * np.sqrt(np.maximum(values, 0))
     angle = -np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
@@ -223,7 +231,7 @@ def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
 def _grid(
     low: Array, high: Array, place: Callable[[Array], tuple[float, float]]
 ) -> tuple[tuple[bool, float, str], ...]:
-    """Lines every 100 mm (or a round multiple), with their coordinate."""
+    """Grid lines every 100 mm, or a multiple, with their coordinate."""
     step = 0.1 * max(1, round(float((high - low).max()) / 0.6))
     lines: list[tuple[bool, float, str]] = []
     for axis, level in ((0, False), (1, True)):
@@ -238,7 +246,10 @@ def _grid(
 def _labels(
     marks: tuple[JointMark, ...], centre: tuple[float, float]
 ) -> tuple[tuple[float, float, str], ...]:
-    """Leg numbers beside their marks, away from the middle; those that would meet share one."""
+    """Leg numbers beside their marks, away from the centre.
+
+    Numbers that would overlap share a label.
+    """
     placed: list[tuple[float, float, list[int]]] = []
     for mark in marks:
         dx, dy = mark.drawing[0] - centre[0], mark.drawing[1] - centre[1]
@@ -290,7 +301,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
 
 
 def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
-    """Three rings of every centre's ellipsoid, along its principal planes."""
+    """Three rings of each centre's ellipsoid, in its principal planes."""
     angle = np.linspace(0, 2 * np.pi, ELLIPSOID_RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     segments: list[Array] = []
@@ -304,7 +315,7 @@ def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
 
 
 def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:
-    """Markers of the drawing's centres with leg numbers and tooltips."""
+    """Markers of the nominal centres with leg numbers and tooltips."""
     joints = (*base, *platform)
     style = {
         "size": 5,

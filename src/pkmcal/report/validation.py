@@ -1,4 +1,4 @@
-"""What a validation found, as an outcome, and what is told of held-out configurations."""
+"""Validation as an outcome, and the report section on held-out configurations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ VALIDATION_METHOD_TEXT = (
 
 
 def outcome_of(v: Validation) -> Outcome:
-    """Everything that ``pkmcal validate`` tells and writes."""
+    """Outcome of ``pkmcal validate``."""
     prior = [n for n, flag in zip(v.session.configurations, v.calibrated, strict=True) if flag]
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
     sentences = (
@@ -61,7 +61,7 @@ def outcome_of(v: Validation) -> Outcome:
 
 
 def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
-    """The main numbers."""
+    """Main numbers."""
     session, again = v.session, int(v.repeated[judged.rows].sum())
     new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
@@ -101,7 +101,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
 
 
 def _readings(judged: BesideDrawing, session: Session) -> Part:
-    """New data: charts, the readings' residuals, [C] Table 3, and the tool point's errors."""
+    """Section on readings and tool: charts, residuals as in [C] Table 3, and tool point errors."""
     old, new = judged.figures(judged.drawing), judged.figures(judged.calibrated)
     test = judged.promise
     residuals = Table(
@@ -139,7 +139,7 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
 
 
 def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
-    """Regions held out, one a row."""
+    """Table of held-out regions."""
     unit = _unit(session)
 
     def text(value: float) -> str:
@@ -172,7 +172,7 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
 
 
 def paths_table(paths: tuple[LinePath, ...]) -> Table:
-    """Straight paths, [C] Table 4."""
+    """Table of straight paths, as in [C] Table 4."""
 
     def text(value: Straightness | None) -> str:
         return f"{_size(value.rms, 'm')} ({_size(value.largest, 'm')})" if value else "–"
@@ -191,7 +191,7 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
 
 
 def held_out_part(item: HoldOut, session: Session) -> Part:
-    """What a calibration's report says of configurations held out of it."""
+    """Report section on the configurations held out of a calibration."""
     out, used, unit = item.left_out, item.used, _unit(session)
     amounts = inside = ""
     if unit:
@@ -237,37 +237,38 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
 
 
 def _joints(session: Session) -> list[tuple[str, str]]:
-    """Name with unit for a table's row, and m or rad, of each reading."""
+    """Name with unit, and unit m or rad, of each reading."""
     names, units = session.document["joints"]["columns"], session.machine.joint_units
     return [(f"{n}, {DISPLAY_UNITS[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
 
 
 def _unit(session: Session) -> str | None:
-    """The unit of all readings, None where they differ."""
+    """Unit of all readings, None if they differ."""
     units = session.machine.joint_units
     return units[0] if len(set(units)) == 1 else None
 
 
 def _mean_rms(value: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
-    """A joint's mean with the digits of its root mean square, and that."""
+    """Mean and root mean square of a joint's residuals, with the same digits."""
     root = value.joint_rms[k]
     return _signed(value.joint_mean[k], root, unit), _size(root, unit)
 
 
 def _signed(value: float, sigma: float, unit: str) -> str:
-    """A number with the digits that ``sigma`` deserves."""
+    """Number with the digits that ``sigma`` justifies."""
     scale = DISPLAY_UNITS[unit][0]
     return number(value * scale, decimals(sigma * scale), signed=True)
 
 
 def _size(value: float, unit: str) -> str:
-    """A magnitude in the unit that people read, two significant digits."""
+    """Magnitude in the displayed unit, two significant digits."""
     return brief(value * DISPLAY_UNITS[unit][0])
 
 
 def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
-    """Residuals of the readings by configuration: bars of the calibrated machine, a line of the
-    drawing.
+    """Residuals of readings by configuration.
+
+    Bars for the calibrated machine, a line for the nominal model.
     """
     unit = _unit(session)
     if unit is None:
@@ -295,7 +296,7 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
 
 
 def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None:
-    """The calibrated machine's residuals in the standard deviations that are promised."""
+    """Residuals of the calibrated machine, in predicted standard deviations."""
     values = judged.calibrated.residuals / judged.promise.expected
     boxes = [
         charts.box(name, values[:, k], "σ", 1, k + 1)

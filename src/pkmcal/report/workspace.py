@@ -1,4 +1,4 @@
-"""The map of the tool's error in the report: slices through the workspace, and points in space."""
+"""Report section on the tool's error over the workspace: slices, and points in space."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from pkmcal.wording import brief, count, number
 SLICE_ROW_HEIGHT = 170
 """Height of a row of slices, px."""
 SLICES_MARGIN, SLICES_RIGHT_MARGIN, SLICES_TOP_MARGIN, SLICES_BOTTOM_MARGIN = 92, 74, 26, 40
-"""Margins round the slices, px, in which their names, the legend and the axes' numbers stand."""
+"""Margins around the slices, px, for names, legend and tick labels."""
 SLICE_GAP_SHARE = 0.045
-"""Between slices, as a part of the width."""
+"""Gap between slices, in widths of the plot."""
 POSE_NEAR_SLICE_SHARE = 0.2
-"""Of the poses' extent across a slice: how far from it a photographed pose is drawn in it."""
+"""Largest distance of a pose that is drawn in a slice, in extents of the poses across it."""
 THIN_EXTENT_SHARE = 0.2
-"""Part of the widest extent below which a coordinate's own tells nothing."""
+"""Least extent of a coordinate worth an axis, in extents of the widest."""
 LEAST_TURN_DRAWN = 1.0
-"""Degrees; what turns less is not drawn."""
+"""Least range of a rotation that is drawn, degrees."""
 SLICES_READING_TEXT = (
     "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
     " measured, near the slice. By the drawing: how sure the platform would be by the drawing's"
@@ -50,7 +50,7 @@ TOO_NARROW_TEXT = "The workspace has an extent along one axis at most, so there 
 
 
 def section(session: Session, estimate: Estimate, tool_map: ToolMap | str, links: Links) -> Part:
-    """The section; of a machine without a map the sentence that says why."""
+    """Section of the report; for a machine without a map the sentence on the reason."""
     name, title, menu = "workspace", "The tool over the workspace", "Workspace"
     if isinstance(tool_map, str):
         return Part(name, title, (tool_map,), menu=menu)
@@ -73,14 +73,14 @@ def section(session: Session, estimate: Estimate, tool_map: ToolMap | str, links
 
 
 def _narrow(tool_map: ToolMap) -> bool:
-    """Whether the region itself, and not the machine, leaves no plane to cut."""
+    """Whether the region, rather than the machine, leaves no plane for slices."""
     named = any(side is not None and side[0] == side[1] for side in tool_map.region.sides)
     wide = np.ptp(tool_map.evenly[1].T_base_platform[:, :3, 3], axis=0)
     return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
 def _quantities(tool_map: ToolMap) -> tuple[tuple[str, Array], ...]:
-    """What is shown of each pose, m, with its name."""
+    """Displayed quantities of each pose, m, with their names."""
     return (
         ("By the drawing, σ", tool_map.before.position),
         ("Drawing's error", tool_map.after.off_position),
@@ -89,7 +89,7 @@ def _quantities(tool_map: ToolMap) -> tuple[tuple[str, Array], ...]:
 
 
 def _headline(tool_map: ToolMap) -> str:
-    """The main figures in a sentence."""
+    """Main numbers in a sentence."""
     _, after = tool_map.evenly
     sigma, off = (x[np.isfinite(x)] * 1e3 for x in (after.position, after.off_position))
     text = (
@@ -106,7 +106,7 @@ def _headline(tool_map: ToolMap) -> str:
 
 
 def _table(tool_map: ToolMap) -> Table:
-    """Medians and largest over the evenly spread poses."""
+    """Table of the median and the largest error over the evenly spread poses."""
     before, after = tool_map.evenly
     rows: list[Row] = []
     turns = float(np.nanmax(before.orientation)) > NO_TURN
@@ -124,7 +124,7 @@ def _table(tool_map: ToolMap) -> Table:
 
 
 def middle_and_worst(values: Array) -> tuple[str, str]:
-    """Median and largest of what is known."""
+    """Median and largest of the finite values, as text."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "–", "–"
@@ -135,7 +135,10 @@ def middle_and_worst(values: Array) -> tuple[str, str]:
 
 
 def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Links) -> Plot | None:
-    """Every quantity in every slice, one under the other; a single slice's beside each other."""
+    """Plot of all quantities in all slices, one below the other.
+
+    Side by side for a single slice.
+    """
     if not tool_map.slices:
         return None
     quantities = _quantities(tool_map)
@@ -181,7 +184,7 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
 
 
 def _extent(tool_map: ToolMap) -> Array:
-    """Lowest and highest coordinate of all slices' poses, (3, 2) mm, and a little more."""
+    """Limits (3, 2) of all slices' coordinates, mm, with a margin."""
     places = tool_map.after.T_base_platform[tool_map.spread :, :3, 3] * 1e3
     low, high = places.min(axis=0), places.max(axis=0)
     more = 0.06 * float((high - low).max())
@@ -189,11 +192,12 @@ def _extent(tool_map: ToolMap) -> Array:
 
 
 def _title(cut: Slice) -> str:
+    """Coordinate of a slice's plane."""
     return f"{'xyz'[cut.normal]} = {number(cut.level * 1e3, 0)} mm"
 
 
 def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[str, Any]:
-    """A slice's cells, by the logarithm of values (n,), mm."""
+    """Heat map of a slice: logarithms of values (n,), mm."""
     visible = np.where(cut.rows >= 0, values[cut.rows], np.nan)
     with np.errstate(divide="ignore"):
         level = np.log10(visible)
@@ -214,7 +218,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
 
 
 def _significant(values: Array, digits: int) -> Array:
-    """Numbers with so many digits, as short as they can be written."""
+    """Numbers rounded to significant digits."""
     with np.errstate(divide="ignore", invalid="ignore"):
         places = digits - 1 - np.floor(np.log10(np.abs(values)))
     one = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
@@ -229,7 +233,7 @@ def _crosses(
     axes: dict[str, str],
     links: Links,
 ) -> dict[str, Any]:
-    """Measured poses near a slice, each of which leads to its photograph."""
+    """Markers of the measured poses near a slice, each linked to its image."""
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
     even = tool_map.evenly[1].T_base_platform[:, cut.normal, 3]
@@ -260,7 +264,12 @@ def _place_axes(
     shape: tuple[int, int],
     extent: Array,
 ) -> None:
-    """The axes of one panel in a table of panels; extent : (3, 2) mm."""
+    """Add the axes of one panel of a table of panels.
+
+    place : column and row.
+    shape : number of columns and rows.
+    extent : (3, 2) mm.
+    """
     (column, row), (across, down) = place, shape
     wide = (1 - SLICE_GAP_SHARE * (across - 1)) / across
     gap = SLICE_GAP_SHARE if down > 1 else 0.0
@@ -292,7 +301,7 @@ def _place_axes(
 
 
 def _label(text: str, panel: str, side: str) -> dict[str, Any]:
-    """A panel's name, above it or to its left."""
+    """Annotation with a panel's name, above or to the left."""
     at = {"xref": f"x{panel} domain", "yref": f"y{panel} domain", "showarrow": False}
     font = {"size": 12, "color": "--ink"}
     if side == "top":
@@ -307,7 +316,7 @@ def _label(text: str, panel: str, side: str) -> dict[str, Any]:
 
 
 def _colours(values: Array) -> dict[str, Any]:
-    """One scale for all values (n,), mm, by their logarithms."""
+    """Common colour axis for values (n,), mm, by their logarithms."""
     finite = values[np.isfinite(values) & (values > 0)]
     low, high = np.log10(np.quantile(finite, (0.01, 0.995)))
     high = max(high, low + 0.3)
@@ -333,9 +342,10 @@ def _colours(values: Array) -> dict[str, Any]:
 
 
 def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
-    """Which three of the six numbers of poses (n, 4, 4) to draw, and their names: where they are,
-    or, of a platform that hardly moves along some axes, how it turns instead. None where less than
-    three numbers change.
+    """Indices of three of the poses' six components (n, 4, 4) to plot, and their names.
+
+    The position, with rotations in place of coordinates in which the platform hardly moves; None
+    if fewer than three components change.
     """
     places = np.ptp(poses[:, :3, 3], axis=0)
     thin = places <= THIN_EXTENT_SHARE * places.max()
@@ -350,14 +360,15 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
 
 
 def _drawn(poses: Array, home: Array, which: Integers) -> Array:
-    """Numbers (n, 3) of poses that are drawn: turns from home in degrees, places in mm."""
+    """Plotted components (n, 3) of poses: rotations from home in degrees, positions in mm."""
     turns = np.rad2deg(pose_difference(poses, home)[:, :3])
     return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
 
 
 def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | None:
-    """The evenly spread poses, coloured by what is left, and the measured ones; None of a machine
-    that moves in a plane.
+    """Plot of the evenly spread poses, coloured by sigma, and of the measured poses.
+
+    None for a machine that moves in a plane.
     """
     _, after = tool_map.evenly
     poses = after.T_base_platform
