@@ -256,6 +256,7 @@ def _holders(
         if name not in numbers:
             numbers[name] = j, _side_bar(bodies, couplings, home, j, name)
         first, bar = numbers[name]
+        # a bar is one body, so its legs must have the same hinge
         hinges = np.stack([limbs.platform, limbs.hinge_axis], axis=1)
         if np.abs(hinges[j] - hinges[first]).max() > SAME_HINGE_DIFFERENCE:
             raise InputError(
@@ -356,6 +357,7 @@ def _carrier(
     body = made[column]
     first = home.motor_legs(column)[0]
     # a carriage has a direction, but no axis in space
+    # legs on one motor turn about the same line, or slide in the same direction
     off = cross(limbs.base[j] - limbs.base[first], axis) if turns else np.zeros(3)
     if max(np.abs(axis - limbs.axis[first]).max(), np.abs(off).max()) > SAME_HINGE_DIFFERENCE:
         raise InputError(
@@ -438,6 +440,7 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
     if home.limbs.drive[j] == TELESCOPE_ROD:
         now, _, high = home.values(column).tolist()
         reach = high + length - now if np.isfinite(high) else length
+    # names of the file's tubes; cylinders added for display have none
     tubes = _tubes(home, j, reach)
     names = [f"leg{j + 1}_tube{k + 1}" for k in range(len(home.leg(j).tubes))]
     names += [""] * (len(tubes) - len(names))
@@ -445,6 +448,7 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
         for (radius, start, stop), name in zip(tubes, names, strict=True):
             rod.shapes.append(RoundBar(start * u, min(stop, length) * u, radius, "rod", name))
         return rod, length * u
+    # a telescope: all tubes but the last are the rod, the last one is the piston
     for (radius, start, stop), name in zip(tubes[:-1], names[:-1], strict=True):
         rod.shapes.append(RoundBar(start * u, stop * u, radius, "rod", name))
     place = pose(np.eye(3), length * u)

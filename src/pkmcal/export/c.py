@@ -108,11 +108,13 @@ class CSource(Exporter):
         machine = source.machine
         poses, joints = samples(machine)
         hinges = inverse_result(machine.layout, machine.values, poses)[1]
+        # closure with the constants as they stand in the text
         off = closure_by_source(files[C_SOURCE_FILE], poses, joints, hinges)
         home, ranges = (numbers_of(files[C_SOURCE_FILE], name) for name in ("HOME", "RANGE"))
         same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
             ranges.reshape(-1, 2), _bounds(machine)
         )
+        # readings of the self-test by the machine's inverse kinematics
         pairs = numbers_of(files[C_SELFTEST_FILE], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
         transform[:, :3, :3], transform[:, :3, 3] = pairs[:, :9].reshape(-1, 3, 3), pairs[:, 9:]
@@ -155,7 +157,7 @@ def _bounds(machine: Machine) -> Array:
     return np.where(np.isfinite(machine.joint_ranges), machine.joint_ranges, silent)
 
 
-# What is written into the files
+# Texts of the files
 
 
 def filled(path: Path, about: Iterable[str], numbers: str) -> str:
@@ -217,6 +219,7 @@ def _rods(machine: Machine, rods: Limbs) -> str:
     C++ does not take designated initializers in C99's form, so the values have no names.
     """
     foot, swing, rate, floating = np.zeros((4, len(rods), 3))
+    # a bar's end: foot + cos(phi) swing + sin(phi) rate for a turning bar
     for k, held in enumerate(rods.held):
         bar, w = rods.bar[k], rods.hinge_axis[k]
         if held == TURN_CARRIER:
@@ -345,7 +348,7 @@ def c_comment(lines: Iterable[str]) -> str:
     return f"/*\n{body}\n */\n"
 
 
-# What is read from the files again
+# Reader of the files
 
 _CONSTANT = re.compile(r"static const \w+ (\w+)")
 _NUMBER = re.compile(r"-?INFINITY|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -406,6 +409,7 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
     lines: list[Array] = []
     out: list[Array] = []
     for rod in _records(text, "RODS", "rod_data"):
+        # rods: end on the base a, end on the platform b, |b - a| = length
         q = rod["scale"] * joints[:, rod["joint"], None]
         phi = hinges[:, rod["hinge"] - 1, None] if rod["hinge"] else np.zeros(1)
         a, longer = rod["base"], np.zeros(1)
@@ -422,6 +426,7 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
         b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod["floating"]
         lines.append(b - a)
         out.append(np.linalg.norm(b - a, axis=1) - rod["length"] - longer)
+    # axes: the rod is perpendicular to an axis, or to the normal of two
     axes = int(re.findall(r"#define AXES (\d+)", text)[0])
     for axis in _records(text, "AXIS", "axis_data")[:axes]:
         turned = (rot @ axis["platform"][:, None])[..., 0]

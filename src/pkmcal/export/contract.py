@@ -82,6 +82,7 @@ class Exporter(ABC):
 def exporters() -> dict[str, Exporter]:
     """All formats by name, in alphabetical order."""
     package = __name__.rpartition(".")[0]
+    # import every module of this folder, so that its subclasses exist
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
     made: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]

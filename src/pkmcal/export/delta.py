@@ -123,6 +123,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
 
     program, bed : as in :class:`Delta`.
     """
+    # a delta: three rods, each on a slide or crank of its own, platform without rotation
     limbs, motion = all_limbs(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
         joints = sorted({leg.base.joint for leg in machine.document.legs})
@@ -138,6 +139,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
             expected="range: [min, max] at every slider or crank",
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
         )
+    # motor position = rate * reading + zero, for the ideal machine
     linear = rods.drive[0] == SLIDE_CARRIER
     rate, zero = _towers(rods) if linear else _arms(rods, rods.scale * ranges.mean(axis=1))
     rate = rods.scale * rate
@@ -188,10 +190,12 @@ def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
 
     middle : (3,) rad. NaN where an arm does not swing in a radial vertical plane.
     """
+    # direction outwards from the centre, in the horizontal plane
     radial = (rods.base - rods.base.mean(axis=0)) * [1, 1, 0]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
     size = np.sqrt(dot(rods.arm, rods.arm))[:, None]
     c, s = np.cos(middle)[:, None], np.sin(middle)[:, None]
+    # arm and its derivative at mid-range, in the plane of radial direction and z
     at, ahead = (c * rods.arm + s * rods.rate) / size, (c * rods.rate - s * rods.arm) / size
     out, d_out = dot(at, radial), dot(ahead, radial)
     sign = np.sign(out * ahead[:, 2] - at[:, 2] * d_out)
@@ -219,9 +223,11 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
         here = begin + share * (grid - begin)
         fk = machine.forward_result(here, fk.T_base_platform)
     poses = fk.T_base_platform
+    # reachable poses, away from singularities, with the readings that were put in
     back = machine.inverse(poses)
     good = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
+    # speed of each carriage or elbow per speed of the tool
     ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
     good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
     if not good.any():
@@ -310,12 +316,14 @@ class Fit:
         near : (n, 3) degrees; of an arm's two solutions the nearest is taken.
         """
         angle = self.angle / DEGREES_A_RADIAN
+        # coordinates of the tool in each tower's vertical plane: along, across, up
         along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle) - self.radius
         across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
         square = self.rod**2 - across**2
         if self.kind == "linear":
             return points[:, 2:] + np.sqrt(np.maximum(square - along**2, 0.0))
         up = points[:, 2:] - self.height
+        # law of cosines for the angle between arm and line from shoulder to tool
         away = np.hypot(along, up)
         share = (away**2 + self.arm**2 - square) / (2 * self.arm * away)
         half = np.arccos(np.clip(share, -1.0, 1.0))
@@ -337,6 +345,7 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
     """
     from scipy.optimize import least_squares
 
+    # minimise the tool's error over the grid, from the ideal machine
     start = _start(delta, freedoms)
     packed = _Packed(start, freedoms)
     points = delta.positions
@@ -365,6 +374,7 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
     """Tool error (n, 3) mm, to first order, at positions that the firmware commands."""
+    # motor positions that the firmware commands for the tool's true positions
     points = MM_A_METRE * apply(fit.T_firmware_base, positions)
     own = fit.rate * readings + fit.zero
     wrong = (fit.motors(points, own) - own) / fit.rate
@@ -410,6 +420,7 @@ class _Packed:
 def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     """Start of the fit: the machine as an ideal delta, with the circle through the three hinges."""
     hinge = MM_A_METRE * delta.hinge
+    # circle through the hinges, and the order of the legs by their directions
     centre = _circle(hinge[:, :2])
     away = hinge[:, :2] - centre
     azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREES_A_RADIAN
@@ -417,6 +428,7 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     order = _order(azimuth, nominal)
     off = _wrapped(azimuth[order] - nominal)
     yaw = 0.0 if freedoms.angles else -float(off.mean())
+    # heights: of each hinge, common, or zero with the frame at the hinges
     height = hinge[order, 2]
     lift = _lift(delta)
     if freedoms.flat and delta.kind == "rotary":
@@ -424,8 +436,10 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     if not freedoms.heights or freedoms.flat:
         height = np.full(3, height.mean())
     height = np.zeros(3) if freedoms.flat else height + lift
+    # frame: origin at the circle's centre, turned to the nominal directions if these are fixed
     turn = rotation(np.array([0.0, 0.0, yaw / DEGREES_A_RADIAN]))
     shift = np.array([0.0, 0.0, lift]) - turn @ np.append(centre, 0.0)
+    # lengths: of each leg, or their mean
     each = (freedoms.rods, freedoms.arms)
     rod, arm = (
         v[order] if own else np.full(3, v.mean())
@@ -480,7 +494,7 @@ def _circle(points: Array) -> Array:
     return points[0] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
 
 
-# The words of the files
+# Texts of the files
 
 
 def firmware_length(value: float) -> str:
@@ -642,6 +656,7 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
     """
     delta = fit.delta
     points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
+    # readings at the commanded motor positions, and the tool there by the machine's kinematics
     readings = np.zeros_like(delta.readings)
     readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)

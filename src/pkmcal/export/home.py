@@ -113,6 +113,7 @@ def home_state(machine: Machine) -> HomeState:
     Raises GeometryError if it cannot be closed there.
     """
     layout, values = machine.layout, machine.values
+    # closest pose on the manifold of constant rods and axes, then readings, then closure by Newton
     near = on_manifold(layout, values, machine.home()).T_base_platform
     readings, internal = inverse_result(layout, values, near)
     reached = bool(np.isfinite(readings).all())

@@ -97,6 +97,7 @@ def all_limbs(machine: Machine) -> Limbs:
     # turns
     turns = np.array([kind == TURN_CARRIER for kind in shifted])[:, None]
     along = np.where(turns, dot(axis, arm)[:, None] * axis, arm)
+    # a platform end on the platform itself has no bar; its offset is part of the point
     barred = np.array([kind != FIXED_CARRIER for kind in held])[:, None]
     driven = np.where(layout.rod_reads, TELESCOPE_ROD, shifted)
     rods = np.where(layout.rod >= 0, layout.rod, 0)

@@ -123,6 +123,7 @@ def _joints(
     machine: Machine, columns: Integers, rate: Array, offset: Array, scale: Array
 ) -> Joints:
     """Joints that follow some columns of readings. Raises InputError if home is beyond a limit."""
+    # joints at home, and limits at the ends of the readings' ranges
     readings = machine.inverse(machine.home()[None])[0][columns]
     home = rate * readings + offset
     limits = np.sort(rate[:, None] * machine.joint_ranges[columns] + offset[:, None], axis=1)
@@ -278,7 +279,7 @@ class LinuxCnc(Exporter):
         return (note("export.linuxcnc_genhexkins"),)
 
 
-# Machines of no module of LinuxCNC's
+# Machines with a generated module
 
 
 def _module_joints(machine: Machine) -> Joints:
@@ -386,6 +387,7 @@ def genhexkins(hal: str, pose: Array) -> Array:
     pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in ("base", "platform")}
     for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
+    # R = Rz(C) Ry(B) Rx(A)
     angle = pose[:, 3:].T / DEGREES_A_RADIAN
     (sa, sb, sc), (ca, cb, cc) = np.sin(angle), np.cos(angle)
     rows = [

@@ -75,6 +75,7 @@ def _mjcf(source: MachineSource) -> str:
     SubElement(world, "light", pos=size, dir="0 0 -1", directional="true")
     _fill(world, tree.bodies[0], tree)
     equality = SubElement(root, "equality")
+    # couplings and loops are equality constraints
     for coupling in tree.couplings:
         comment(equality, coupling.comment)
         out = SubElement(equality, "joint", name=coupling.name, joint1=coupling.follower)

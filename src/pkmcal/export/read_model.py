@@ -159,6 +159,7 @@ class ReadModel:
         """
 
         def remainder(x: Array) -> Array:
+            """Residuals of the constraints and of the goal."""
             gaps = self.gaps(x)
             if goal is None:
                 return gaps
@@ -166,6 +167,7 @@ class ReadModel:
             off = pose_difference(self.places(x)["platform"], wanted)
             return np.concatenate([gaps, off], axis=-1)
 
+        # Gauss-Newton with difference quotients; the pseudoinverse tolerates redundant constraints
         steps = DIFFERENCE_QUOTIENT_STEP * np.eye(x.shape[-1])[~held]
         for _ in range(MOST_CLOSING_STEPS):
             value = remainder(x)

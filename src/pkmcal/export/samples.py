@@ -51,6 +51,7 @@ def samples(
         & (fk.singularity > LEAST_SAMPLE_SINGULARITY)
         & np.isfinite(joints).all(axis=-1)
     )
+    # readings that were put in come back unless inverse kinematics takes another branch
     if wanted is not None:
         good &= np.abs(joints - wanted).max(axis=-1) < SAME_ELBOW_DIFFERENCE
     if not good.any():

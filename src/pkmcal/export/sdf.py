@@ -108,12 +108,14 @@ def _chain(model: Element, body: TreeBody, tree: BodyTree) -> None:
     if body.parent is None:
         _joint(model, "base_fixed", ("world", body.name), "fixed")
         return
+    # a free body has no joint; loops hold it
     if body.free:
         return
     last = body.parent.name
     steps = list(_steps(body.joints))
     if not steps:
         _joint(model, f"{body.name}_fixed", (last, body.name), "fixed")
+    # all joints but the last lead to a massless link
     for k, joints in enumerate(steps):
         own = joints[0].name.removesuffix("_first")
         link = body.name if k == len(steps) - 1 else f"{own}_link"

@@ -76,9 +76,7 @@ class UrdfExporter(Exporter):
         return {name: _urdf(tree, source, loops), loops: _loops(tree, source)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Differences of the model that the text's links and joints and the file of
-        loops describe.
-        """
+        """Differences of the model that the text's links and joints and the loops describe."""
         tree, loops = files.values()
         return differences(read_urdf(tree, loops), source.machine)
 

@@ -46,6 +46,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
 
     for link in results:
         put(link)
+    # joints that follow others, and the state at home
     couplings: list[ReadCoupling] = []
     for node in root.findall("joint"):
         if (mimic := node.find("mimic")) is not None:
@@ -57,6 +58,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
         key[joints[name].dof] = value
     for c in couplings:
         key[c.follower] = c.ratio * key[c.leader] + c.offset
+    # named links: each leg's base, and the two ends of each loop
     legs = [loop["name"] for loop in beside["loops"]]
     ends = {f"{leg}_base": numbers[f"{leg}_rod"] for leg in legs}
     ends |= {name: numbers[name] for loop in beside["loops"] for name in loop["frames"]}

@@ -66,6 +66,7 @@ class Verdict:
         }
 
     def _texts(self, level: Level) -> tuple[str, ...]:
+        """Sentences of the findings with a level."""
         return tuple(one.text for one in self.findings if one.level is level)
 
 

@@ -235,9 +235,7 @@ def bar_chart(
     curve: tuple[tuple[float, float], ...] = (),
     note: str = "",
 ) -> BarChart | None:
-    """Bars on a scale that holds them, their expected intervals and the curve; None
-    without bars.
-    """
+    """Bars on a scale that holds them, their expected intervals and the curve; None for no bars."""
     if not bars:
         return None
     tops = [bar.value for bar in bars] + [v for _, v in curve]

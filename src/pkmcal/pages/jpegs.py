@@ -67,6 +67,7 @@ def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> l
     except InputError:
         return [""] * len(widths)
     out: dict[int, str] = {}
+    # from large to small, each scaled from the previous one
     for width in sorted(widths, reverse=True):
         image = narrowed(image, width)
         out[width] = base64.b64encode(coded(image, PAGE_JPEG_QUALITY)).decode("ascii")

@@ -169,6 +169,7 @@ def machine_laid_over(
     points = edge_points(machine, camera, legs, tubes, FINE_EDGE_CURVE_POINTS)
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
     edges: list[Drawn] = []
+    # each visible stretch is a polyline of its own
     for e, (curve, visible) in enumerate(zip(points.pixel[0], clear, strict=True)):
         leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
         parts = (straightened(curve[None, start:stop])[0] for start, stop in _runs(visible))
@@ -195,6 +196,7 @@ def measured_curves(
     photograph : (n,) index of each edge's image.
     fraction : (m,) positions along the edges' spans.
     """
+    # rays to the contour, moved from the axis to the measured side
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
     radius = machine.radii_of(edges.leg, edges.tube)
     at = photograph, edges.leg
@@ -243,6 +245,7 @@ def straightened(curves: Array) -> list[list[list[float]]]:
     curves = np.where(finite[..., None], curves, np.nan)
     first = curves[row, np.argmax(finite, axis=1)]
     last = curves[row, -1 - np.argmax(finite[:, ::-1], axis=1)]
+    # straight: no point is farther from the chord than the limit
     chord, off = last - first, curves - first[:, None]
     # twice the area with the chord: the distance from it, times its length
     area = np.abs(chord[:, :1] * off[..., 1] - chord[:, 1:] * off[..., 0])

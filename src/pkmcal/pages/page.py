@@ -75,6 +75,7 @@ def environment() -> jinja2.Environment:
         bytecode_cache=Compiled(),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        # control characters in any printed text become visible
         finalize=lambda value: (
             legible(value, keep="\n\t")
             if isinstance(value, str) and not isinstance(value, Markup)

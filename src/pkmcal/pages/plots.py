@@ -229,6 +229,7 @@ def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
     def camera(width: float, inside: float) -> dict[str, dict[str, float]]:
         # a corner at depth d in front of the eye is in view if it lies within slope * d of the
         # axis; on each axis the extreme corner of either side fixes the distance and the centre
+        """Plotly camera for an aspect ratio and the share of the plot that holds the data."""
         slope = inside * np.tan(PLOTLY_VIEW_ANGLE / 2) * np.array([width, 1.0])
         near, across = (corners @ direction)[:, None], corners @ axes / slope
         one, other = (near + across).max(axis=0), (near - across).max(axis=0)
@@ -256,6 +257,7 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
     right, bottom = camera.image_size[0] - 0.5, camera.image_size[1] - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
     at = np.arange(4 * FRUSTUM_POINTS_A_SIDE + 1) / FRUSTUM_POINTS_A_SIDE
+    # along each ray from the border to the centre take the first that the camera model has
     border = np.stack([np.interp(at, np.arange(5), corners[:, c]) for c in (0, 1)], axis=-1)
     centre = (border.max(axis=0) + border.min(axis=0)) / 2
     share = np.linspace(1, 0, 41)[:, None, None]

@@ -65,6 +65,7 @@ def printer(text: str, label: str) -> Printer:
             found=quoted(kinematics[0]),
             expected="kinematics: delta",
         )
+    # checked values: one radius, and rod, end switch and direction of each tower
     radius = _positive(result, label, "printer", "delta_radius")
     each = {
         name: [_of_tower(result, label, k, name, value) for k in range(3)]
@@ -85,6 +86,7 @@ def printer(text: str, label: str) -> Printer:
             },
         }
     )
+    # without the settings of its motors a printer has the usual carriage step
     stepped = {"rotation_distance", "microsteps"} <= result.get("stepper_a", {}).keys()
     with np.errstate(invalid="ignore"):
         ends = homed(config)
@@ -141,6 +143,7 @@ def sections(text: str, label: str) -> Sections:
     ]
     out: Sections = {}
     section = ""
+    # SAVE_CONFIG's lines first, so that the user's own override them
     for n, line in (*saved, *own):
         plain = re.split(r"(?:^|\s)[#;]", line)[0].rstrip()
         if head := _SECTION.fullmatch(plain.strip()):
@@ -235,6 +238,7 @@ def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
 
 def _step(config: Sections, label: str, section: str) -> float:
     """Carriage travel per motor step, mm."""
+    # the second and the third stepper default to the first
     own = {**config.get("stepper_a", {}), **config.get(section, {})}
     both = {section: own}
     turn = _positive(both, label, section, "rotation_distance")

@@ -44,6 +44,8 @@ def read_touches(path: Path, printer: Printer) -> Touches:
     label = path.name
     text = read_text(path)
     dx, dy, dz = printer.offset
+    # the format, and the tool's positions (n, 3) at contact with the tool's height above the bed
+    # there
     if text.startswith("configuration,"):
         points, heights = _table(path, label), 0.0
     elif text.startswith(HEIGHT_MAP_TITLE):
@@ -62,6 +64,7 @@ def read_touches(path: Path, printer: Printer) -> Touches:
             " 'bed probe heights:' with the lines G30 P0 X Y Z-99999, or a table"
             " configuration,x [mm],y [mm],z [mm]",
         )
+    # carriages at these positions, by the printer's own formulas
     with np.errstate(all="ignore"):
         carriages = printer.carriages(points)
     bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST_PRINTER_VALUE).all(axis=1))
@@ -97,6 +100,7 @@ def _map(text: str, label: str) -> Array:
     numbers = dict(zip(names, values, strict=False))
 
     def value(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
+        """Number of the map's grid, under the first of several names that the map has."""
         text = next((numbers[name] for name in called if name in numbers), "")
         try:
             value = float(text)
@@ -111,6 +115,7 @@ def _map(text: str, label: str) -> Array:
             )
         return value
 
+    # names of newer and older versions of RepRapFirmware
     x0, y0 = value("xmin", "min0"), value("ymin", "min1")
     dx = value("xspacing", "spacing0", "spacing", above=0.0)
     dy = value("yspacing", "spacing1", "spacing", above=0.0)

@@ -48,6 +48,7 @@ def printer(text: str, label: str) -> Printer:
                 found=f"{values.min():g}",
                 expected="a number above zero",
             )
+    # complete command: corrections and adjustments default to 0
     filled = dict(words)
     filled["665L"] = rod
     for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
@@ -82,6 +83,7 @@ def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
             value = read_words(line)
         except ValueError:
             value = {"": np.array([np.inf])}
+        # NaN and infinity fail this comparison as well
         if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in value.values()):
             raise InputError(
                 "a value of this line is no number that a printer can have",

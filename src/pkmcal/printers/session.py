@@ -244,7 +244,9 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
     edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     with np.errstate(invalid="ignore"):
+        # heights of the carriages at the bed's edge, towards the towers and away from them
         lowest = _lowest([printer.carriages(s * edge) for s in (-1.0, 1.0)], touches)
+    # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())
     legs = [
         PRINTER_LEG_TEXT.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))

@@ -179,6 +179,7 @@ def calibration_cards(
     session, observation = calibration.session, calibration.observation
     # the flatness exists for sessions of heights only
     estimate, flatness = calibration.estimate, calibration.findings.bed
+    # joint centres: standard deviation, and distance from the nominal model, mm
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(
@@ -313,6 +314,7 @@ def _data(
             f"{session.machine.redundancy} more than the machine has freedoms; nothing else was"
             " measured",
         )
+    # without images: poses and links
     if not taken:
         weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
         quiet, n = int(np.sum(weights < INLIER_WEIGHT)), len(weights)

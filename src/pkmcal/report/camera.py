@@ -251,6 +251,7 @@ def _field(c: CameraCalibration) -> Markup:
     columns, rows = FIELD_CELLS
     pixels, off = c.pixels[c.inliers], c.residuals[c.inliers]
     dx, dy = width / columns, height / rows
+    # cell of each corner, and number of corners in each cell
     column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
     row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
     flat = row * columns + column
@@ -261,6 +262,7 @@ def _field(c: CameraCalibration) -> Markup:
         for k, n in enumerate(counts.tolist())
         if n
     ]
+    # mean residual of cells with three or more corners, at the corners' mean
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)

@@ -62,6 +62,7 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Board
         ):
             if not item.success or not estimate.configurations[k]:
                 continue
+            # board in the camera's frame, by the estimate
             body = state.T_base_platform[k] if moves else np.eye(4)
             T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[ONLY_BOARD_MOUNT]
             points = apply(T_camera_board, size * views.board.points[item.ids])

@@ -181,7 +181,7 @@ def _row(d: MachineDifference, k: int) -> Row:
     )
 
 
-# ------------------------------------------------------------------ pictures
+# ------------------------------------------------------------------ plots
 
 
 def _joints(d: MachineDifference) -> Plot:

@@ -149,6 +149,7 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
     rows, photograph = np.unique(some.configuration, return_inverse=True)
+    # predicted edges with the estimated edge shift, from which measured ones are offset
     legs = legs_in_camera(
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
@@ -222,6 +223,7 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     side = size[0] / FIELD_CELLS_ACROSS
     inside = np.all((result.pixel > -0.5) & (result.pixel < np.array(size) - 0.5), axis=1)
     some = result.select(np.asarray(inside))
+    # cell of each offset
     at = np.floor((some.pixel + 0.5) / side).astype(int)
     # places of one edge in a cell are one measurement, corners are two
     steep = np.abs(some.direction).argmax(axis=1)

@@ -64,6 +64,7 @@ def plot(
     used = np.flatnonzero(estimate.configurations)
     if not len(used):
         return None
+    # poses of the slider, evenly chosen
     some = used[
         np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST_SLIDER_POSES)).astype(int))
     ]
@@ -89,7 +90,7 @@ def plot(
     )
 
 
-# ------------------------------------------------------------------ what moves
+# ------------------------------------------------------------------ moving traces
 
 
 def _frames(machine: Machine, limbs: PosedLimbs, names: list[str]) -> tuple[dict[str, Any], ...]:
@@ -142,6 +143,7 @@ def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
     length = np.linalg.norm(b - a, axis=-1)
     u = (b - a) / length[:, None]
     other = np.eye(3)[np.argmin(np.abs(u), axis=-1)]
+    # v and w span the cross-section
     v = np.cross(u, other)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
     w = np.cross(u, v)
@@ -170,7 +172,7 @@ def _faces(tubes: int) -> Integers:
     return (one + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
 
 
-# ------------------------------------------------------------------ what stands still
+# ------------------------------------------------------------------ static traces
 
 
 def _still(
@@ -240,7 +242,7 @@ def _poses(
     )
 
 
-# ------------------------------------------------------------------ how it is shown
+# ------------------------------------------------------------------ layout
 
 
 def _layout(

@@ -258,6 +258,7 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
     table, sigma = estimate.machine.parameters, np.sqrt(np.diag(estimate.covariance).clip(0))
     again = {name for group in table.tied for name in group[1:]}
     own = np.array([name not in again for name in table.names], dtype=bool)
+    # parameters with a standard deviation, the first of each tie
     free = np.flatnonzero((sigma > ROUNDING_SIGMA) & own)
     rho = estimate.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     whole = np.array([_whole_axis(table.names[k]) for k in free])

@@ -90,6 +90,7 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     shifts : (N,) px of the edges, for tooltips.
     """
     session, level = calibration.session, levels(calibration.observation, calibration.estimate)
+    # the first image of each configuration at each station
     every = [
         (s, photo)
         for s, station in enumerate(session.stations)
@@ -103,6 +104,7 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
         (images[s], session.stations[s].photographs.index(photo))
         for s, photo in ordered[:MOST_PAGE_IMAGES]
     ]
+    # JPEGs until the budget is spent; overlays for the images that have one
     shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
@@ -165,6 +167,7 @@ def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
     Unweighted: images with rejected edges are those that a reader has to see.
     """
     edges, poses = observation.edges, observation.poses
+    # mean square residual by station and configuration
     squares = np.concatenate(
         [np.sum(estimate.edge_residuals**2, axis=1), np.sum(estimate.pose_residuals**2, axis=1)]
     )
@@ -302,14 +305,13 @@ class _ImageOverlays:
                     self.missed[s, one.configuration].append(drawn)
 
     def _spots(self, centres: tuple[Centres, ...], s: int, configurations: Integers) -> None:
-        """Collect joint centres of the calibrated machine, and of the nominal one
-        aligned with it.
-        """
+        """Collect joint centres of the calibrated and of the aligned nominal machine."""
         session, state = self.calibration.session, self.calibration.estimate.state
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
         base, platform = (side.T_calibrated_drawing for side in centres)
         after = self.calibration.machine.ends_at(joints, pose)
+        # pose of the nominal machine in its own frames
         old_pose = inverse(base) @ pose @ platform
         before = session.machine.ends_at(joints, old_pose)
         visible = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))

@@ -50,6 +50,7 @@ def used_photographs(
         (observation.poses, estimate.pose_weights),
     ):
         pairs = np.stack([item.station, item.configuration], axis=1)
+        # inliers among the measurements of each station and configuration
         pairs, own = np.unique(pairs, axis=0, return_inverse=True)
         inliers = np.bincount(own.ravel(), weights >= INLIER_WEIGHT, len(pairs))
         most = 2 * inliers >= np.bincount(own.ravel(), minlength=len(pairs))

@@ -81,6 +81,7 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     )
     each = np.arange(len(edges))
     radius = machine.radii_of(edges.leg, edges.tube)
+    # measured minus predicted normal in the tangent basis of the measured one
     normal = edge_normal_jacobians(legs.a[each, j], legs.b[each, j], radius, edges.side).n
     error = -np.einsum("nij,ni->nj", edges.basis, normal)
     error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]

@@ -141,6 +141,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
         home = session.machine.home()
     except PkmcalError:  # no home in the nominal model: use the first pose with data
         home = estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
+    # errors are enlarged to a fixed share of the machine's radius
     placed = {"base": np.eye(4), "platform": home}
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
@@ -185,6 +186,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     drawn = np.array([joint.drawing[pick] for joint in scene.joints])
     visible = np.array([joint.displaced[pick] for joint in scene.joints])
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
+    # scale and limits, so that all points fit into the width of a chart
     corners = np.concatenate([drawn, visible, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = (CHART_WIDTH - 2 * PLANE_VIEW_MARGIN) / (high - low).max()
@@ -192,6 +194,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     left = (width - float((high - low)[0]) * scale) / 2
 
     def place(point: Array) -> tuple[float, float]:
+        """SVG coordinates of a point (2,), m."""
         x, y = (point - low) * scale
         return round(left + float(x), 1), round(height - PLANE_VIEW_MARGIN - float(y), 1)
 

@@ -143,6 +143,7 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
         return None
     quantities = _quantities(tool_map)
     single = len(tool_map.slices) == 1
+    # table of panels: a column for each slice and a row for each quantity, or one row
     across, down = (len(quantities), 1) if single else (len(tool_map.slices), len(quantities))
     extent = _extent(tool_map)
     data: list[dict[str, Any]] = []
@@ -347,6 +348,7 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     The position, with rotations in place of coordinates in which the platform hardly moves; None
     if fewer than three components change.
     """
+    # rotations replace coordinates of little extent, the largest first
     places = np.ptp(poses[:, :3, 3], axis=0)
     thin = places <= THIN_EXTENT_SHARE * places.max()
     turns = np.rad2deg(np.ptp(pose_difference(poses, poses[0])[:, :3], axis=0))

@@ -141,6 +141,7 @@ class Viewed:
         T_camera_base = inverse(saved.stations[number].T_base_camera)
         refined = saved.path.parent / written_camera(station.camera_file)
         camera = load_camera(refined) if refined.is_file() else station.camera
+        # breathing: the station's own focal length differs from the camera file's
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
         pose = saved.T_base_platform[row]
@@ -160,6 +161,7 @@ class Viewed:
                 next_step="Run pkmcal calibrate, or name its folder with --calibration",
             )
         saved = load(self.calibration)
+        # the same configurations with the same readings: otherwise poses belong to other images
         same = saved.configurations == self.session.configurations
         if not same or not np.allclose(saved.joints, self.session.joints):
             raise InputError(

@@ -69,6 +69,7 @@ def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
 
 def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any]) -> None:
     """Measure the legs' edges and add them to the answer."""
+    # measure the edges in a batch of this one image
     row = viewed.photograph(request.station, request.photograph).configuration
     taken = Photographs(
         request.station,
@@ -82,6 +83,7 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
     take = legs.measure if request.shown == "calibration" else legs.search
     in_view = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
     judged, reasons = _judged(viewed, request)
+    # measured edges, with weights and residuals of the calibration
     curves, away = _off(pane, in_view.edges)
     for n, points in enumerate(straightened(curves)):
         place = (int(in_view.edges.leg[n]), int(in_view.edges.tube[n]), int(in_view.edges.side[n]))
@@ -96,6 +98,7 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
         drawn = polyline(place[0], points, quiet, tip)
         if drawn:
             out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
+    # predicted edges that were not measured
     missed = _missed(pane, in_view.edges, in_view.rejected, reasons)
     out["missed"] = missed
     out["median"] = float(np.median(np.abs(away))) if len(away) else None
@@ -139,6 +142,7 @@ def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
     machine, one = pane.machine, np.zeros(len(edges), dtype=int)
     pose, joints = pane.T_base_platform[None], pane.joints[None]
     axes = legs_in_camera(machine, pane.T_camera_base, pose, joints)
+    # curves of the measured edges and of the machine's own, over the same spans
     measured, drawn = (
         measured_curves(machine, pane.camera, axes, one, part)
         for part in (edges, own_edges(machine, axes, one, edges))
@@ -199,6 +203,7 @@ def _words(
     tolerance = pane.machine.document.tolerance.center
     gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
+    # expected offset: prior sigma of a centre, projected, and resolution of the search
     near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     # some background edges lie near by chance, but not most of the machine's
     verdict = (

@@ -92,7 +92,13 @@ def pinned(
     count = 4 if len(pins) == 2 else 6
     spread = HAND_POSE_SPREAD[:count]
 
+    # two joints fix aim, roll and distance exactly; more are fitted together with the prior
     def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        """Residuals as a function of x in prior sigmas.
+
+        The prior takes part from three joints on.
+        """
+
         def rows(x: Array) -> Array:
             visible = camera.project(apply(shifted(x * spread), pins))
             off = (
@@ -119,9 +125,11 @@ def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:
     """
     middle = apply(T_camera_base, points.mean(axis=0))
     sight = middle / np.linalg.norm(middle)
+    # two axes across the line of sight
     across = np.linalg.svd(sight[None])[2][1:]
 
     def shifted(x: Array) -> Array:
+        """Pose at x, (4,) or (6,)."""
         turn = x[4:] @ across if len(x) > 4 else np.zeros(3)
         near = pose(np.eye(3), (np.exp(x[3]) - 1) * middle)
         return _about_camera(x[:3]) @ near @ _about(turn, middle) @ T_camera_base

@@ -74,6 +74,7 @@ def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
+    # pins first, then the gesture
     if request.pins:
         pins = np.stack([_joint(viewed, request, k) for k in range(len(request.pins))])
         pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
