@@ -336,7 +336,7 @@ def _words(home: HomeState, j: int) -> str:
     if "torsion" in value:
         out += " Its universal joints keep it from twisting."
     if any("platform" in kind for kind in value):
-        out += " It may turn about its own line; its equations say nothing of that."
+        out += " It may turn about its own line; its equations do not restrict that."
     return out
 
 

@@ -212,7 +212,7 @@ def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
     if not np.isfinite(endstops).all() or fit.radius <= 0:
         out = fit.radius + fit.arm * np.cos(fit.end_motors / DEGREES_A_RADIAN)
         raise InputError(
-            "Klipper tells an arm's end switch by a height in the middle, and none belongs to it",
+            "Klipper gives an arm's end switch by a height in the middle, and none belongs to it",
             found=f"an arm that reaches {out.max():.1f} mm out, a rod of {fit.rod.min():.1f} mm",
             next_step="Give the cranks a smaller range in the mechanism file",
         )

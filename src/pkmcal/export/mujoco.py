@@ -33,7 +33,7 @@ CONVENTIONS = (
     "Units: m, rad, kg, s. MuJoCo's world is the machine's base frame; the body 'platform' has the"
     " platform frame, so its xpos and xmat are T_base_platform.",
     "Actuators leg1, leg2, … (motor1, … where a motor moves several rods) have the machine's"
-    " readings as their values, and sensors of these names tell them: set data.ctrl to readings."
+    " readings as their values, and sensors of these names measure them: set data.ctrl to readings."
     " Joints of these names have scale * reading: a rod's length is that + offset, a crank's angle"
     " that + angle. An actuator's gear is 1 / scale; without one the scale is 1.",
     "The keyframe 'home' is closed by pkmcal's kinematics, and is the model as drawn (qpos0)."

@@ -265,7 +265,7 @@ def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[f
         values = list[float]()
     if len(values) != 3 or not all(abs(x) <= MOST_CARRIAGE_STEPS for x in values):
         raise InputError(
-            f"{name} does not tell where the three motors were",
+            f"{name} does not give the three motors' positions",
             where=where,
             found=quoted(text),
             expected="three numbers, as SAVE_CONFIG wrote them",

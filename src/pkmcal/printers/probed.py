@@ -108,7 +108,7 @@ def _map(text: str, label: str) -> Array:
             value = np.nan
         if not above < value <= LARGEST_PRINTER_VALUE:
             raise InputError(
-                "the height map does not tell its grid",
+                "the height map does not define its grid",
                 where=f"{label}, line 3",
                 found=", ".join(values) or "nothing",
                 expected=f"a number{'' if above else ' above zero'} under {called[0]}",

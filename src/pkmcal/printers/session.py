@@ -42,7 +42,7 @@ home: {{position: [0, 0, {home} mm]}}
 workspace_radius: {reach} mm
 # Standard deviations of the firmware's values: of radius and towers (a radius that was measured
 # from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured
-# to 0.1 mm, hole to hole, tell the more of sizes along x and y.
+# to 0.1 mm, hole to hole, determine sizes along x and y better.
 tolerance: {{center: 2 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
 """
 PRINTER_LEG_TEXT = """\
@@ -80,8 +80,8 @@ joints:
 
 """
 WHERE_CARRIAGES_STAND = {
-    "Klipper": "what Klipper's\n#                          GET_POSITION tells behind stepper:",
-    "RepRapFirmware": "what M114\n#                          tells behind Count, divided by M92",
+    "Klipper": "what Klipper's\n#                          GET_POSITION prints behind stepper:",
+    "RepRapFirmware": "what M114\n#                          prints behind Count, divided by M92",
 }
 FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that go as far as it says.
@@ -104,12 +104,12 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY tells it. A bed that is not flat
-      # to that counts as well: what is found is told.
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY prints it. A bed that is not flat
+      # to that counts as well, and is reported.
       noise: {{position: 0.02 mm}}
       level: true             # the firmware's Z is counted from the bed
 
-# Heights do not tell how large a part comes out. Distances between marks that the tool made do: the
+# Heights do not determine how large a part comes out. Distances between marks of the tool do: the
 # carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
 # distances:
 #   file: distances.csv
@@ -183,11 +183,11 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
     """
     if touches is None:
         raise InputError(
-            "nothing tells where the bed is",
+            "no point of the bed is known",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
             " DELTA_CALIBRATE and SAVE_CONFIG write",
-            next_step="Name what the printer's console said while it probed with --probed FILE; or"
+            next_step="Name the printer's console output of a probing with --probed FILE; or"
             " --board, for a session with a camera",
         )
     if len(touches.heights) < FEWEST_BED_POINTS:

@@ -59,7 +59,7 @@ def surface_plot(session: Session, surface: BedSurface) -> Plot:
         "surface",
         "How uneven the bed is",
         "Heights of the points that were probed above their mean, as smooth as the data show them"
-        " to be. What the machine bends as well is not told apart from the bed; that is in the"
+        " to be. A bending of the machine is not distinguished from the bed's; that is in the"
         " standard deviations. Point at a mark for its number.",
         "A map of the bed, coloured by height.",
         {"data": [trace], "layout": layout, "config": {}},

@@ -327,7 +327,7 @@ def _data(
         )
     used = sum(provenance.used_photographs(session, observation, estimate))
     coarse = int(observation.edges.coarse.sum())
-    beside = f" and {coarse} told by silhouettes" if coarse else ""
+    beside = f" and {coarse} from silhouettes" if coarse else ""
     parts = [
         f"{count(n, thing)} measured{more}, {int(np.sum(weights < INLIER_WEIGHT))} of"
         " them given less than half their weight"
@@ -364,7 +364,7 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
         return Figure(
             "Does the model explain the data?",
             (("–", "χ² per degree of freedom"),),
-            "as many unknowns as measurements: nothing is left over that could tell",
+            "as many unknowns as measurements: nothing is left over for a test",
         )
     value = s.chi2 / s.dof
     return Figure(

@@ -38,11 +38,11 @@ CAMERA_MODELS_TEXT = (
     " parameters among equals."
 )
 CAMERA_SIGMA_TEXT = (
-    "The standard deviations say how much the intrinsics would scatter if other photographs of this"
-    " kind were taken. They hold the noise of the corners and the views' disagreement beyond it."
-    " They know nothing of what all photographs share: a board whose squares are not as long as its"
-    " file says leaves the intrinsics alone and scales every distance; a focus that moves"
-    " afterwards makes it another camera."
+    "The standard deviations are those with which the intrinsics would scatter if other"
+    " photographs of this kind were taken. They hold the noise of the corners and the views'"
+    " disagreement beyond it. They do not contain what all photographs share: a board whose"
+    " squares are not as long as its file says leaves the intrinsics alone and scales every"
+    " distance; a focus that moves afterwards makes it another camera."
 )
 
 
@@ -60,7 +60,7 @@ def outcome_of(
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
     factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
-    hardly = f"Hardly told apart, and so to be used together only: {together}."
+    hardly = f"Hardly distinguished, and so to be used together only: {together}."
     # with its covariance, which is the prior of `calibrate --refine-camera`
     measured = replace(c.camera, covariance=c.covariance)
     return Outcome(
@@ -186,15 +186,15 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
-            f"{count(finite, 'corner')}, {finite - int(c.inliers.sum())} of them put aside",
+            f"{count(finite, 'corner')}, {finite - int(c.inliers.sum())} of them rejected",
         ),
         Figure(
             "How different are the views?",
             ((f"{tilt.min():.0f} to {tilt.max():.0f}", "°"),),
-            "tilt of the board from facing the camera; 20 to 45° to all sides tell most",
+            "tilt of the board from facing the camera; 20 to 45° to all sides are best",
         ),
         Figure(
-            "How much of the picture was tested?",
+            "How much of the image was tested?",
             ((f"{covered:.0f}", "%"),),
             f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners;"
             " elsewhere the lens is extrapolated",
@@ -225,9 +225,7 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
         dx, dy = (off * factor).tolist()
         corners.append(Arrow(x, y, dx, dy, not c.inliers[v, i], tip))
     n_rejected = sum(corner.quiet for corner in corners)
-    caption = f"{count(len(finite), 'corner')}" + (
-        f", {n_rejected} put aside" if n_rejected else ""
-    )
+    caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     caption += "" if jpeg else "; the photograph is not at hand"
     width, height = c.camera.image_size

@@ -42,7 +42,7 @@ def outcome_of(d: MachineDifference) -> Outcome:
         kicker=f"{d.a.name} → {d.b.name}",
         subject=f"A: {d.a.name}, a {d.a.kind}; B: {d.b.name}, a {d.b.kind}",
         verdict=d.verdict,
-        stamp="Changed" if d.changed else "Cannot be told" if refused else "No change",
+        stamp="Changed" if d.changed else "Undecided" if refused else "No change",
         level=Level.WRONG if d.changed else Level.DOUBTFUL,
         figures=_cards(d),
         parts=parts,

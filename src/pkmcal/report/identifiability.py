@@ -31,7 +31,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
         tied=tied(table),
         spectrum=spectrum(findings),
     )
-    return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
+    return Part("identifiability", "What the data determine", html=html, menu="Identifiability")
 
 
 def directions_headline(findings: Findings) -> str:
@@ -70,7 +70,7 @@ def spectrum(findings: Findings) -> BarChart | None:
         )
         for k, (value, height) in enumerate(zip(values, heights, strict=True))
         for reference_values in [
-            "the data say nothing"
+            "the data do not determine it"
             if k >= findings.identifiability.rank
             else f"the drawing knows it {brief(1 / value)} times better"
             if value < 1

@@ -46,9 +46,9 @@ MOST_CORRELATIONS = 250
 """Most parameters in the plot of correlations; with more a cell would be below three pixels."""
 RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
 HOW_TOGETHER = (
-    "Orange: when one is larger than told, so is the other; blue: the other is smaller. Only their"
-    " sum, or difference, is as sure as the small deviations of other values suggest. In the"
-    " frames that the parameters are told in; what a frame or the file holds is left out, and of"
+    "Orange: when one is larger than stated, so is the other; blue: the other is smaller. Only"
+    " their sum, or difference, is as sure as the small deviations of other values suggest. In the"
+    " frames that the parameters refer to; what a frame or the file holds is left out, and of"
     " values that are tied one stands for all."
 )
 LATEX_SIGNS = {

@@ -345,7 +345,7 @@ def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
 
 def _rejected_words(n: int) -> str:
     """Number of rejected edges as the rest of a sentence."""
-    return f", {n} of them put aside" if n else ""
+    return f", {n} of them rejected" if n else ""
 
 
 def _size(corners: BoardCorners) -> str:

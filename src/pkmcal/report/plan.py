@@ -49,7 +49,7 @@ PLAN_METHOD_TEXT = (
     " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. Two"
     " of a place differ by a tenth of some motor's range at least: a photograph taken twice errs by"
     " the same. They are within the joints' ranges, in home's assembly, away from singular poses,"
-    " with legs clear of each other; what lies outside the picture or behind a leg tells nothing.",
+    " with legs clear of each other; what lies outside the image or behind a leg adds nothing.",
 )
 
 
@@ -75,7 +75,7 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
         subject=_purpose(plan),
         verdict=Verdict(
             usable=True,
-            headline=f"These {count(len(plan.names), 'configuration')} will tell the tool's"
+            headline=f"These {count(len(plan.names), 'configuration')} will determine the tool's"
             f" {_accuracy_cells(plan.promised)}, standard deviations, mean over the workspace.",
             findings=(_paying(plan), *_carefully(plan)),
         ),
@@ -92,8 +92,8 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
             Figure(
                 "How much better than by chance?",
                 ((number(gain, 1), "×"),),
-                "configurations spread evenly over the joints' ranges, as many, would tell it to"
-                f" {amount(plan.by_chance.position, 'm')}",
+                "as many configurations spread evenly over the joints' ranges would determine it"
+                f" to {amount(plan.by_chance.position, 'm')}",
             ),
             Figure(
                 "How long is the way?",
@@ -238,7 +238,7 @@ def _curve(plan: MeasurementPlan) -> Part:
         for a in few
     ]
     table = Table(
-        "What so many from each place tell",
+        "Accuracy by the number from each place",
         ("Configurations", "position", *(["orientation"] if turns else [])),
         tuple(rows),
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"

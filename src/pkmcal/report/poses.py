@@ -21,7 +21,7 @@ from pkmcal.wording import brief, count, decimals, number
 MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
-    "Bars by configuration: a jump that stays says that something was moved, a single tall bar"
+    "Bars by configuration: a jump that stays means that something was moved, a single tall bar"
     " that this one photograph, or its readings, are wrong."
 )
 
@@ -66,7 +66,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
     """Sentences on number, errors and noise of the poses."""
     inliers = estimate.pose_weights >= INLIER_WEIGHT
     s = estimate.statistics
-    n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} put aside"
+    n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} rejected"
     in_view = count(len(np.unique(poses.configuration)), "configuration")
     sizes = [_length(error[inliers, 3:]) * 1e3, float(np.rad2deg(_length(error[inliers, :3])))]
     sizes_text = [
@@ -104,7 +104,7 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
         ("Target", "Frame", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"),
         tuple(rows),
         "Place and rotation vector of the target's own axes in the body's frame, ± σ. Open: these"
-        " measurements do not tell it, and nothing that they predict depends on it.",
+        " measurements do not determine it, and nothing that they predict depends on it.",
         brief=False,
         words=(1,),
     )
@@ -198,7 +198,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
             brief(_length(error[k : k + 1, 3:]) * 1e3),
             brief(turn),
             number(float(level[k]), 1),
-            "put aside" if estimate.pose_weights[k] < INLIER_WEIGHT else "used",
+            "rejected" if estimate.pose_weights[k] < INLIER_WEIGHT else "used",
         )
         rows.append(Row(session.station_names[poses.station[k]], cells))
     columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")

@@ -24,11 +24,11 @@ from pkmcal.session.load import Session
 from pkmcal.wording import amount, brief, count, decimals, number
 
 SIGMA_MEANING_TEXT = Markup(
-    "<strong>What σ means here.</strong> The standard deviations say how much the result would"
-    " scatter if the same measurements were taken again. They contain the noise of the measurement,"
-    " and of what the model leaves out (legs that bend, joints with play, a lens that its file does"
-    " not describe, an uneven bed) what these data show. Measurements that the calibration has not"
-    " used are the test for the rest."
+    "<strong>What σ means here.</strong> The standard deviations are those with which the result"
+    " would scatter if the same measurements were taken again. They contain the noise of the"
+    " measurement, and of what the model leaves out (legs that bend, joints with play, a lens that"
+    " its file does not describe, an uneven bed) what these data show. Measurements that the"
+    " calibration has not used are the test for the rest."
 )
 NORMAL_FROM_FREEDOMS = 50
 """Degrees of freedom above which a Student distribution is reported as normal."""

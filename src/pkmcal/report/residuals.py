@@ -263,7 +263,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
         )
     if scatter := estimate.statistics.look_scatter:
         out.append(
-            "Which border is a leg's depends on where it is looked for: from machines as likely as"
+            "Which border is a leg's depends on where it is searched: from machines as likely as"
             f" this one, results scatter by {number(scatter, 1)} of the deviations that noise gives"
             " them, and these contain it."
         )
@@ -285,7 +285,7 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     results = sorted(results, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
-        "middle one: look at its pictures first."
+        "middle one: check its photographs first."
         for g in results
     ]
 

@@ -19,11 +19,11 @@ VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
     " platform are estimated from the photographs; a configuration's own readings have no part in"
     " its pose, and where photographs leave open where a camera or a board is, the readings of the"
-    " other configurations tell. The readings are then predictions. The drawing is judged in the"
+    " other configurations decide. The readings are then predictions. The drawing is judged in the"
     " same way, frames laid over each other, on the poses that suit it best.",
     "The uncertainty of “times better” is from drawing the configurations again at random"
-    " (bootstrap). Directions count by how well the photographs see them: one photograph tells"
-    " depth poorly, and there any two machines look alike.",
+    " (bootstrap). Directions count by how well the photographs see them: one photograph"
+    " determines depth poorly, and there any two machines look the same.",
     "The promise holds the calibration's covariance and the noise of these photographs and"
     " readings. It is broken where chance explains the residuals less than once in a thousand times"
     " even if all deviations were half as large again.",

@@ -22,17 +22,17 @@ WATCH_METHOD_TEXT = (
     " poses, stations, edge shifts and shading cannot take it up. Each leg is then tested for a"
     " change of its numbers: a score test, chi-square of as many degrees of freedom as these data"
     " see.",
-    "A camera's place costs six freedoms, unless it is said to have been left in place: what moves"
-    " all of the machine against its camera is not seen then. Directions in which"
-    " a change by the drawing's whole tolerance would make less than one standard deviation are"
+    "A camera's place costs six freedoms, unless it is stated to have been left in place: what"
+    " moves all of the machine against its camera is not seen then. Directions in which a"
+    " change by the drawing's whole tolerance would make less than one standard deviation are"
     " left out.",
 )
 
 
 FIXED_STATION_TEXT = (
-    "Where the calibration had a camera is known as well as its covariance with the machine tells,"
-    " most of which the photographs of both share. Whether such a camera was moved is tested as"
-    " well; a base that moved against its camera looks the same."
+    "A camera's place in the calibration is used with its covariance, most of which it shares with"
+    " the machine. Whether such a camera was moved is tested as well; a base that moved against its"
+    " camera looks the same."
 )
 
 
@@ -69,7 +69,7 @@ def _how(w: Watch) -> Part:
     poses = w.session.board or w.session.trackers
     allowed = (
         "Several tests are made, so each chance is adjusted: noise is drawn 20 000 times through"
-        " the same tests, and the share in which any of them comes out as small is told. So"
+        " the same tests, and the share in which any of them comes out as small is given. So"
         f" {w.judged.alpha:g} of machines that did not change are flagged. The noise is"
         f" {w.noise_scale:.2f} times the stated one of edges"
         + (f" and {w.pose_scale:.2f} times that of poses" if poses else "")
@@ -87,7 +87,7 @@ def stamp(w: Watch) -> str:
     if w.verdict.usable:
         return "Still as calibrated"
     parts = {f.suspect.cause.part for f in w.judged.findings}
-    return "Changed" if w.judged.changed and parts != {"camera"} else "Cannot be told"
+    return "Changed" if w.judged.changed and parts != {"camera"} else "Undecided"
 
 
 def _cards(w: Watch) -> tuple[Figure, ...]:

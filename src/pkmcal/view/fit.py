@@ -78,7 +78,7 @@ def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]
     else:
         text = (
             f"Not recognised in {shots} about this pose. Bring two or three joints to their places"
-            " and try again, or look whether drawing, readings and photographs belong together."
+            " and try again, or check whether drawing, readings and photographs belong together."
         )
     return pose.T_camera_base, pose.good, text
 
