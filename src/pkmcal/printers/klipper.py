@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from configparser import ConfigParser
 from functools import partial
 from itertools import count, takewhile
@@ -56,8 +55,8 @@ def printer(text: str, label: str) -> Printer:
     saved block that Klipper would ignore.
     """
     _check_saved(text, label)
-    result = sections(text, label)
-    kinematics = result["printer"].get("kinematics", ("", f"{label}, [printer]"))
+    entries = sections(text, label)
+    kinematics = entries["printer"].get("kinematics", ("", f"{label}, [printer]"))
     if kinematics[0] != "delta":
         raise InputError(
             "heights of a bed are read of linear deltas",
@@ -65,14 +64,18 @@ def printer(text: str, label: str) -> Printer:
             found=quoted(kinematics[0]),
             expected="kinematics: delta",
         )
-    # checked values: one radius, and rod, end switch and direction of each tower
-    radius = _positive(result, label, "printer", "delta_radius")
-    each = {
-        name: [_of_tower(result, label, k, name, value) for k in range(3)]
+    # checked values: one radius, and rod, end switch and direction of each tower; rods and end
+    # switches of the second and the third tower default to the first's
+    radius = _positive(entries, label, "printer", "delta_radius")
+    by_tower = {
+        name: [
+            value(entries, label, f"stepper_{s}", name, value(entries, label, "stepper_a", name))
+            for s in KLIPPER_STEPPERS
+        ]
         for name, value in (("arm_length", _positive), ("position_endstop", _number))
     }
-    each["angle"] = [
-        _number(result, label, f"stepper_{s}", "angle", default)
+    by_tower["angle"] = [
+        _number(entries, label, f"stepper_{s}", "angle", default)
         for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
     ]
     # the export's formulas read a ConfigParser; values are text there
@@ -81,29 +84,29 @@ def printer(text: str, label: str) -> Printer:
         {
             "printer": {"kinematics": "delta", "delta_radius": repr(radius)},
             **{
-                f"stepper_{s}": {name: repr(values[k]) for name, values in each.items()}
+                f"stepper_{s}": {name: repr(values[k]) for name, values in by_tower.items()}
                 for k, s in enumerate(KLIPPER_STEPPERS)
             },
         }
     )
     # without the settings of its motors a printer has the usual carriage step
-    stepped = {"rotation_distance", "microsteps"} <= result.get("stepper_a", {}).keys()
+    steps_stated = {"rotation_distance", "microsteps"} <= entries.get("stepper_a", {}).keys()
     with np.errstate(invalid="ignore"):
-        ends = homed(config)
+        homed_heights = homed(config)
     return Printer(
         program="Klipper",
         label=label,
         motors=("stepper_a", "stepper_b", "stepper_c"),
         radius=radius,
-        angle=np.array(each["angle"]),
-        rod=np.array(each["arm_length"]),
-        homed=ends,
-        reach=_positive(result, label, "printer", "print_radius", radius),
+        angle=np.array(by_tower["angle"]),
+        rod=np.array(by_tower["arm_length"]),
+        homed=homed_heights,
+        reach=_positive(entries, label, "printer", "print_radius", radius),
         carriages=partial(klipper_carriage_heights, config),
-        offset=_probe(result, label),
-        touches=_touches(result, label, ends),
-        step=max(_step(result, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
-        if stepped
+        offset=_probe_offset(entries, label),
+        touches=_touches(entries, label, homed_heights),
+        step=max(_mm_a_step(entries, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
+        if steps_stated
         else CARRIAGE_STEP,
     )
 
@@ -154,14 +157,6 @@ def sections(text: str, label: str) -> Sections:
     return out
 
 
-def _of_tower(
-    config: Sections, label: str, k: int, name: str, value: Callable[..., float]
-) -> float:
-    """Value of a tower; the default for the second and the third tower is the first tower's."""
-    first = value(config, label, "stepper_a", name)
-    return value(config, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
-
-
 def _number(
     config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
@@ -209,7 +204,7 @@ def _positive(
     return value
 
 
-def _probe(config: Sections, label: str) -> tuple[float, float, float]:
+def _probe_offset(config: Sections, label: str) -> tuple[float, float, float]:
     """Offset (x, y, z) of the probe from the nozzle, mm; zeros without a probe."""
     for section, entries in config.items():
         if "z_offset" in entries:
@@ -229,14 +224,14 @@ def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
     ]
     if not names:
         return None
-    direction = np.array([_step(config, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
+    mm_a_step = np.array([_mm_a_step(config, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
     heights = [_number(config, label, section, name) for name in names]
-    steps = [_three(entries, label, f"{name}_pos") for name in names]
+    steps = [_motor_steps(entries, label, f"{name}_pos") for name in names]
     origin = f"{label}, [{section}]"
-    return Touches(ends - np.array(steps) * direction, np.array(heights), origin)
+    return Touches(ends - np.array(steps) * mm_a_step, np.array(heights), origin)
 
 
-def _step(config: Sections, label: str, section: str) -> float:
+def _mm_a_step(config: Sections, label: str, section: str) -> float:
     """Carriage travel per motor step, mm."""
     # the second and the third stepper default to the first
     own = {**config.get("stepper_a", {}), **config.get(section, {})}
@@ -256,7 +251,7 @@ def _step(config: Sections, label: str, section: str) -> float:
     return turn / (full * micro * prod(a / b for a, b in pairs))
 
 
-def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
+def _motor_steps(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
     """Three comma-separated motor positions, in steps. Raises InputError for anything else."""
     text, where = entries.get(name, ("", f"{label}, [delta_calibrate]"))
     try:

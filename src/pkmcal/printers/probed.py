@@ -47,15 +47,15 @@ def read_touches(path: Path, printer: Printer) -> Touches:
     # the format, and the tool's positions (n, 3) at contact with the tool's height above the bed
     # there
     if text.startswith("configuration,"):
-        points, heights = _table(path, label), 0.0
+        points, heights = _table_points(path, label), 0.0
     elif text.startswith(HEIGHT_MAP_TITLE):
-        points, heights = _map(text, label), 0.0
+        points, heights = _height_map_points(text, label), 0.0
     elif values := _TRIGGERED.findall(text):
-        points, heights = _together(np.array(values, dtype=float)), dz
+        points, heights = _means_by_place(np.array(values, dtype=float)), dz
     elif values := _CONTACT.findall(text):
-        points, heights = _together(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
+        points, heights = _means_by_place(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
     elif values := _HEIGHTS.findall(text):
-        points, heights = _sequence(text, label, values[-1][0]), 0.0
+        points, heights = _sequence_points(text, label, values[-1][0]), 0.0
     else:
         raise InputError(
             "there is no point of a bed in this file",
@@ -79,20 +79,20 @@ def read_touches(path: Path, printer: Printer) -> Touches:
     return Touches(carriages, np.full(len(points), heights), label)
 
 
-def _table(path: Path, label: str) -> Array:
+def _table_points(path: Path, label: str) -> Array:
     """Points (n, 3) of a table, mm; as in every table, columns without a unit are in metres."""
     table = read_csv(path, label=label, columns=("x", "y", "z"))
     table.check_kinds(["m", "m", "m"])
     return MM_A_METRE * table.values[:, [table.columns.index(c) for c in "xyz"]]
 
 
-def _together(points: Array) -> Array:
+def _means_by_place(points: Array) -> Array:
     """Mean points (m, 3) of the points (n, 3) with equal x and y, in the order of first contact."""
     places = list(dict.fromkeys(map(tuple, points[:, :2].tolist())))
     return np.array([points[(points[:, :2] == place).all(axis=1)].mean(axis=0) for place in places])
 
 
-def _map(text: str, label: str) -> Array:
+def _height_map_points(text: str, label: str) -> Array:
     """Points (n, 3) of heightmap.csv, mm. Raises InputError for a map without a valid grid."""
     lines = [line for line in text.splitlines()[1:] if line.strip()]
     names = [word.strip() for word in (lines[0] if lines else "").split(",")]
@@ -137,7 +137,7 @@ def _map(text: str, label: str) -> Array:
     return np.array(out).reshape(-1, 3)
 
 
-def _sequence(text: str, label: str, heights: str) -> Array:
+def _sequence_points(text: str, label: str, heights: str) -> Array:
     """Points (n, 3), mm, from the lines ``G30 Pn`` and the heights of the last reply.
 
     Raises InputError if the numbers of the points do not match the heights.
@@ -145,9 +145,9 @@ def _sequence(text: str, label: str, heights: str) -> Array:
     z = [float(word) for word in heights.split()]
     places: dict[int, tuple[float, float]] = {}
     for words in _G30.findall(text):
-        results = {letter.upper(): float(number) for letter, number in _WORD.findall(words)}
-        if results.keys() >= {"P", "X", "Y"}:
-            places[int(results["P"])] = results["X"], results["Y"]
+        word_values = {letter.upper(): float(number) for letter, number in _WORD.findall(words)}
+        if word_values.keys() >= {"P", "X", "Y"}:
+            places[int(word_values["P"])] = word_values["X"], word_values["Y"]
     if sorted(places) != list(range(len(z))):
         raise InputError(
             "heights and points do not belong together",

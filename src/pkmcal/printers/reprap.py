@@ -35,7 +35,7 @@ def printer(text: str, label: str) -> Printer:
 
     Raises InputError for missing, malformed or impossible values.
     """
-    words, places = _numbers(text, label)
+    words, places = _checked_words(text, label)
     rod, radius, height, reach = (
         _words(words, label, "665" + letter, size)
         for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
@@ -70,7 +70,7 @@ def printer(text: str, label: str) -> Printer:
     )
 
 
-def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
+def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
     """Values by command and letter, of M665 and M666 only, and the line of each.
 
     Raises InputError for a line that holds no numbers within bounds.

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.mechanisms import MechanismDocument, checked_machine
@@ -133,20 +131,20 @@ def write_printer_session(
 
     Raises InputError for files that lack necessary values.
     """
-    value = read_printer(printer)
+    delta = read_printer(printer)
     if in_view is None:
-        touches = value.touches if probed is None else read_touches(probed, value)
-        texts = heights_texts(value, _enough(value, touches))
+        touches = delta.touches if probed is None else read_touches(probed, delta)
+        texts = heights_texts(delta, _checked_touches(delta, touches))
     else:
-        texts = carried_texts(value, places)
+        texts = carried_texts(delta, places)
     return write_texts(folder, texts)
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     """Files by name of a session with a board on the tool, to be filled in by the user."""
     texts = session_texts("linear-delta", "board", places)
-    drawing = drawing_text(printer) + PLATFORM_FIXED_TEXT
-    document = parse_yaml(drawing, Path("mechanism.yaml"))
+    nominal = drawing_text(printer) + PLATFORM_FIXED_TEXT
+    document = parse_yaml(nominal, Path("mechanism.yaml"))
     machine = checked_machine(validated_document(document, MechanismDocument), document)
     heads = [f"{motor} [mm]" for motor in printer.motors]
     # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
@@ -159,7 +157,7 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     )
     session = texts["session.yaml"]
     texts["session.yaml"] = head + session[session.index("# One entry") :]
-    texts["mechanism.yaml"] = drawing
+    texts["mechanism.yaml"] = nominal
     texts["joints.csv"] = example_readings(machine, heads)
     texts["board.yaml"] = board_text(
         min(max(square, STARTER_SQUARE_CHOICES[0]), STARTER_SQUARE_CHOICES[-1])
@@ -176,7 +174,7 @@ def _resolution(printer: Printer) -> dict[str, str]:
     }
 
 
-def _enough(printer: Printer, touches: Touches | None) -> Touches:
+def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
     """The points, unchanged.
 
     Raises InputError for too few points, and for points that contradict the printer's values.
@@ -243,9 +241,11 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
     edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    # lowest carriages at the bed's edge, towards the towers and away from them, and at the touches
     with np.errstate(invalid="ignore"):
-        # heights of the carriages at the bed's edge, towards the towers and away from them
-        lowest = _lowest([printer.carriages(s * edge) for s in (-1.0, 1.0)], touches)
+        carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
+    carriages += [] if touches is None else [touches.carriages]
+    lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
     # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())
     legs = [
@@ -259,12 +259,6 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
         home=_mm(top / 2),
         reach=_mm(printer.reach),
     )
-
-
-def _lowest(at_edge: Sequence[Array], touches: Touches | None) -> float:
-    """Lowest position of the carriages, mm, at the bed's edge and at the probed points."""
-    reached = [*at_edge] if touches is None else [*at_edge, touches.carriages]
-    return float(np.nanmin(np.concatenate(reached))) - CARRIAGE_MARGIN_BELOW
 
 
 def _mm(value: float) -> str:
