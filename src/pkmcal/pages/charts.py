@@ -216,14 +216,14 @@ def row_chart(
     Whiskers much longer than the median one end at the border, so that a single bad group does not
     flatten all others.
     """
-    there = tuple(box for box in boxes if box)
-    if not there:
+    rows = tuple(box for box in boxes if box)
+    if not rows:
         return None
-    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in there]
+    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in rows]
     reach = min(max(reaches), CUT_OFF_LENGTH_FACTOR * float(np.median(reaches)))
     high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
     ticks = ticks_between(-high, high)
-    return RowChart(title, unit, alt, there, -high, high, ticks, band, note)
+    return RowChart(title, unit, alt, rows, -high, high, ticks, band, note)
 
 
 def bar_chart(
@@ -259,5 +259,7 @@ def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
 
 def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
     """Charts beside each other below their remarks, as HTML; empty without charts."""
-    there = [chart for chart in charts if chart]
-    return page.filled_template("panels.html.j2", charts=there, remarks=remarks) if there else ""
+    present = [chart for chart in charts if chart]
+    return (
+        page.filled_template("panels.html.j2", charts=present, remarks=remarks) if present else ""
+    )

@@ -25,7 +25,11 @@ def jpeg(path: Path | None, size: tuple[int, int]) -> str:
 
     Empty if the file cannot be read.
     """
-    return _packed(Pictures([path], size, [path.name]), 0, (LARGE_JPEG_WIDTH,))[0] if path else ""
+    return (
+        _base64_jpegs(Pictures([path], size, [path.name]), 0, (LARGE_JPEG_WIDTH,))[0]
+        if path
+        else ""
+    )
 
 
 def small_and_large(
@@ -43,7 +47,8 @@ def small_and_large(
         for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
             some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
             for small, large in pool.map(
-                lambda one: _packed(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)), some
+                lambda one: _base64_jpegs(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)),
+                some,
             ):
                 if len(small) > remainder:
                     return
@@ -57,7 +62,7 @@ def small_and_large(
                 yield small, large if fits else ""
 
 
-def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
+def _base64_jpegs(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
     """Base64 JPEGs of an image in several widths.
 
     Never enlarged; empty texts if the image cannot be read.

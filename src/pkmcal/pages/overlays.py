@@ -172,11 +172,13 @@ def machine_laid_over(
     # each visible stretch is a polyline of its own
     for e, (curve, visible) in enumerate(zip(points.pixel[0], clear, strict=True)):
         leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        parts = (straightened(curve[None, start:stop])[0] for start, stop in _runs(visible))
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]])))
+        runs = [(a, b) for a, b in pairwise(ends.tolist()) if visible[a] and b - a > 1]
+        parts = (straightened(curve[None, start:stop])[0] for start, stop in runs)
         lines = (polyline(leg, part, False, tip) for part in parts)
         edges += [line for line in lines if line]
-    ends = machine.ends_at(joints, T_base_platform)
-    both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
+    joint_ends = machine.ends_at(joints, T_base_platform)
+    both = camera.project(apply(T_camera_base, np.stack([joint_ends.a, joint_ends.b])))
     return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
 
 
@@ -273,9 +275,3 @@ def _spots(pixel: Array, visible: Booleans, width: int) -> tuple[Spot, ...]:
         if best is not None:
             labels.append(pixel[best, j])
     return tuple(spots)
-
-
-def _runs(visible: Booleans) -> list[tuple[int, int]]:
-    """Runs of True in (n,) that are longer than one element, as start and stop."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]])))
-    return [(a, b) for a, b in pairwise(ends.tolist()) if visible[a] and b - a > 1]

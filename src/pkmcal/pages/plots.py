@@ -77,8 +77,8 @@ def trace(
         "type": "scatter",
         "mode": mode,
         "name": name,
-        "x": _drawn(x),
-        "y": _drawn(y),
+        "x": _plot_values(x),
+        "y": _plot_values(y),
         "line": {"color": colour, "width": 1.5},
         "marker": {"color": colour, "size": 8},
         **more,
@@ -93,14 +93,14 @@ def bars(name: str, x: Iterable[Any], y: Iterable[float], **marker: Any) -> dict
     return {
         "type": "bar",
         "name": name,
-        "x": _drawn(x),
-        "y": _drawn(y),
+        "x": _plot_values(x),
+        "y": _plot_values(y),
         "marker": marker,
         "hovertemplate": "%{x}: %{y:.3g}",
     }
 
 
-def _drawn(values: Iterable[Any]) -> list[Any]:
+def _plot_values(values: Iterable[Any]) -> list[Any]:
     """Names unchanged; numbers with five digits, None for those that are not finite."""
     return [
         value if isinstance(value, str) else float(f"{value:.5g}") if math.isfinite(value) else None
@@ -268,6 +268,9 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
         return []
     deep = rays[:, 2].min()
     points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
-    in_view = apply(T_base_camera, points)
+    border_points = apply(T_base_camera, points)
     eye = T_base_camera[:3, 3]
-    return [in_view, *(np.stack([eye, in_view[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4))]
+    return [
+        border_points,
+        *(np.stack([eye, border_points[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4)),
+    ]
