@@ -20,20 +20,25 @@ MODEL_POSE_ROUNDING = 1e-9
 
 def differences(model: ReadModel, machine: Machine) -> list[Difference]:
     """Differences of joint centres at home, loop closure, radii, and platform poses by readings."""
-    turned, shifted, n = _forward(model, machine)
-    reference_values = {
+    # platform of the model, closed at the machine's readings; NaN where its loops do not close
+    poses, readings = samples(machine, AGREEMENT_POSES)
+    x = model.at(readings, poses)
+    away: Array = pose_difference(model.places(x)["platform"], poses)
+    away[np.abs(model.gaps(x)).max(axis=1) > MODEL_GEOMETRY_ROUNDING] = np.nan
+    turned, shifted, n = largest(away[:, :3]), largest(away[:, 3:]), len(poses)
+    tube_radii = {
         f"leg{j + 1}_tube{t + 1}": float(radius)
         for j, radii in enumerate(machine.radii())
         for t, radius in enumerate(radii)
     }
-    results = [model.radii.get(name, np.nan) for name in reference_values]
+    radii_read = [model.radii.get(name, np.nan) for name in tube_radii]
     loops = largest(model.gaps(model.key))
     return [
         *_centres(model, machine),
         Difference("loops at home", loops, MODEL_GEOMETRY_ROUNDING),
         Difference(
             "tubes' radii",
-            largest(results, list(reference_values.values())),
+            largest(radii_read, list(tube_radii.values())),
             MODEL_GEOMETRY_ROUNDING,
         ),
         Difference(f"platform's place at {n} poses", shifted, MODEL_POSE_ROUNDING),
@@ -56,15 +61,3 @@ def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
         out.append(Difference(f"{what} at home", gap, MODEL_GEOMETRY_ROUNDING))
     readings = largest(model.gear * model.key[model.actuated], model.ctrl)
     return [*out, Difference("readings at home", readings, MODEL_GEOMETRY_ROUNDING)]
-
-
-def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
-    """Largest rotation (rad) and translation (m) between the platforms, and the number of poses.
-
-    Model and machine have equal readings. NaN where the model's loops do not close.
-    """
-    poses, readings = samples(machine, AGREEMENT_POSES)
-    x = model.at(readings, poses)
-    away: Array = pose_difference(model.places(x)["platform"], poses)
-    away[np.abs(model.gaps(x)).max(axis=1) > MODEL_GEOMETRY_ROUNDING] = np.nan
-    return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

@@ -303,15 +303,16 @@ def _add_legs(
     bodies: list[TreeBody], home: HomeState, held: list[tuple[TreeBody, Array]]
 ) -> Iterator[Loop]:
     """Add each leg as a chain from the base, and yield the loop that closes it on the platform."""
-    made: dict[int, TreeBody] = {}
+    motors: dict[int, TreeBody] = {}
     for j, (holder, point) in enumerate(held):
-        parent = _carrier(bodies, home, j, made)
+        parent = _carrier(bodies, home, j, motors)
         origin = parent.T_base_body[:3, 3]
         name, length = f"leg{j + 1}", float(home.distance[j])
         place = pose(np.eye(3), home.a[j] - origin)
         middle = home.u[j] * length / 2
         rod = _body(
-            bodies, TreeBody(f"{name}_rod", parent, place, middle, length, comment=_words(home, j))
+            bodies,
+            TreeBody(f"{name}_rod", parent, place, middle, length, comment=_description(home, j)),
         )
         for hinge, axis in _base_hinges(home, j):
             rod.joints.append(BodyJoint(f"{name}_{hinge}", "hinge", axis))
@@ -321,27 +322,27 @@ def _add_legs(
         yield Loop(name, holder, point, tip, end, _end_hinges(home, j))
 
 
-def _words(home: HomeState, j: int) -> str:
+def _description(home: HomeState, j: int) -> str:
     """Description of a leg for the file's comment."""
-    leg, value = home.leg(j), home.equations[j]
+    leg, equations = home.leg(j), home.equations[j]
     rod = "a rod of constant length"
     if home.length_varies(j):
         driven = home.limbs.drive[j] == TELESCOPE_ROD
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not value and home.machine.document.motion not in PLANAR_MOTIONS:
+    if not equations and home.machine.document.motion not in PLANAR_MOTIONS:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
-    if "torsion" in value:
+    if "torsion" in equations:
         out += " Its universal joints keep it from twisting."
-    if any("platform" in kind for kind in value):
+    if any("platform" in kind for kind in equations):
         out += " It may turn about its own line; its equations do not restrict that."
     return out
 
 
 def _carrier(
-    bodies: list[TreeBody], home: HomeState, j: int, made: dict[int, TreeBody]
+    bodies: list[TreeBody], home: HomeState, j: int, motors: dict[int, TreeBody]
 ) -> TreeBody:
     """Body that carries a leg's base joint: the base, or the motor body of all legs on that motor.
 
@@ -352,9 +353,9 @@ def _carrier(
         bodies[0].shapes.append(RoundBar(home.a[j], None, thick, "base"))
         return bodies[0]
     axis, turns = limbs.axis[j], limbs.drive[j] == TURN_CARRIER
-    if column not in made:
-        made[column] = _motor(bodies, home, column, limbs.base[j] if turns else home.a[j], axis)
-    body = made[column]
+    if column not in motors:
+        motors[column] = _motor(bodies, home, column, limbs.base[j] if turns else home.a[j], axis)
+    body = motors[column]
     first = home.motor_legs(column)[0]
     # a carriage has a direction, but no axis in space
     # legs on one motor turn about the same line, or slide in the same direction
@@ -401,18 +402,18 @@ def _motor(
 
 def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
     """Names and axes (3,) of a leg's hinges on the base side, in series."""
-    value = home.equations[j]
+    equations = home.equations[j]
     if home.machine.document.motion in PLANAR_MOTIONS:
         yield "base", BASE_FRAME_UP
         return
-    if "revolute base" in value:
+    if "revolute base" in equations:
         axis = joint_axis(home, "base", j)
         yield "base", BASE_FRAME_UP if axis is None else axis
     else:
         first, second = universal_hinges(home, j)
         yield "base_first", first
         yield "base_second", second
-    if "revolute platform" in value:
+    if "revolute platform" in equations:
         yield "twist", home.u[j]
 
 
@@ -421,11 +422,11 @@ def _end_hinges(home: HomeState, j: int) -> tuple[tuple[str, Array], ...]:
 
     Empty where they act as a ball joint.
     """
-    value, own = home.equations[j], joint_axis(home, "platform", j)
-    if own is not None and "torsion" in value:
+    equations, own = home.equations[j], joint_axis(home, "platform", j)
+    if own is not None and "torsion" in equations:
         second = universal_hinges(home, j)[1]
         return ("platform_second", second), ("platform_first", home.rot @ own)
-    if own is not None and "revolute platform" in value:
+    if own is not None and "revolute platform" in equations:
         return (("platform", home.rot @ own),)
     return ()
 

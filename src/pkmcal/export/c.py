@@ -111,9 +111,9 @@ class CSource(Exporter):
         # closure with the constants as they stand in the text
         off = closure_by_source(files[C_SOURCE_FILE], poses, joints, hinges)
         home, ranges = (numbers_of(files[C_SOURCE_FILE], name) for name in ("HOME", "RANGE"))
-        same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
-            ranges.reshape(-1, 2), _bounds(machine)
-        )
+        T = machine.home()
+        same = np.array_equal(home, np.concatenate([T[:3, :3].ravel(), T[:3, 3]]))
+        same = same and np.array_equal(ranges.reshape(-1, 2), _bounds(machine))
         # readings of the self-test by the machine's inverse kinematics
         pairs = numbers_of(files[C_SELFTEST_FILE], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
@@ -306,11 +306,6 @@ def _pose(T: Array, between: str = " ") -> str:
     """
     rows = f",{between}".join(c_value(row) for row in T[:3, :3])
     return f"{{{{{rows}}},{between}{c_value(T[:3, 3])}}}"
-
-
-def _flat(T: Array) -> Array:
-    """Numbers (12,) of a pose in the order of the C structure."""
-    return np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
 
 
 def c_number(value: float) -> str:

@@ -85,20 +85,20 @@ def exporters() -> dict[str, Exporter]:
     # import every module of this folder, so that its subclasses exist
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
-    made: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
-    return {one.name: one for one in sorted((make() for make in made), key=lambda one: one.name)}
+    formats: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
+    return {one.name: one for one in sorted((make() for make in formats), key=lambda one: one.name)}
 
 
 def exporter_of(name: str) -> Exporter:
     """Format by name. Raises InputError for an unknown name."""
-    reference_values = exporters()
-    if name in reference_values:
-        return reference_values[name]
-    guess = closest(name, reference_values)
+    known_formats = exporters()
+    if name in known_formats:
+        return known_formats[name]
+    guess = closest(name, known_formats)
     raise InputError(
         "there is no such format to export to",
         found=name,
-        expected=(f"{guess}, or another of " if guess else "") + listed(list(reference_values), 20),
+        expected=(f"{guess}, or another of " if guess else "") + listed(list(known_formats), 20),
     )
 
 

@@ -127,8 +127,8 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     limbs, motion = all_limbs(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
         joints = sorted({leg.base.joint for leg in machine.document.legs})
-        value = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
-        raise _no_delta(machine, program, value)
+        description = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
+        raise _no_delta(machine, program, description)
     rods = rod_limbs(machine)
     if len(rods) != 3 or machine.n_joints != 3 or FLOAT_CARRIER in rods.held:
         raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
@@ -347,7 +347,7 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
 
     # minimise the tool's error over the grid, from the ideal machine
     start = _start(delta, freedoms)
-    packed = _Packed(start, freedoms)
+    packed = _ParameterVector(start, freedoms)
     points = delta.positions
     readings = delta.readings[:, start.order]
     by_reading = MM_A_METRE * delta.by_reading[:, :, start.order]
@@ -357,19 +357,17 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
 
     # central differences: at an exact model the error falls below a nanometre
     solution = least_squares(off, packed.zeros, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14)
-    values = packed.fit(solution.x)
-    error = np.linalg.norm(_tool_error(values, points, readings, by_reading), axis=1)
-    values = replace(
-        values, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
-    )
-    if not values.largest <= MOST_TOOL_ERROR:
+    fit = packed.fit(solution.x)
+    error = np.linalg.norm(_tool_error(fit, points, readings, by_reading), axis=1)
+    fit = replace(fit, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error)))))
+    if not fit.largest <= MOST_TOOL_ERROR:
         raise InputError(
             f"{delta.program} cannot follow this machine: its parameters leave the tool off",
-            found=f"{values.largest:.2f} mm",
+            found=f"{fit.largest:.2f} mm",
             expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
             next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
         )
-    return values
+    return fit
 
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
@@ -381,7 +379,7 @@ def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) 
     return (by_reading @ wrong[..., None])[..., 0]
 
 
-class _Packed:
+class _ParameterVector:
     """Changes of the start's parameters as a vector x, mm and degrees; zero at the start."""
 
     def __init__(self, start: Fit, freedoms: Freedoms) -> None:
@@ -531,9 +529,10 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
         f" motor position ({unit}) = {rate:.9g} * reading ({word}) {round(zero, 6) + 0.0:+.6f}."
         for name, j, rate, zero in zip(names, fit.order, fit.rate, fit.zero, strict=True)
     ]
+    in_mm = fit.T_firmware_base * np.array([1.0, 1.0, 1.0, MM_A_METRE])
     rows = [
         f"firmware_from_base row {k + 1}: {' '.join(f'{v:.12g}' for v in np.round(row, 12) + 0.0)}"
-        for k, row in enumerate(_in_mm(fit.T_firmware_base)[:3])
+        for k, row in enumerate(in_mm[:3])
     ]
     factors = [
         f"Motor {name} goes {factor:.9g} times as far as its reading says."
@@ -586,7 +585,8 @@ def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list
     """
     ends = fit.delta.ends[fit.order]
     return [
-        f"{name} = {_digits(value)} {_signed(rate)} * (reading - {end:.9g})"
+        f"{name} = {_digits(value)} {'-' if rate < 0 else '+'} {abs(rate):.9g}"
+        f" * (reading - {end:.9g})"
         for name, value, rate, end in zip(names, values, fit.rate, ends, strict=True)
     ]
 
@@ -594,12 +594,12 @@ def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list
 def switch_values(text: str, readings: Array) -> Array:
     """Values (3,) by the lines of :func:`proportional_switches` at readings (3,)."""
     lines = (line.partition(" * (reading - ") for line in text.splitlines())
-    results = [
+    terms = [
         (*head.replace("+ ", "+").replace("- ", "-").split()[-2:], tail.partition(")")[0])
         for head, times, tail in lines
         if times
     ]
-    value, rate, end = np.array(results, dtype=float).T
+    value, rate, end = np.array(terms, dtype=float).T
     return value + rate * (readings - end)
 
 
@@ -618,18 +618,6 @@ def readings_elsewhere(fit: Fit) -> Array:
 def _digits(value: float) -> str:
     """Number with up to six decimals."""
     return f"{value:.6f}".rstrip("0").rstrip(".") if abs(value) > 5e-7 else "0"
-
-
-def _signed(value: float) -> str:
-    """Number after its sign and a space."""
-    return f"{'-' if value < 0 else '+'} {abs(value):.9g}"
-
-
-def _in_mm(transform: Array) -> Array:
-    """Transformation (4, 4) with its translation in mm."""
-    out = np.array(transform)
-    out[:3, 3] *= MM_A_METRE
-    return out
 
 
 def read_firmware_from_base(text: str) -> Array:
@@ -662,12 +650,12 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
     off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
     largest = float(np.where(result.converged, off, np.inf).max())
-    given_values = stated(text)
+    stated_error = stated(text)
     return Difference(
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         largest,
         # the fit's error is of first order, so a large one may be 2 % larger
-        1.02 * given_values + TOOL_ROUNDING,
+        1.02 * stated_error + TOOL_ROUNDING,
     )
 
 

@@ -128,7 +128,7 @@ def home_state(machine: Machine) -> HomeState:
     ends = limb_ends(layout, values, readings, fk.T_base_platform, fk.internal)
     line = ends.b - ends.a
     distance = np.sqrt(dot(line, line))
-    reference = equations(machine.document)
+    closure = equations(machine.document)
     return HomeState(
         machine,
         all_limbs(machine),
@@ -139,9 +139,7 @@ def home_state(machine: Machine) -> HomeState:
         np.array(ends.b),
         line / distance[:, None],
         distance,
-        tuple(
-            frozenset(kind for leg, kind in reference if leg == j) for j in range(machine.n_legs)
-        ),
+        tuple(frozenset(kind for leg, kind in closure if leg == j) for j in range(machine.n_legs)),
     )
 
 

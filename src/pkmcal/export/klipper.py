@@ -169,10 +169,8 @@ def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[st
     back = np.array([_homed_by(config, row) for row in heights])
     lines: list[str] = []
     for k, name in enumerate(KLIPPER_STEPPERS):
-        above_limit = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
-        pairs = [
-            f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in above_limit
-        ]
+        recovered = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
+        pairs = [f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in recovered]
         lines.append(f"stepper_{name}.position_endstop = {', '.join(pairs)}")
     return lines
 

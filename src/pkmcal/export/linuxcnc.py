@@ -216,7 +216,7 @@ def _kind(source: MachineSource) -> Limbs | Fit | None:
     if source.machine.document.motion != "translation":
         return _hexapod(source.machine)
     try:
-        fit = _fit(source)
+        fit = fit_of(source, PROGRAM, LINUXCNC_LINEAR_FREEDOMS, LINUXCNC_ROTARY_FREEDOMS)
     except InputError:  # not a delta, or one that the parameters do not describe
         return None
     return fit if fit.largest <= UNWARNED_TOOL_ERROR else None
@@ -401,11 +401,6 @@ def genhexkins(hal: str, pose: Array) -> Array:
 
 
 # Deltas
-
-
-def _fit(source: MachineSource) -> Fit:
-    """LinuxCNC's parameters of a delta."""
-    return fit_of(source, PROGRAM, LINUXCNC_LINEAR_FREEDOMS, LINUXCNC_ROTARY_FREEDOMS)
 
 
 def _delta_hal(source: MachineSource, fit: Fit) -> str:

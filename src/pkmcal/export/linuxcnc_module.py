@@ -67,16 +67,13 @@ def module_files(source: MachineSource) -> dict[str, str]:
     linuxcnc_coordinates(source.machine)
     files = CSource().files(source)
     del files[C_SELFTEST_FILE]
-    units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {_plain(source.machine)};\n"
+    # constants of type double, without the macro of the C source's number type
+    plain = c_value(joint_units(source.machine)).replace("REAL(", "").replace(")", "")
+    units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {plain};\n"
     numbers = f"/* LinuxCNC's joint is the reading times this: mm/m or degrees/rad */\n{units}"
     about = source.header(*MODULE_CONVENTIONS)
     files[MODULE_SOURCE_FILE] = filled(MODULE_SOURCE_FOLDER / MODULE_SOURCE_FILE, about, numbers)
     return files
-
-
-def _plain(machine: Machine) -> str:
-    """Joint units as a C initializer of type double."""
-    return c_value(joint_units(machine)).replace("REAL(", "").replace(")", "")
 
 
 def module_differences(files: dict[str, str], source: MachineSource) -> list[Difference]:

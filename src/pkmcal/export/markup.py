@@ -44,5 +44,5 @@ def document(root: Element, source: MachineSource, conventions: Iterable[str]) -
 
 def file_name(name: str) -> str:
     """File name, without suffix, for a machine's name."""
-    retained = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
-    return retained.strip("-") or "machine"
+    characters = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
+    return characters.strip("-") or "machine"

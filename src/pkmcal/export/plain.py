@@ -42,8 +42,10 @@ class MechanismYaml(Exporter):
         document = yaml.safe_load(files[PLAIN_MECHANISM_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        count = _values_in(document, table.names)
-        return [Difference(f"{len(count)} values read again", largest(count, values), 0.0)]
+        read_again = _values_in(document, table.names)
+        return [
+            Difference(f"{len(read_again)} values read again", largest(read_again, values), 0.0)
+        ]
 
 
 @final
@@ -94,10 +96,10 @@ class MachineJson(Exporter):
         document = json.loads(files[PLAIN_MACHINE_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        results = [p["value"] for p in document["parameters"]]
+        read_values = [p["value"] for p in document["parameters"]]
         again = _values_in(document["mechanism"], table.names)
         out = [
-            Difference(f"{len(results)} values read again", largest(results, values), 0.0),
+            Difference(f"{len(read_values)} values read again", largest(read_values, values), 0.0),
             Difference("values in the mechanism", largest(again, values), 0.0),
         ]
         if source.covariance is not None:

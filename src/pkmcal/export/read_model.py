@@ -195,10 +195,12 @@ def body_poses(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
             if j.kind == "free":
                 here = perturb(here, x[..., j.dof : j.dof + 6])
                 continue
-            sense = (x[..., j.dof, None] - j.ref) * j.axis
+            displacement = (x[..., j.dof, None] - j.ref) * j.axis
             turns = j.kind == "hinge"
             here = here @ (
-                pose(rotation(sense), NO_TRANSLATION) if turns else pose(np.eye(3), sense)
+                pose(rotation(displacement), NO_TRANSLATION)
+                if turns
+                else pose(np.eye(3), displacement)
             )
         at.append(here)
     return at

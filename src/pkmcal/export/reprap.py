@@ -64,8 +64,8 @@ class RepRap(Exporter):
     def files(self, source: MachineSource) -> dict[str, str]:
         """One file of G-code."""
         fit = _fit(source)
-        sense = "mm" if fit.kind == "linear" else "degree"
-        correcting = f"Divide its steps per {sense} (M92) by that."
+        unit = "mm" if fit.kind == "linear" else "degree"
+        correcting = f"Divide its steps per {unit} (M92) by that."
         lines = about(source, fit, "XYZ", correcting)
         names = [f"M666 {letter}" for letter in "XYZ"]
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
@@ -93,7 +93,9 @@ class RepRap(Exporter):
             for readings in readings_elsewhere(fit)
             for values in [switch_values(text, readings)]
         ]
-        same = [*words.get("665B", words.get("669B", []))] == _radius(source)
+        radius = workspace_radius(source)
+        read_radius = [*words.get("665B", words.get("669B", []))]
+        same = read_radius == ([] if radius is None else [float(radius)])
         return [
             firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
             Difference(
@@ -108,12 +110,6 @@ class RepRap(Exporter):
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
         """Agreement of settings and machine, and the steps after installing them."""
         return (_fit(source).following, *redo(source))
-
-
-def _radius(source: MachineSource) -> list[float]:
-    """Print radius as a list, empty without one."""
-    radius = workspace_radius(source)
-    return [] if radius is None else [float(radius)]
 
 
 def _adjustments(fit: Fit) -> Array:
@@ -131,7 +127,7 @@ def _linear(fit: Fit, radius: str | None) -> list[str]:
     corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
     return [
         "M669 K3 ; linear delta",
-        f"M665 L{_three(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
+        f"M665 L{_by_tower(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
         + ("" if radius is None else f" B{radius}")
         + f" {_letters(corrections, firmware_angle)}"
         " ; L rods, R radius, H homed height"
@@ -157,7 +153,7 @@ def _rotary(fit: Fit, radius: str | None) -> list[str]:
     low = float(MM_A_METRE * delta.positions[:, 2].min() + MM_A_METRE * fit.T_firmware_base[2, 3])
     high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
     return [
-        f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)}"
+        f"M669 K10 U{_by_tower(fit.arm)} L{_by_tower(fit.rod)} H{_by_tower(fit.height)}"
         f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(homed)}"
         + ("" if radius is None else f" B{radius}")
         + f" {_letters(corrections, firmware_angle)}"
@@ -170,7 +166,7 @@ def _rotary(fit: Fit, radius: str | None) -> list[str]:
     ]
 
 
-def _three(values: Array) -> str:
+def _by_tower(values: Array) -> str:
     """Three lengths, separated by colons."""
     return ":".join(firmware_length(v) for v in values)
 

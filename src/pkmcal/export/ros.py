@@ -64,8 +64,11 @@ class Ros(Exporter):
         Transforms by the quaternions, cameras by the reader of foreign camera files.
         """
         frames = frame_names(source)
-        results = transforms(files[ROS_LAUNCH_FILE])
-        off = [float(np.abs(results[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
+        read_transforms = transforms(files[ROS_LAUNCH_FILE])
+        off = [
+            float(np.abs(read_transforms[frames[s]] - T).max())
+            for s, T in source.T_base_camera.items()
+        ]
         out = [Difference(f"{len(off)} transforms read again", max(off), TRANSFORM_ROUNDING)]
         for station, camera in source.cameras.items():
             text = files.get(f"camera_info_{frames[station]}.yaml")
@@ -127,19 +130,14 @@ def _launch(source: MachineSource) -> str:
         f"Transforms from {ROS_BASE_FRAME} (the machine's base frame) to each camera's optical"
         " frame: z forward, x right, y down. Metres; quaternions x y z w, which turn camera"
         " coordinates into base coordinates.",
-        *(_sigma(source)),
+        *(
+            f"Station {station}: sigma of rotation"
+            f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
+            f" {', '.join(f'{v:.2g}' for v in sigma[3:])} m, along the base's axes."
+            for station, sigma in source.sigma_camera.items()
+        ),
     )
     return commented(about, "#") + "launch:\n" + "".join(nodes)
-
-
-def _sigma(source: MachineSource) -> tuple[str, ...]:
-    """Line for each station with the sigmas of its pose."""
-    return tuple(
-        f"Station {station}: sigma of rotation"
-        f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
-        f" {', '.join(f'{v:.2g}' for v in sigma[3:])} m, along the base's axes."
-        for station, sigma in source.sigma_camera.items()
-    )
 
 
 def _camera_info(source: MachineSource, station: str, frame: str) -> str:

@@ -80,10 +80,8 @@ def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
     root = Element("sdf", {"version": version, "xmlns:pkmcal": SDF_NAMESPACE})
     model = SubElement(root, "model", name=name)
     for k, reading in enumerate(tree.home.readings):
-        reference_values = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
-        SubElement(
-            model, "pkmcal:reading", reference_values, scale=numbers_text(tree.home.scale(k))
-        )
+        attributes = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
+        SubElement(model, "pkmcal:reading", attributes, scale=numbers_text(tree.home.scale(k)))
     for body in tree.bodies:
         if body.comment:
             comment(model, body.comment)
@@ -159,8 +157,8 @@ def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
     if joint.column < 0:
         SubElement(limit, "effort").text = "0"  # without a limit readers assume a motor
     else:
-        reference_values = np.sort(tree.home.values(joint.column)[1:] - joint.value)
-        for end, value in zip(("lower", "upper"), reference_values, strict=True):
+        limits = np.sort(tree.home.values(joint.column)[1:] - joint.value)
+        for end, value in zip(("lower", "upper"), limits, strict=True):
             if np.isfinite(value):
                 SubElement(limit, end).text = numbers_text(value)
     for coupling in tree.couplings:

@@ -22,27 +22,27 @@ LOOP_JOINT_ENDING = "_loop"
 def read_sdf(text: str) -> ReadModel:
     """Model of an SDF text; joints named ``…_loop`` are the loop closures."""
     model = fromstring(text)[0]
-    made = _Links(model)
-    for link in made.links:
-        made.put(link)
-    loops = [made.loop(name) for name in made.joints if name.endswith(LOOP_JOINT_ENDING)]
+    tree = _Links(model)
+    for link in tree.links:
+        tree.put(link)
+    loops = [tree.loop(name) for name in tree.joints if name.endswith(LOOP_JOINT_ENDING)]
     sites = {
-        name: (made.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
-        for name, node in made.frames.items()
+        name: (tree.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
+        for name, node in tree.frames.items()
     }
-    for link in made.links:  # a rod's origin is its base joint
+    for link in tree.links:  # a rod's origin is its base joint
         if link.endswith("_rod"):
-            sites[f"{link.removesuffix('rod')}base"] = (made.numbers[link], np.zeros(3))
+            sites[f"{link.removesuffix('rod')}base"] = (tree.numbers[link], np.zeros(3))
     return ReadModel(
-        bodies=tuple(made.bodies),
+        bodies=tuple(tree.bodies),
         loops=tuple(loops),
         couplings=tuple(
             ReadCoupling(
-                made.joints_by_name[name].dof,
-                made.joints_by_name[mimic.attrib["joint"]].dof,
+                tree.joints_by_name[name].dof,
+                tree.joints_by_name[mimic.attrib["joint"]].dof,
                 *_ratio_and_offset(mimic),
             )
-            for name, node in made.joints.items()
+            for name, node in tree.joints.items()
             if (mimic := node.find("axis/mimic")) is not None
         ),
         sites=sites,
@@ -50,10 +50,10 @@ def read_sdf(text: str) -> ReadModel:
             node.attrib["name"]: float(node.findtext("geometry/cylinder/radius", "nan"))
             for node in model.iter("visual")
         },
-        actuated=np.array([made.joints_by_name[name].dof for name in made.readings], dtype=int),
-        gear=np.array([1 / float(values["scale"]) for values in made.readings.values()]),
-        ctrl=np.array([float(values["home"]) for values in made.readings.values()]),
-        key=np.array(made.key),
+        actuated=np.array([tree.joints_by_name[name].dof for name in tree.readings], dtype=int),
+        gear=np.array([1 / float(values["scale"]) for values in tree.readings.values()]),
+        ctrl=np.array([float(values["home"]) for values in tree.readings.values()]),
+        key=np.array(tree.key),
     )
 
 

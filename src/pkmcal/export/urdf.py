@@ -114,12 +114,12 @@ def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
             _visual(node, shape)
     for loop in tree.loops:
         _ends(root, loop, tree)
-    transmissions = {
+    words = {
         "loops": loops,
         "pose": FREE_PLATFORM_WORDS if tree.platform.free else RESTRICTED_PLATFORM_WORDS,
         "reach": JOINT_LIMIT_ROD_LENGTHS,
     }
-    return document(root, source, [line.format(**transmissions) for line in CONVENTIONS])
+    return document(root, source, [line.format(**words) for line in CONVENTIONS])
 
 
 def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:

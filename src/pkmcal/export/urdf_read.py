@@ -20,8 +20,8 @@ URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "sl
 def read_urdf(text: str, loops: str) -> ReadModel:
     """Model of a URDF text and its file of loops."""
     root, beside = fromstring(text), yaml.safe_load(loops)
-    results = {node.attrib["name"]: node for node in root.findall("link")}
-    above = {_link(node, "child"): node for node in root.findall("joint")}
+    links = {node.attrib["name"]: node for node in root.findall("link")}
+    joint_above = {_link(node, "child"): node for node in root.findall("joint")}
     bodies: list[ReadBody] = []
     numbers: dict[str, int] = {}
     joints: dict[str, ReadJoint] = {}
@@ -30,7 +30,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
         """Index of a link's body, added after its parent's if necessary."""
         if link in numbers:
             return numbers[link]
-        node = above.get(link)
+        node = joint_above.get(link)
         if node is None:  # the root
             bodies.append(ReadBody(link, 0, np.eye(4), ()))
         else:
@@ -40,11 +40,11 @@ def read_urdf(text: str, loops: str) -> ReadModel:
                 name, kind = node.attrib["name"], URDF_JOINT_KINDS[node.attrib["type"]]
                 joints[name] = ReadJoint(name, kind, axis, len(joints), 0.0)
                 own = (joints[name],)
-            bodies.append(ReadBody(link, parent, _place(node), own))
+            bodies.append(ReadBody(link, parent, _origin_pose(node), own))
         numbers[link] = len(bodies) - 1
         return numbers[link]
 
-    for link in results:
+    for link in links:
         put(link)
     # joints that follow others, and the state at home
     couplings: list[ReadCoupling] = []
@@ -94,7 +94,7 @@ def _link(joint: Element, which: str) -> str:
     return "" if node is None else node.attrib["link"]
 
 
-def _place(node: Element) -> Array:
+def _origin_pose(node: Element) -> Array:
     """Pose (4, 4) of a joint's origin."""
     origin = node.find("origin")
     return pose(
