@@ -104,9 +104,11 @@ class Viewed:
         """
         row, station = self.photograph(s, k).configuration, self.station(s)
         machine, joints = self.session.machine, self.session.joints[row]
-        there = station.T_camera_base
-        there = self.start(s) if there is None else there
-        return Pane(machine, station.camera, joints, self.poses[row], there, station.response)
+        T_camera_base = station.T_camera_base
+        T_camera_base = self.start(s) if T_camera_base is None else T_camera_base
+        return Pane(
+            machine, station.camera, joints, self.poses[row], T_camera_base, station.response
+        )
 
     def _start(self, s: int) -> Array:
         """Default T_camera_base (4, 4) of a station without a pose.

@@ -44,13 +44,15 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
             next_step="Its place is found from the board when you calibrate",
         )
     start = placed_by_hand(viewed, request).T_camera_base
-    view = _view(viewed, request.station)
+    view = _search_view(viewed, request.station)
     many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
     if many:
-        value, sure, text = _together(view, None if request.anywhere else start)
+        localized, sure, text = _from_images(view, None if request.anywhere else start)
     else:
-        value, sure, text = _from_one_image(view, viewed.image(request.station, request.photograph))
-    pose = value if sure else start
+        localized, sure, text = _from_one_image(
+            view, viewed.image(request.station, request.photograph)
+        )
+    pose = localized if sure else start
     plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
     return {
         **overlay_after_gesture(viewed, request.model_copy(update=plain)),
@@ -59,7 +61,7 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     }
 
 
-def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
+def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
     """Localization from several images: pose, success, and a sentence."""
     pose = find_station(view, start, np.random.default_rng(0))
     shots = count(len(view.configuration), "photograph")
@@ -85,23 +87,23 @@ def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]
 
 def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, str]:
     """Localization from one image, with a global search: pose, success, and a sentence."""
-    value = localize_image(view, image)
-    best = value.T_camera_base[0]
-    if value.rival_probability < RIVAL_POSE_PROBABILITY:
+    localized = localize_image(view, image)
+    best = localized.T_camera_base[0]
+    if localized.rival_probability < RIVAL_POSE_PROBABILITY:
         return best, True, "Placed: from no other place does the machine fit as well."
-    why = f"with probability {brief(value.rival_probability)} another place is the right one"
+    why = f"with probability {brief(localized.rival_probability)} another place is the right one"
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
-def _view(viewed: Viewed, s: int) -> StationView:
+def _search_view(viewed: Viewed, s: int) -> StationView:
     """Data of a station for the search, cached because the user fits repeatedly."""
-    retained: dict[int, StationView] = viewed.views
-    if s not in retained:
+    views: dict[int, StationView] = viewed.views
+    if s not in views:
         session, station = viewed.session, viewed.station(s)
         rows = np.array([photo.configuration for photo in station.photographs])
         few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_PHOTOGRAPHS, len(rows))).astype(int))
         tables = distance_tables([viewed.image(s, int(k)) for k in few])
-        retained[s] = StationView(
+        views[s] = StationView(
             session.machine,
             station.camera,
             rows[few],
@@ -109,4 +111,4 @@ def _view(viewed: Viewed, s: int) -> StationView:
             viewed.poses,
             tables,
         )
-    return retained[s]
+    return views[s]

@@ -89,8 +89,8 @@ def pinned(
         return aimed(camera, T_camera_base, visible, pixels[0])
     from scipy.optimize import least_squares
 
-    count = 4 if len(pins) == 2 else 6
-    spread = HAND_POSE_SPREAD[:count]
+    freedoms = 4 if len(pins) == 2 else 6
+    spread = HAND_POSE_SPREAD[:freedoms]
 
     # two joints fix aim, roll and distance exactly; more are fitted together with the prior
     def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
@@ -105,14 +105,14 @@ def pinned(
                 np.nan_to_num(visible - pixels, nan=UNSEEN_JOINT_PIXELS).ravel()
                 / PINNED_JOINT_SIGMA
             )
-            return off if count == 4 else np.concatenate([off, x])
+            return off if freedoms == 4 else np.concatenate([off, x])
 
         return rows
 
-    for _ in range(1 if count == 4 else PINNING_ROUNDS):
+    for _ in range(1 if freedoms == 4 else PINNING_ROUNDS):
         shifted = _motion(T_camera_base, points)
         with np.errstate(over="ignore"):  # a pixel may be kilometres away
-            x = least_squares(misfit(shifted), np.zeros(count)).x
+            x = least_squares(misfit(shifted), np.zeros(freedoms)).x
         T_camera_base = shifted(x * spread)
     return T_camera_base
 

@@ -30,8 +30,8 @@ STATION_POSE_DECIMALS = 4
 
 def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
     """Machine of a request, in front of the camera at the pose of the files."""
-    take = viewed.calibrated if request.shown == "calibration" else viewed.drawn
-    return take(request.station, request.photograph)
+    machine_shown = viewed.calibrated if request.shown == "calibration" else viewed.drawn
+    return machine_shown(request.station, request.photograph)
 
 
 def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
@@ -126,6 +126,6 @@ def _bare_limbs(pane: Pane) -> list[Drawn]:
         apply(pane.T_camera_base, a + np.linspace(0, 1, EDGE_CURVE_POINTS)[:, None] * (b - a))
     )
     whole = np.isfinite(pixel).all(axis=(1, 2))
-    in_view = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
-    lines = (polyline(j, points, True, "") for j, points in in_view)
+    curves = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
+    lines = (polyline(j, points, True, "") for j, points in curves)
     return [line for line in lines if line]

@@ -60,9 +60,9 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Mount, Route
 
-    retained = PoseFile(viewed.session.folder)
+    pose_file = PoseFile(viewed.session.folder)
 
-    def value(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+    def edges(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         from pkmcal.view.edge_search import edge_search
 
         return edge_search(viewed, request)
@@ -74,7 +74,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
 
     def save(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         pose = placed_by_hand(viewed, request).T_camera_base
-        return {"said": retained.write(viewed.station(request.station), pose)}
+        return {"said": pose_file.write(viewed.station(request.station), pose)}
 
     def answering(answer: Callable[[Viewed, ViewRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
@@ -106,7 +106,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         *(
             Route(f"/{name}", answering(answer), methods=["POST"])
             for name, answer in (
-                ("overlay", overlay_after_gesture), ("found", value), ("fit", fit), ("save", save),
+                ("overlay", overlay_after_gesture), ("found", edges), ("fit", fit), ("save", save),
             )
         ),
     ]  # fmt: skip
