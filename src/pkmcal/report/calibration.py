@@ -57,14 +57,14 @@ if TYPE_CHECKING:
 def outcome_of(calibration: Calibration) -> Outcome:
     """Outcome of `pkmcal calibrate`, with the texts of its files."""
     c, held_out, over = calibration, _held_out(calibration), _tool_map(calibration)
-    in_view = digests(c.session)
-    report = report_of(c, held_out, over, session_digest(c.session, in_view))
+    file_digests = digests(c.session)
+    report = report_of(c, held_out, over, session_digest(c.session, file_digests))
     open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         report,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, calibration_document(c, open_, predicted, over, in_view)),
+        texts=texts_of(c, calibration_document(c, open_, predicted, over, file_digests)),
         summary={
             "verdict": c.verdict.document(),
             **(report.summary or {}),
@@ -196,8 +196,8 @@ def calibration_cards(
         "mean distance of the joint centres, drawing and result laid over each other; largest "
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
-    value = (
-        _flat(flatness, tool) if flatness else None,
+    cards = (
+        _flatness(flatness, tool) if flatness else None,
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
         shifted,
@@ -205,7 +205,7 @@ def calibration_cards(
         _data(session, observation, estimate, _links(calibration)),
         _fit(session, estimate),
     )
-    return tuple(card for card in value if card)
+    return tuple(card for card in cards if card)
 
 
 def calibration_numbers(
@@ -252,19 +252,19 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
         _pose_values(tool.position.mean(), tool.orientation.mean()),
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
         f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
-        f"{_turned(float(tool.orientation.max()))}",
+        f"{_turn_text(float(tool.orientation.max()))}",
     )
 
 
-def _flat(bed: Bed, tool: ToolError) -> Figure:
+def _flatness(bed: Bed, tool: ToolError) -> Figure:
     """Card on the flatness of a probed bed.
 
     The expected sigma of the tool's height, and how the nominal model bent the bed.
     """
-    there = tool.T_base_platform[:, :2, 3]
+    xy = tool.T_base_platform[:, :2, 3]
     finite = np.isfinite(tool.off_position)
     # error of the nominal model in z, without the plane that only tilts and lifts the bed
-    plane = np.column_stack([np.ones(int(finite.sum())), there[finite]])
+    plane = np.column_stack([np.ones(int(finite.sum())), xy[finite]])
     off = tool.off[finite, 5]
     bent = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
     return Figure(
@@ -289,7 +289,7 @@ def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figur
         "What did the drawing do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),
         "mean error of the drawing's pose at the same readings; worst "
-        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turned(float(turn.max()))}",
+        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turn_text(float(turn.max()))}",
     )
 
 
@@ -381,7 +381,7 @@ def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], 
     return ((brief(position * 1e3), "mm"), *turn)
 
 
-def _turned(orientation: float) -> str:
+def _turn_text(orientation: float) -> str:
     """Orientation (rad) as the rest of a sentence; empty for a platform that does not turn."""
     return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
 

@@ -92,7 +92,7 @@ def outcome_of(
                 "Photographs",
                 html=page.filled_template(
                     "corners.html.j2",
-                    pictures=_photographs(c, [Path(path) for path in paths], factor),
+                    pictures=_images(c, [Path(path) for path in paths], factor),
                     factor=factor,
                     missed=[d for d in c.detections if not d.success],
                 ),
@@ -126,12 +126,12 @@ def _intrinsics(c: CameraCalibration) -> Table:
     for name, value, sigma in values:
         unit = INTRINSIC_UNITS.get(name.partition(".")[0], "")
         places = decimals(sigma)
-        display = (
+        cells = (
             (number(value, places), number(sigma, places))
             if sigma > 0
             else (f"{value:g}", "not estimated")
         )
-        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*display, unit)))
+        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*cells, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
 
 
@@ -202,16 +202,16 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
+def _images(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
     """All views with their images, found by file name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
         jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
-        return tuple(_photograph(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+        return tuple(_image(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
 
-def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
+def _image(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
     """One view with its detected corners."""
     finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
     corners: list[Arrow] = []

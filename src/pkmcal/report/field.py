@@ -101,15 +101,15 @@ def section(
     links: Links,
 ) -> Part | None:
     """Section of the report; None without residuals."""
-    value = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
-    if not value:
+    result = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
+    if not result:
         return None
-    display, factor, longest = value
+    image_fields, factor, longest = result
     text = (
         f"{FIELD_READING_TEXT} Drawn {factor:g} times as long as they are; the longest is"
         f" {brief(longest)} px."
     )
-    html = page.filled_template("fields.html.j2", fields=display)
+    html = page.filled_template("fields.html.j2", fields=image_fields)
     return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
 
 
@@ -136,11 +136,11 @@ def field_offsets(
         )
         for axis in (0, 1)
     ]
-    values = Offsets(
+    offsets = Offsets(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Offsets))
     )
-    finite = np.isfinite(values.value) & np.isfinite(values.pixel).all(axis=-1)
-    return values.select(np.asarray(finite))
+    finite = np.isfinite(offsets.value) & np.isfinite(offsets.pixel).all(axis=-1)
+    return offsets.select(np.asarray(finite))
 
 
 def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:

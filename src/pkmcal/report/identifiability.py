@@ -53,28 +53,28 @@ def directions_headline(findings: Findings) -> str:
 
 def spectrum(findings: Findings) -> BarChart | None:
     """Bars of the information in all directions, best known first, on a logarithmic scale."""
-    values = np.asarray(findings.identifiability.singular_values, dtype=float)
-    if values.size == 0:
+    information = np.asarray(findings.identifiability.singular_values, dtype=float)
+    if information.size == 0:
         return None
     decades = math.log10(1 / LEAST_BAR_INFORMATION)
     heights = np.maximum(
-        np.log10(np.maximum(values, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
+        np.log10(np.maximum(information, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
     )
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
         UprightBar(
             str(k + 1),
-            f"Direction {k + 1}: {reference_values}",
+            f"Direction {k + 1}: {words}",
             float(height),
-            quiet=bool(value >= 1),
+            quiet=bool(ratio >= 1),
         )
-        for k, (value, height) in enumerate(zip(values, heights, strict=True))
-        for reference_values in [
+        for k, (ratio, height) in enumerate(zip(information, heights, strict=True))
+        for words in [
             "the data do not determine it"
             if k >= findings.identifiability.rank
-            else f"the drawing knows it {brief(1 / value)} times better"
-            if value < 1
-            else f"the data know it {brief(value)} times better than the drawing"
+            else f"the drawing knows it {brief(1 / ratio)} times better"
+            if ratio < 1
+            else f"the data know it {brief(ratio)} times better than the drawing"
         ]
     )
     tops = range(math.floor(high) + 1)
@@ -143,7 +143,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
 
 def tied(table: ParameterTable) -> str:
     """Sentence on tied parameters; empty without any."""
-    groups = [names for names in _together(table) if not names & set(table.fixed)]
+    groups = [names for names in _tie_groups(table) if not names & set(table.fixed)]
     if not groups:
         return ""
     against = {name for names in table.opposed for name in names}
@@ -156,7 +156,7 @@ def tied(table: ParameterTable) -> str:
     return f"Changes together, as one value: {'; '.join(text)}{more}."
 
 
-def _together(table: ParameterTable) -> list[set[str]]:
+def _tie_groups(table: ParameterTable) -> list[set[str]]:
     """Groups of tied parameters; ties that share a name are merged."""
     out: list[set[str]] = []
     for names in table.tied:

@@ -73,8 +73,8 @@ def plot(
     names = [session.configurations[k] for k in some]
     cameras = np.array([inverse(T)[:3, 3] for T in state.T_camera_base[: len(session.stations)]])
     frames = _frames(machine, limbs, names)
-    still = _still(session, estimate, limbs, links, places)
-    data = [*_moving(machine, frames[0]["data"]), *still]
+    still = _static_traces(session, estimate, limbs, links, places)
+    data = [*_moving_traces(machine, frames[0]["data"]), *still]
     layout = _layout(limbs, cameras.reshape(-1, 3), data, names)
     fewer = f" of {len(used)}, evenly chosen" if len(some) < len(used) else ""
     return Plot(
@@ -107,7 +107,7 @@ def _frames(machine: Machine, limbs: PosedLimbs, names: list[str]) -> tuple[dict
     return tuple(out)
 
 
-def _moving(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _moving_traces(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Traces of the first frame, with their styles."""
     out: list[dict[str, Any]] = []
     lines = (("axes of the legs", "--muted", 3), ("arms", "--ink", 7), ("platform", "--ink", 5))
@@ -175,7 +175,7 @@ def _faces(tubes: int) -> Integers:
 # ------------------------------------------------------------------ static traces
 
 
-def _still(
+def _static_traces(
     session: Session,
     estimate: Estimate,
     limbs: PosedLimbs,

@@ -106,20 +106,20 @@ class ParameterGroup:
     rows: tuple[ParameterRow, ...]
 
 
-def section(drawing: Machine, estimate: Estimate) -> Part:
+def section(nominal: Machine, estimate: Estimate) -> Part:
     """Section with the table of parameters."""
     visible = estimate.edge_weights.size or estimate.pose_weights.size
     estimates = parameter_estimates(
-        drawing.values, estimate.machine, estimate.covariance, estimate.data_share
+        nominal.values, estimate.machine, estimate.covariance, estimate.data_share
     )
     groups = parameter_groups(estimates)
     html = page.filled_template(
         "parameters.html.j2",
         groups=groups,
         downloads={
-            "parameters.csv": _as_link("text/csv", parameters_csv(estimates)),
-            "parameters.tex": _as_link("application/x-tex", parameters_tex(groups)),
-            "parameters.json": _as_link(
+            "parameters.csv": _data_url("text/csv", parameters_csv(estimates)),
+            "parameters.tex": _data_url("application/x-tex", parameters_tex(groups)),
+            "parameters.json": _data_url(
                 "application/json", json_text({"parameters": estimates.records()})
             ),
         },
@@ -157,7 +157,7 @@ def _for_tex(text: str) -> str:
     return text
 
 
-def _as_link(kind: str, text: str) -> str:
+def _data_url(kind: str, text: str) -> str:
     """Data URL of a text."""
     packed = base64.b64encode(text.encode("utf-8")).decode("ascii")
     return f"data:{kind};charset=utf-8;base64,{packed}"
@@ -206,29 +206,25 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
     """
     table = estimate.machine.parameters
     names = table.names
-    results = () if findings is None else findings.unidentified
-    text = [{_whole_axis(name) for name in s.parameters} for s in results]
+    unidentified_directions = () if findings is None else findings.unidentified
+    named_together = [{_whole_axis(name) for name in s.parameters} for s in unidentified_directions]
     pairs = [
         (names[i], names[j], rho)
         for i, j, rho in tight_pairs(estimate)
-        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in text)
+        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in named_together)
     ]
-    return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_TIGHT_PAIRS])
+    return tuple(
+        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
+        f"{number(rho, 3)}): their {'difference' if rho > 0 else 'sum'} is known far better than"
+        " each alone."
+        for first, second, rho in pairs[:MOST_TIGHT_PAIRS]
+    )
 
 
 def _whole_axis(name: str) -> str:
     """Axis of which a parameter is a component; other parameters unchanged."""
     whole = name.rpartition(".")[0]
     return whole if whole.endswith("axis") else name
-
-
-def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
-    """Sentence on two tightly correlated parameters."""
-    what = "difference" if rho > 0 else "sum"
-    return (
-        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
-        f"{number(rho, 3)}): their {what} is known far better than each alone."
-    )
 
 
 def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
@@ -276,23 +272,23 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
 def correlations_part(estimate: Estimate) -> Part | None:
     """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
     table = estimate.machine.parameters
-    display, rho, pairs = correlations(estimate)
-    if not 1 < len(display) <= MOST_CORRELATIONS:
+    free, rho, pairs = correlations(estimate)
+    if not 1 < len(free) <= MOST_CORRELATIONS:
         return None
-    names = [table.in_words(table.names[k]) for k in display]
+    names = [table.in_words(table.names[k]) for k in free]
     off = np.abs(rho) * pairs
     a, b = np.unravel_index(np.argmax(off), off.shape)
     text = (
         f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
         f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
     ).replace("-", "−")
-    if np.count_nonzero(pairs) < len(display) * (len(display) - 1) // 2:
+    if np.count_nonzero(pairs) < len(free) * (len(free) - 1) // 2:
         text += " Components of one axis, which its length binds, are not counted."
     plot = Plot(
         "correlations",
         "Correlations of the parameters",
         "Point at a cell for its two parameters.",
-        f"A square of {len(display)} by {len(display)} cells, coloured by the correlation of two"
+        f"A square of {len(free)} by {len(free)} cells, coloured by the correlation of two"
         " parameters each.",
         _heat_map(rho, names),
         height=600,

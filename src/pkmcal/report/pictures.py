@@ -97,7 +97,7 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
         for photo in {p.configuration: p for p in reversed(station.photographs)}.values()
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
-    images = {s: _images(session, s) for s in range(len(session.stations))} | {
+    images = {s: _decoded(station) for s, station in enumerate(session.stations)} | {
         **calibration.photographs
     }
     files = [
@@ -108,19 +108,19 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
-    count = _ImageOverlays(calibration, shifts, centres, chosen)
+    overlays = _ImageOverlays(calibration, shifts, centres, chosen)
     room = JPEG_CHARACTERS_A_PAGE - sum(len(small) + len(large) for small, large in shots)
     return Album(
         tuple(
-            count.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
+            overlays.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
             for place in [(s, photo.configuration)]
         ),
         tuple(_rejected(session, room)),
         len(every),
-        count.factor,
+        overlays.factor,
         links,
-        count.corners,
+        overlays.corners,
     )
 
 
@@ -150,11 +150,6 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
         )
 
 
-def _images(session: Session, s: int) -> Pictures:
-    """Images of a station, decoded on access."""
-    return _decoded(session.stations[s])
-
-
 def _decoded(station: Station) -> Pictures:
     """Images of a station that need not be in the session any more, decoded on access."""
     paths = [photo.path for photo in station.photographs]
@@ -173,9 +168,9 @@ def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
     )
     numbers = np.concatenate([np.full(len(edges), 2.0), poses.rows])
     places = np.concatenate([np.column_stack([x.station, x.configuration]) for x in (edges, poses)])
-    each, which = np.unique(places, axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    mean = np.bincount(which, squares) / np.bincount(which, numbers)
+    each, group = np.unique(places, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    mean = np.bincount(group, squares) / np.bincount(group, numbers)
     return {(s, k): float(m) ** 0.5 for (s, k), m in zip(each.tolist(), mean, strict=True)}
 
 
@@ -229,12 +224,14 @@ class _ImageOverlays:
         mine = c.select((c.station == s) & (c.photograph == p))
         width, height = station.camera.image_size
         edges, missed = self.edges[s, k], self.missed[s, k]
+        n_rejected = sum(edge.quiet for edge in edges)
+        rms = float(np.sqrt(np.mean(np.sum(mine.off**2, axis=1)))) if len(mine) else 0.0
         captions = [
-            count(len(edges), "edge") + _rejected_words(sum(e.quiet for e in edges))
+            count(len(edges), "edge") + (f", {n_rejected} of them rejected" if n_rejected else "")
             if edges
             else "",
             f"{len(missed)} not used" if missed else "",
-            f"{count(len(mine), 'corner')}, {_size(mine)}" if len(mine) else "",
+            f"{count(len(mine), 'corner')}, {brief(rms)} px off" if len(mine) else "",
             f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
             *self.reasons[s, k],
             "" if shot[0] else "the file could not be read",
@@ -322,8 +319,8 @@ class _ImageOverlays:
             for side, end in enumerate(("base", "platform")):
                 for j in np.flatnonzero(inside[side, n]).tolist():
                     old = drawn[side, n, j]
-                    cross = _pair(old) if np.isfinite(old).all() else None
-                    new = _pair(visible[side, n, j])
+                    cross = _rounded_pixel(old) if np.isfinite(old).all() else None
+                    new = _rounded_pixel(visible[side, n, j])
                     self.spots[s, k].append(Spot(j + 1, end, new, cross, j not in labelled))
                     labelled.add(j)
 
@@ -343,17 +340,6 @@ def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
     )
 
 
-def _rejected_words(n: int) -> str:
-    """Number of rejected edges as the rest of a sentence."""
-    return f", {n} of them rejected" if n else ""
-
-
-def _size(corners: BoardCorners) -> str:
-    """Root mean square residual of corners, in words."""
-    rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
-    return f"{brief(rms)} px off"
-
-
-def _pair(point: Array) -> tuple[float, float]:
+def _rounded_pixel(point: Array) -> tuple[float, float]:
     """Pixel with one decimal."""
     return round(float(point[0]), 1), round(float(point[1]), 1)

@@ -63,9 +63,9 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     parts = [_order(plan), _curve(plan)]
     if plan.tried:
         texts[PLAN_PLACES_FILE] = yaml_text(stations_document(plan))
-        parts.append(_places(plan))
+        parts.append(_camera_places(plan))
     if _cameras(plan):
-        parts.append(_where(plan))
+        parts.append(_space(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
     gain = plan.by_chance.position / plan.promised.position
@@ -76,8 +76,8 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
         verdict=Verdict(
             usable=True,
             headline=f"These {count(len(plan.names), 'configuration')} will determine the tool's"
-            f" {_accuracy_cells(plan.promised)}, standard deviations, mean over the workspace.",
-            findings=(_paying(plan), *_carefully(plan)),
+            f" {_accuracy_text(plan.promised)}, standard deviations, mean over the workspace.",
+            findings=(_worth_note(plan), *_blocked_notes(plan)),
         ),
         stamp="Plan",
         figures=(
@@ -109,7 +109,7 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     )
 
 
-def _accuracy_cells(accuracy: Accuracy) -> str:
+def _accuracy_text(accuracy: Accuracy) -> str:
     """Accuracy of position and, if the platform turns, of orientation, in words."""
     words = f"position to {amount(accuracy.position, 'm')}"
     if not accuracy.orientation:
@@ -126,7 +126,7 @@ def _purpose(plan: MeasurementPlan) -> str:
     return f"{each}, chosen for {INDEX_NAMES[plan.index]}; workspace: {plan.region}."
 
 
-def _paying(plan: MeasurementPlan) -> Finding:
+def _worth_note(plan: MeasurementPlan) -> Finding:
     """Note on the number of configurations beyond which more are not worthwhile."""
     last, until = plan.promised, plan.pays_until
     twice = next(a for a in plan.curve if a.count > last.count)
@@ -140,7 +140,7 @@ def _paying(plan: MeasurementPlan) -> Finding:
     return note("plan.pays_until", number=until, **facts)
 
 
-def _carefully(plan: MeasurementPlan) -> tuple[Finding, ...]:
+def _blocked_notes(plan: MeasurementPlan) -> tuple[Finding, ...]:
     """Note on configurations that a straight path does not reach."""
     names = [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]
     return (note("plan.blocked", listed(names), names=names),) if names else ()
@@ -267,7 +267,7 @@ def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
     return list(out.values())
 
 
-def _places(plan: MeasurementPlan) -> Part:
+def _camera_places(plan: MeasurementPlan) -> Part:
     """Section on the camera's places, and what the best of them give alone."""
     order = sorted(plan.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
     rows = [
@@ -293,7 +293,7 @@ def _places(plan: MeasurementPlan) -> Part:
     return Part("places", "Where to put the camera", tables=(table,))
 
 
-def _where(plan: MeasurementPlan) -> Part:
+def _space(plan: MeasurementPlan) -> Part:
     """Section with a plot of the machine, its configurations, cameras, and candidate places."""
     rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
     machine = rig.machine
@@ -325,7 +325,7 @@ def _where(plan: MeasurementPlan) -> Part:
             ),
         ]  # fmt: skip
     if plan.tried:
-        data.append(_tried(plan.tried))
+        data.append(_candidate_markers(plan.tried))
     layout = uncropped(data, path_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
@@ -340,7 +340,7 @@ def _where(plan: MeasurementPlan) -> Part:
     return Part("where", "In space", plots=(plot,))
 
 
-def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
+def _candidate_markers(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
     """Markers at candidate places, coloured by the accuracy that each gives alone."""
     at = np.array([one.place.position for one in tried])
     value = np.array([one.alone for one in tried]) * 1e3
@@ -389,11 +389,11 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
                 "turn": plan.region.turn,
             },
             "together": plan.together,
-            "now": _progress_text(plan.now),
-            "promised": _progress_text(plan.promised),
-            "by_chance": _progress_text(plan.by_chance),
+            "now": _accuracy_document(plan.now),
+            "promised": _accuracy_document(plan.promised),
+            "by_chance": _accuracy_document(plan.by_chance),
             "pays_until": plan.pays_until,
-            "curve": [_progress_text(a) for a in plan.curve],
+            "curve": [_accuracy_document(a) for a in plan.curve],
             "columns": list(plan.subject.columns),
             "configurations": [
                 {
@@ -426,7 +426,7 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _progress_text(accuracy: Accuracy) -> dict[str, float]:
+def _accuracy_document(accuracy: Accuracy) -> dict[str, float]:
     """Accuracy as plain data."""
     return {
         "configurations": accuracy.count,

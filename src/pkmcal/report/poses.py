@@ -58,8 +58,8 @@ def errors(poses: PoseSet, estimate: Estimate) -> Array:
     """
     white = estimate.pose_residuals * estimate.statistics.pose_scale
     error = (np.linalg.pinv(poses.whiten) @ white[..., None])[..., 0]
-    reference_values = np.any(poses.whiten != 0, axis=-2)
-    return np.where(reference_values, error, np.nan)
+    measured = np.any(poses.whiten != 0, axis=-2)
+    return np.where(measured, error, np.nan)
 
 
 def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...]:
@@ -67,7 +67,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
     inliers = estimate.pose_weights >= INLIER_WEIGHT
     s = estimate.statistics
     n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} rejected"
-    in_view = count(len(np.unique(poses.configuration)), "configuration")
+    configurations = count(len(np.unique(poses.configuration)), "configuration")
     sizes = [_length(error[inliers, 3:]) * 1e3, float(np.rad2deg(_length(error[inliers, :3])))]
     sizes_text = [
         f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)
@@ -75,7 +75,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
     # the noise factor is at least 1; the residuals may be smaller
     times = s.pose_scale if s.pose_scale > 1 else np.sqrt(s.chi2_poses / max(s.dof_poses, 1))
     return (
-        f"{count(len(poses), 'pose')} measured in {in_view}{n_rejected}.",
+        f"{count(len(poses), 'pose')} measured in {configurations}{n_rejected}.",
         f"They are {' and '.join(sizes_text)} off the calibrated machine (root mean"
         " square), which is"
         f" {number(times, 2)} times their stated noise.",
@@ -95,9 +95,9 @@ def _mounts(session: Session, estimate: Estimate) -> Table:
     state, rows = estimate.state, list[Row]()
     for m, name in enumerate(mount_names(session, len(state.T_mount))):
         T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
-        reference = identified(estimate.machine, estimate.mount_covariance[m])
-        place = _texts(T[:3, 3], sigma[3:], reference[3:], 1e3)
-        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], reference[:3], 180 / np.pi)
+        determined = identified(estimate.machine, estimate.mount_covariance[m])
+        place = _texts(T[:3, 3], sigma[3:], determined[3:], 1e3)
+        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], determined[:3], 180 / np.pi)
         rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
     return Table(
         "Where it sits",

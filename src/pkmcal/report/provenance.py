@@ -44,7 +44,7 @@ def used_photographs(
     An image is in use if its board's pose is an inlier, or at least half of its edges are.
     Held-out images are not.
     """
-    names_so_far = set[tuple[int, int]]()
+    in_use = set[tuple[int, int]]()
     for item, weights in (
         (observation.edges, estimate.edge_weights),
         (observation.poses, estimate.pose_weights),
@@ -54,9 +54,9 @@ def used_photographs(
         pairs, own = np.unique(pairs, axis=0, return_inverse=True)
         inliers = np.bincount(own.ravel(), weights >= INLIER_WEIGHT, len(pairs))
         most = 2 * inliers >= np.bincount(own.ravel(), minlength=len(pairs))
-        names_so_far |= {(s, c) for s, c in pairs[most].tolist()}
+        in_use |= {(s, c) for s, c in pairs[most].tolist()}
     return tuple(
-        sum((s, photo.configuration) in names_so_far for photo in station.photographs)
+        sum((s, photo.configuration) in in_use for photo in station.photographs)
         for s, station in enumerate(session.stations)
     )
 
@@ -86,15 +86,17 @@ def stations(
             photographs += f", {pixels} × {pixels} pixels as one"
         places = decimals(sigma)
         cells = (
-            *_place(estimate, s),
+            *_pose_cells(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
-            _shift_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
+            _distance_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
             f"{station.camera_file}, {station.camera.model}, {photographs}",
         )
         rows.append(Row(station.name, cells))
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
-        rows.append(Row(table.name, (*_place(estimate, s), *(["–"] if edges else []), "–", what)))
+        rows.append(
+            Row(table.name, (*_pose_cells(estimate, s), *(["–"] if edges else []), "–", what))
+        )
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
     columns += ("Away from the pose by hand", "Camera")
@@ -105,32 +107,32 @@ def stations(
     return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
 
 
-def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
+def _pose_cells(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     """Position of a station with standard deviations (mm), and that of its orientation (degrees).
 
     Open where the data do not determine them.
     """
-    value, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
-    place = inverse(value)[:3, 3] * 1e3
-    covariance = base_camera_covariance(value, covariance)
-    reference = identified(estimate.machine, covariance)
+    T_camera_base, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
+    place = inverse(T_camera_base)[:3, 3] * 1e3
+    covariance = base_camera_covariance(T_camera_base, covariance)
+    determined = identified(estimate.machine, covariance)
     # rounding may leave a negative variance
     sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
         f"{number(v, decimals(d))} ± {brief(d)}" if sure else "open"
-        for v, d, sure in zip(place.tolist(), sigma.tolist(), reference[3:], strict=True)
+        for v, d, sure in zip(place.tolist(), sigma.tolist(), determined[3:], strict=True)
     )
-    return x, y, z, amount(turn, "rad") if reference[:3].all() else "open"
+    return x, y, z, amount(turn, "rad") if determined[:3].all() else "open"
 
 
-def _shift_cell(rough: Array | None, values: Array) -> str:
+def _distance_cell(rough: Array | None, estimated: Array) -> str:
     """Distance and angle of the estimated pose from the one by hand."""
     if rough is None:
         return "–"
-    turn = np.rad2deg(np.linalg.norm(pose_difference(values, rough)[:3]))
-    direction = np.linalg.norm(inverse(values)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
-    return f"{number(float(direction), 0)} mm, {number(float(turn), 1)}°"
+    turn = np.rad2deg(np.linalg.norm(pose_difference(estimated, rough)[:3]))
+    distance = np.linalg.norm(inverse(estimated)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
+    return f"{number(float(distance), 0)} mm, {number(float(turn), 1)}°"
 
 
 def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
@@ -209,7 +211,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             if s.n_edges
         ),
         *(
-            (f"What the data allow of the {name}' stated noise", f"{_between(limits)} times")
+            (f"What the data allow of the {name}' stated noise", f"{_interval_text(limits)} times")
             for name, limits, n in (
                 ("poses", s.pose_range, s.n_poses),
                 ("readings", s.reading_range, s.n_joints),
@@ -225,7 +227,7 @@ def link_labels(session: Session) -> str:
     return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
 
 
-def _between(limits: tuple[float, float | None]) -> str:
+def _interval_text(limits: tuple[float, float | None]) -> str:
     """Interval in words."""
     low, high = limits
     return f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)}"
@@ -286,7 +288,7 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
         cases=tuple(
             (
                 f"{stations[i.station]} / {configurations[i.configuration]}",
-                _what(i) if same else f"{_what(i)}: {i.reason}",
+                _rejected_part(i) if same else f"{_rejected_part(i)}: {i.reason}",
             )
             for number, i in enumerate(items)
             if number < MOST_CASES or i.leg < 0  # whole images and boards are always listed
@@ -294,7 +296,7 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
     )
 
 
-def _what(item: Rejection) -> str:
+def _rejected_part(item: Rejection) -> str:
     """Rejected part in words; -1 stands for all."""
     if item.leg < 0:
         return "board" if item.reason.startswith("the board") else "whole photograph"

@@ -115,7 +115,7 @@ def _configuration(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iter
         for part in ("platform", "calibrated", "drawing", "measured"):
             yield Logged(("machine", part), "clear", {}, at)
     for s in range(len(session.stations)):
-        yield from _photograph(c, s, k)
+        yield from _image(c, s, k)
 
 
 def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[Logged]:
@@ -141,9 +141,9 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
             else RECORDED_GREY
             for j in legs
         ]
-        static = {"strips": strips, "radii": radii, "colours": colours}
+        lines = {"strips": strips, "radii": radii, "colours": colours}
         labels = [f"leg {j + 1}" for j in legs]
-        yield Logged(("machine", name), "lines3d", {**static, "labels": labels}, at)
+        yield Logged(("machine", name), "lines3d", {**lines, "labels": labels}, at)
     ends = machine.ends_at(joints, pose)
     points = np.concatenate([ends.a, ends.b])
     labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
@@ -154,8 +154,8 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     if len(c.observation.poses):
         points, configuration = poses.target_places(c.observation, c.estimate)
         points = points[configuration == k]
-        static = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
-        yield Logged(("machine", "measured"), "points3d", static, at)
+        targets = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
+        yield Logged(("machine", "measured"), "points3d", targets, at)
 
 
 def _tubes(
@@ -179,7 +179,7 @@ def _tubes(
     return strips, radii, legs
 
 
-def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
+def _image(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     """Records of a station's image with its edges, and of the calibrated machine's contour."""
     at, session, estimate = k + 1, c.session, c.estimate
     station = session.stations[s]

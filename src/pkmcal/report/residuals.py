@@ -51,7 +51,7 @@ def section(
     links : to the images on the page.
     poses : chart of the poses' residuals, None without poses.
     """
-    display = charts.panels(
+    panels = charts.panels(
         by_leg(session, edges, estimate, links),
         _edge_boxes("station", session.station_names, edges.station, edges, estimate, links),
         _joints(session, estimate, links),
@@ -61,7 +61,7 @@ def section(
         _outward(edges, shifts, links),
         remarks=remarks(session, edges, estimate, shifts),
     )
-    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=display)
+    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=panels)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:
@@ -281,24 +281,26 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     if len(level) < 3:
         return []
     middle = float(np.median(list(level.values())))
-    results = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
-    results = sorted(results, key=lambda g: -level[g])[:4]
+    outstanding = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
+    outstanding = sorted(outstanding, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
         "middle one: check its photographs first."
-        for g in results
+        for g in outstanding
     ]
 
 
 def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
     """Edges with a large and significant mean shift, in words, the largest first."""
-    results: list[tuple[float, str]] = []
+    shaded: list[tuple[float, str]] = []
     for (leg, tube, side), mine in _edge_kinds(edges):
-        values = shifts[mine & (estimate.edge_weights >= INLIER_WEIGHT) & np.isfinite(shifts)]
-        if len(values) < 4:
+        finite_shifts = shifts[
+            mine & (estimate.edge_weights >= INLIER_WEIGHT) & np.isfinite(shifts)
+        ]
+        if len(finite_shifts) < 4:
             continue
-        mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
+        mean, error = finite_shifts.mean(), finite_shifts.std(ddof=1) / np.sqrt(len(finite_shifts))
         if abs(mean) > max(SHADED_MEAN_SHIFT, 3 * error):
             where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
-            results.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
-    return [text for _, text in sorted(results, reverse=True)[:4]]
+            shaded.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
+    return [text for _, text in sorted(shaded, reverse=True)[:4]]

@@ -114,11 +114,11 @@ def section(
     centres: tuple[Centres, ...],
 ) -> Part:
     """Section of the report."""
-    drawn = scene_of(session, estimate, centres)
+    scene = scene_of(session, estimate, centres)
     return Part(
         "geometry",
         "Geometry before and after",
-        (page.filled_template("geometry.html.j2", scene=drawn),),
+        (page.filled_template("geometry.html.j2", scene=scene),),
         plots=(
             Plot(
                 "space",
@@ -126,11 +126,11 @@ def section(
                 "Drag to turn, wheel or pinch to come nearer.",
                 "The machine in three dimensions: joint centres by the drawing and as calibrated."
                 " The two plane views show the same.",
-                figure_of(drawn),
+                figure_of(scene),
                 height=420,
             ),
         ),
-        html=page.filled_template("views.html.j2", views=plane_projections(drawn)),
+        html=page.filled_template("views.html.j2", views=plane_projections(scene)),
         menu="Geometry",
     )
 
@@ -153,7 +153,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
-        display = drawing + factor * (apply(T, side.calibrated) - drawing)
+        enlarged = drawing + factor * (apply(T, side.calibrated) - drawing)
         spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
         for j in range(len(drawing)):
             dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
@@ -161,11 +161,11 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
                 f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
                 f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
             )
-            arm = np.stack([drawing[j], display[j]])[:, None]
+            arm = np.stack([drawing[j], enlarged[j]])[:, None]
             if side.side == "base":
                 old = apply(side.T_calibrated_drawing, before[j])
                 arm = np.stack([old, old + factor * (after[j] - old)])
-            joints.append(Joint(j + 1, side.side, drawing[j], display[j], spread[j], tip, arm))
+            joints.append(Joint(j + 1, side.side, drawing[j], enlarged[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 

@@ -280,16 +280,16 @@ def choices_table(s: Study) -> Table:
     """Table of the sets of legs that have to be observed."""
     useful = [c for c in s.choices if not c.blind]
     sizes = sorted({len(c.legs) for c in useful})
-    display = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
-    if s.own not in display:
-        display = [s.own, *display]
+    listed = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
+    if s.own not in listed:
+        listed = [s.own, *listed]
     rows = [
         Row(
             chosen_legs(c, s) + (", as seen" if c == s.own else ""),
             (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
              if c.fading else "yes"),
         )
-        for c in display
+        for c in listed
     ]  # fmt: skip
     return Table(
         f"Which legs must be seen, by their {s.plan.loop.law}",
@@ -363,11 +363,11 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
         "title": o.estimate.title,
         "reached": o.reached,
         "ends": {end.word: n for end, n in o.ends.items()},
-        "astray_median": _over(o.astray, o, np.median),
-        "astray_largest": _over(o.astray, o, np.max),
-        "overshoot_median": _over(o.overshoot, o, np.median),
-        "overshoot_largest": _over(o.overshoot, o, np.max),
-        "error_rise_largest": _over(o.rise, o, np.max),
+        "astray_median": _statistic(o.astray, o, np.median),
+        "astray_largest": _statistic(o.astray, o, np.max),
+        "overshoot_median": _statistic(o.overshoot, o, np.median),
+        "overshoot_largest": _statistic(o.overshoot, o, np.max),
+        "error_rise_largest": _statistic(o.rise, o, np.max),
         "settling_median": _settled(o),
         "runs": [
             {"end": end.word, "way": sense, "astray": off, "overshoot": over, "settling": settling}
@@ -378,7 +378,7 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
     }
 
 
-def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
+def _statistic(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
     """Statistic over the runs that reached the goal, None without any."""
     good = values[o.runs.reached]
     return float(of(good)) if good.size else None
@@ -386,13 +386,13 @@ def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
 
 def _percent(values: Any, o: Trials) -> str:
     """Largest value over the runs that reached the goal, as a percentage."""
-    value = _over(values, o, np.max)
+    value = _statistic(values, o, np.max)
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
 def _mm(values: Array, o: Trials, of: Callable[[Any], Any] = np.median) -> str:
     """Statistic in m over the runs that reached the goal, as millimetres."""
-    value = _over(values, o, of)
+    value = _statistic(values, o, of)
     return "–" if value is None else _magnitude(1e3 * value)
 
 
@@ -425,12 +425,12 @@ def shares(o: Trials, values: Array) -> Array:
     return values[rows] / np.maximum(values[rows, :1], 1e-300)
 
 
-def _every(samples: int, most: int) -> Integers:
+def _sample_rows(samples: int, most: int) -> Integers:
     """Indices of at most ``most`` samples at equal distances."""
     return np.unique(np.linspace(0, samples - 1, min(samples, most)).round().astype(int))
 
 
-def _rounded(values: Array, digits: int = 4) -> list[float]:
+def _significant(values: Array, digits: int = 4) -> list[float]:
     """Numbers with so many significant digits."""
     return [float(f"{v:.{digits}g}") for v in values]
 
@@ -439,7 +439,7 @@ def curves(s: Study) -> dict[str, Any]:
     """Plot of the error's norm against time, a line and a band for each estimate."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), SERVO_CURVE_POINTS)
+    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
         values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST_SERVO_ERROR_SHARE)
         name = o.estimate.name
@@ -459,7 +459,7 @@ def tail(s: Study) -> dict[str, Any]:
     """Plot of the distance from the goal as a share of the path, enlarged near zero."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), SERVO_CURVE_POINTS)
+    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
         values = 100 * np.median(shares(o, o.runs.travel)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
@@ -473,10 +473,10 @@ def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
     dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
     style = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
     entries = {"hoverinfo": "all", "hovertemplate": hover}
-    return _flat(o.estimate.title, _rounded(time), _rounded(values), style, **entries)
+    return _line_trace(o.estimate.title, _significant(time), _significant(values), style, **entries)
 
 
-def _flat(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
+def _line_trace(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
     """Trace of a line in the plane."""
     plain = {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": y}
     return {**plain, "line": style, "hoverinfo": "skip", **more}
@@ -487,7 +487,9 @@ def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
     both = np.concatenate([time, time[::-1]])
     edge = np.concatenate([values.max(axis=0), values.min(axis=0)[::-1]])
     fill = {"fill": "toself", "fillcolor": colour, "showlegend": False}
-    return _flat(f"{name}, all runs", _rounded(both), _rounded(edge), {"width": 0}, **fill)
+    return _line_trace(
+        f"{name}, all runs", _significant(both), _significant(edge), {"width": 0}, **fill
+    )
 
 
 # ------------------------------------------------------------------ in space
@@ -512,15 +514,15 @@ def space(s: Study, run: int) -> dict[str, Any]:
 
     Moving traces come first, so that frames refer to them by index.
     """
-    run_numbers = s.outcome("identified").runs
-    start, goal = run_numbers.T_base_platform[run, 0], run_numbers.goals[run]
-    in_view = set(s.eye.true.legs.tolist())
+    runs = s.outcome("identified").runs
+    start, goal = runs.T_base_platform[run, 0], runs.goals[run]
+    observed = set(s.eye.true.legs.tolist())
     *legs, platform = _moving(s, start)
     data = [
         line(
-            f"leg {j + 1}" + ("" if j in in_view else ", not seen"),
-            f"--leg{j % N_COLOURS + 1}" if j in in_view else "--quiet",
-            8 if j in in_view else 4,
+            f"leg {j + 1}" + ("" if j in observed else ", not seen"),
+            f"--leg{j % N_COLOURS + 1}" if j in observed else "--quiet",
+            8 if j in observed else 4,
             (),
             **leg,
         )
@@ -534,7 +536,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     data.append(dashed)
     for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
         o = s.outcome(name)
-        poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
+        poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
         middle = _limbs(s, poses)[1].mean(axis=1)
         data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
     camera = markers(
@@ -560,7 +562,7 @@ def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
     """Frames of the animation of :func:`space`."""
     runs = s.outcome("identified").runs
     out: list[dict[str, Any]] = []
-    for row in _every(int(runs.last[run]) + 1, ANIMATION_FRAMES):
+    for row in _sample_rows(int(runs.last[run]) + 1, ANIMATION_FRAMES):
         moving = _moving(s, runs.T_base_platform[run, row])
         out.append(
             {
@@ -603,13 +605,13 @@ def image(s: Study, run: int) -> dict[str, Any]:
     width, height = s.eye.camera.image_size
     right, bottom = width - 0.5, height - 0.5
     x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
-    data = [_flat("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
+    data = [_line_trace("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
     runs = s.outcome("identified").runs
     first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
     data += _edges(s, first, 1.2, "at the start", "dot")
     data += _edges(s, goal, 2.6, "at the goal", "solid")
-    data += _ways(s, run, "identified", "solid")
-    data += _ways(s, run, "hand", "dash")
+    data += _end_paths(s, run, "identified", "solid")
+    data += _end_paths(s, run, "hand", "dash")
     layout = plane("x, pixels", "y, pixels")
     layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width], "constrain": "domain"}
     layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "constrain": "domain"}
@@ -627,7 +629,7 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
     """Traces of the edges at a pose."""
     pixels = _pixels(s, pose, SERVO_EDGE_PLACES)[0]
     return [
-        _flat(
+        _line_trace(
             f"edges {name}",
             _pixel_list(pixels[e, :, 0]),
             _pixel_list(pixels[e, :, 1]),
@@ -639,16 +641,16 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
     ]
 
 
-def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
+def _end_paths(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
     """Traces of the paths of both ends of each leg's first edge."""
     o = s.outcome(name)
-    poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
+    poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
     pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
     data: list[dict[str, Any]] = []
     for e in range(0, len(s.eye.tubes.leg), 2):
         ways = np.concatenate([pixels[:, e, 0], gap, pixels[:, e, -1]])
         data.append(
-            _flat(
+            _line_trace(
                 f"way, {o.estimate.title.lower()}",
                 _pixel_list(ways[:, 0]),
                 _pixel_list(ways[:, 1]),

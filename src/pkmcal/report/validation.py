@@ -80,7 +80,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
         Figure(
             "Where is the tool, by the readings?",
             tuple(
-                (_size(value, unit), DISPLAY_UNITS[unit][1])
+                (_magnitude(value, unit), DISPLAY_UNITS[unit][1])
                 for value, unit in ((new.position, "m"), (new.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
@@ -113,9 +113,9 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
                 (
                     *_mean_rms(old, k, unit),
                     *_mean_rms(new, k, unit),
-                    _size(test.joint_rms[k], unit),
+                    _magnitude(test.joint_rms[k], unit),
                     _signed(test.common[k], test.common_sigma[k], unit),
-                    _size(test.common_sigma[k], unit),
+                    _magnitude(test.common_sigma[k], unit),
                 ),
             )
             for k, (name, unit) in enumerate(_joints(session))
@@ -128,7 +128,7 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
         "Tool point: forward kinematics of the readings against the photographs",
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
-            Row(name, (_size(f.position, "m"), _size(f.orientation, "rad")))
+            Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
             for name, f in (("Drawing", old), ("Calibrated", new))
         ),
         "Root mean squares, frames laid over each other for the drawing. The photographs' own noise"
@@ -175,7 +175,7 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
     """Table of straight paths, as in [C] Table 4."""
 
     def text(value: Straightness | None) -> str:
-        return f"{_size(value.rms, 'm')} ({_size(value.largest, 'm')})" if value else "–"
+        return f"{_magnitude(value.rms, 'm')} ({_magnitude(value.largest, 'm')})" if value else "–"
 
     rows = [
         Row(path.name, (str(path.n), *map(text, (path.seen, path.drawing, path.calibrated))))
@@ -197,14 +197,14 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
     if unit:
         amounts = f": {against(out.after, out.before, unit)}"
         inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
-    retained = "" if out.promise.holds else " That is more than the deviations promise."
+    broken = "" if out.promise.holds else " That is more than the deviations promise."
     held = count(len(out.rows), "configuration")
     poses = len(np.unique(same_pose(session.joints[out.rows], session.joint_noise)))
     if poses < len(out.rows):
         held += f" of {count(poses, 'pose')}"
     sentence = (
         f"On {held} held out, the calibrated machine predicts the"
-        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{retained}"
+        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{broken}"
     )
     in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
     drawn = out.figures(out.drawing)
@@ -214,7 +214,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
             (
                 *_mean_rms(in_use, k, unit),
                 *_mean_rms(new, k, unit),
-                _size(drawn.joint_rms[k], unit),
+                _magnitude(drawn.joint_rms[k], unit),
             ),
         )
         for k, (name, unit) in enumerate(_joints(session))
@@ -223,7 +223,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         ("tool position, mm", "position", "m"),
         ("tool orientation, °", "orientation", "rad"),
     ):
-        cells = [_size(getattr(f, field), unit) for f in (in_use, new, drawn)]
+        cells = [_magnitude(getattr(f, field), unit) for f in (in_use, new, drawn)]
         rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
     table = Table(
         "Residuals of configurations in use and held out",
@@ -251,7 +251,7 @@ def _unit(session: Session) -> str | None:
 def _mean_rms(value: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
     """Mean and root mean square of a joint's residuals, with the same digits."""
     root = value.joint_rms[k]
-    return _signed(value.joint_mean[k], root, unit), _size(root, unit)
+    return _signed(value.joint_mean[k], root, unit), _magnitude(root, unit)
 
 
 def _signed(value: float, sigma: float, unit: str) -> str:
@@ -260,7 +260,7 @@ def _signed(value: float, sigma: float, unit: str) -> str:
     return number(value * scale, decimals(sigma * scale), signed=True)
 
 
-def _size(value: float, unit: str) -> str:
+def _magnitude(value: float, unit: str) -> str:
     """Magnitude in the displayed unit, two significant digits."""
     return brief(value * DISPLAY_UNITS[unit][0])
 
@@ -297,9 +297,9 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
 
 def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None:
     """Residuals of the calibrated machine, in predicted standard deviations."""
-    values = judged.calibrated.residuals / judged.promise.expected
+    normalized = judged.calibrated.residuals / judged.promise.expected
     boxes = [
-        charts.box(name, values[:, k], "σ", 1, k + 1)
+        charts.box(name, normalized[:, k], "σ", 1, k + 1)
         for k, name in enumerate(session.document["joints"]["columns"])
     ]
     return charts.row_chart(

@@ -38,7 +38,7 @@ FIXED_STATION_TEXT = (
 
 def outcome_of(w: Watch) -> Outcome:
     """Outcome of ``pkmcal watch``."""
-    value, bars = _findings_table(w), _by_configuration(w)
+    causes, bars = _findings_table(w), _by_configuration(w)
     parts = (
         Part(
             "legs",
@@ -46,7 +46,7 @@ def outcome_of(w: Watch) -> Outcome:
             html=charts.panels(_statistics(w), _zeros(w)),
             tables=(legs_table(w), _others_table(w)),
         ),
-        Part("causes", "Causes", tables=(value,)) if value else None,
+        Part("causes", "Causes", tables=(causes,)) if causes else None,
         Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
         _how(w),
     )
@@ -192,10 +192,10 @@ def _findings_table(w: Watch) -> Table | None:
     """
     if not w.judged.findings:
         return None
-    names = names_of(w.session)
+    station_names = names_of(w.session)
     rows = [
         Row(
-            f"{mark} {cause_words(suspect, names)}",
+            f"{mark} {cause_words(suspect, station_names)}",
             (number(suspect.chi2, 1), str(len(suspect.cause.sizes))),
         )
         for place, finding in enumerate(w.judged.findings, start=1)
@@ -256,7 +256,7 @@ def _span(sizes: tuple[float, float]) -> str:
 def _statistics(w: Watch) -> charts.BarChart | None:
     """Chart of the larger statistic of each leg, relative to its threshold."""
     bars = [
-        _bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
+        _leg_bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
         for leg in w.judged.legs
         if leg.whole.dof
     ]
@@ -270,7 +270,7 @@ def _statistics(w: Watch) -> charts.BarChart | None:
     )
 
 
-def _bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
+def _leg_bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
     """Bar of a leg's tests."""
     from scipy.special import chdtri
 

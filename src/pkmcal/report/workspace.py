@@ -156,7 +156,7 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
             axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
             data.append(_heat(cut, values * 1e3, name, axes))
             data.append(_crosses(session, estimate, tool_map, cut, axes, links))
-            _place_axes(layout, cut, panel, place, (across, down), extent)
+            _add_axes(layout, cut, panel, place, (across, down), extent)
             if single or row == 0:
                 layout["annotations"].append(_label(name if single else _title(cut), panel, "top"))
             if not single and column == 0:
@@ -257,7 +257,7 @@ def _crosses(
     }
 
 
-def _place_axes(
+def _add_axes(
     layout: dict[str, Any],
     cut: Slice,
     panel: str,
@@ -356,12 +356,12 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     if np.count_nonzero(thin) > len(order):
         return None
     instead = sorted(order[: np.count_nonzero(thin)])
-    which = np.array([*instead, *(3 + np.flatnonzero(~thin))])
+    components = np.array([*instead, *(3 + np.flatnonzero(~thin))])
     names = ("turn about x, °", "turn about y, °", "turn about z, °", "x, mm", "y, mm", "z, mm")
-    return which, tuple(names[k] for k in which)
+    return components, tuple(names[k] for k in components)
 
 
-def _drawn(poses: Array, home: Array, which: Integers) -> Array:
+def _plot_coordinates(poses: Array, home: Array, which: Integers) -> Array:
     """Plotted components (n, 3) of poses: rotations from home in degrees, positions in mm."""
     turns = np.rad2deg(pose_difference(poses, home)[:, :3])
     return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
@@ -377,7 +377,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     axes = _axes(poses)
     if axes is None:
         return None
-    which, names = axes
+    components, names = axes
     sigma, turn = after.position * 1e3, np.rad2deg(after.orientation)
     turns = bool(np.nanmax(turn) > np.rad2deg(NO_TURN))
     columns = [sigma, after.off_position * 1e3, turn if turns else np.zeros_like(turn)]
@@ -385,12 +385,12 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     hover += "<br>σ %{customdata[0]:.3g} mm"
     hover += ", %{customdata[2]:.2g}°" if turns else ""
     hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
-    home = poses[0] if which.min() >= 3 else session.machine.home()
+    home = poses[0] if components.min() >= 3 else session.machine.home()
     used = np.flatnonzero(estimate.configurations)
     data = [
         coloured(
             "Calibrated, σ",
-            _drawn(poses, home, which) * 1e-3,
+            _plot_coordinates(poses, home, components) * 1e-3,
             sigma,
             "σ, mm",
             customdata=_significant(np.column_stack(columns), 3),
@@ -398,7 +398,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
         ),
         markers(
             "Measured",
-            _drawn(estimate.state.T_base_platform[used], home, which) * 1e-3,
+            _plot_coordinates(estimate.state.T_base_platform[used], home, components) * 1e-3,
             {"size": 4, "color": "--calibrated", "symbol": "diamond"},
             hovertext=[f"measured: {session.configurations[k]}" for k in used],
             hoverinfo="text",
@@ -408,7 +408,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     layout["showlegend"] = False
     for axis, name in zip("xyz", names, strict=True):
         layout["scene"][f"{axis}axis"]["title"] = {"text": name}
-    if which.min() < 3:
+    if components.min() < 3:
         layout["scene"]["aspectmode"] = "cube"
     return Plot(
         "reach",
