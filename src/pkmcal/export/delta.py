@@ -220,24 +220,24 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     begin = np.where(np.isfinite(begin), begin, grid)  # for a motor that cannot reach home
     fk = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
     for share in np.linspace(0, 1, STEPS_FROM_HOME + 1)[1:]:
-        here = begin + share * (grid - begin)
-        fk = machine.forward_result(here, fk.T_base_platform)
+        readings = begin + share * (grid - begin)
+        fk = machine.forward_result(readings, fk.T_base_platform)
     poses = fk.T_base_platform
     # reachable poses, away from singularities, with the readings that were put in
     back = machine.inverse(poses)
-    good = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
-    good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
+    usable = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
+    usable &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
     # speed of each carriage or elbow per speed of the tool
-    ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
-    good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
-    if not good.any():
+    speed_ratios = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
+    usable &= np.nan_to_num(speed_ratios * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
+    if not usable.any():
         raise InputError(
             f"mechanism {machine.name!r} closes nowhere within its ranges",
             next_step="Check the ranges in the mechanism file",
         )
-    poses = poses[good]
+    poses = poses[usable]
     by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., joint]
-    return poses, grid[good][:, joint], by_reading
+    return poses, grid[usable][:, joint], by_reading
 
 
 # The fit
@@ -401,17 +401,17 @@ class _ParameterVector:
         """Parameters at x."""
         cuts = np.cumsum([count for _, count in self.parts])[:-1]
         names = [name for name, _ in self.parts]
-        by = dict(zip(names, np.split(x, cuts), strict=True))
+        changes = dict(zip(names, np.split(x, cuts), strict=True))
         own = {
-            name: getattr(self.start, name) + by[name]
+            name: getattr(self.start, name) + changes[name]
             for name in ("rod", "angle", "arm", "height", "zero")
-            if name in by
+            if name in changes
         }
-        turn = np.concatenate([by["tilt"], by.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
-        shift = np.concatenate([by["shift"], by.get("lift", np.zeros(1))]) / MM_A_METRE
+        turn = np.concatenate([changes["tilt"], changes.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
+        shift = np.concatenate([changes["shift"], changes.get("lift", np.zeros(1))]) / MM_A_METRE
         placed = self.start.T_firmware_base
         placed = pose(rotation(turn) @ placed[:3, :3], placed[:3, 3] + shift)
-        radius = self.start.radius + float(by["radius"][0])
+        radius = self.start.radius + float(changes["radius"][0])
         return replace(self.start, radius=radius, T_firmware_base=placed, **own)
 
 

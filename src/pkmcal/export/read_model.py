@@ -170,11 +170,13 @@ class ReadModel:
         # Gauss-Newton with difference quotients; the pseudoinverse tolerates redundant constraints
         steps = DIFFERENCE_QUOTIENT_STEP * np.eye(x.shape[-1])[~held]
         for _ in range(MOST_CLOSING_STEPS):
-            value = remainder(x)
+            residual = remainder(x)
             by_freedom = (
-                remainder(x[:, None] + steps) - value[:, None]
+                remainder(x[:, None] + steps) - residual[:, None]
             ).mT / DIFFERENCE_QUOTIENT_STEP
-            step = np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ value[..., None]
+            step = (
+                np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ residual[..., None]
+            )
             x = x.copy()
             x[:, ~held] -= step[..., 0]
             if np.abs(step).max() < LOOPS_CLOSED_STEP:

@@ -232,9 +232,9 @@ def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
         """Plotly camera for an aspect ratio and the share of the plot that holds the data."""
         slope = inside * np.tan(PLOTLY_VIEW_ANGLE / 2) * np.array([width, 1.0])
         near, across = (corners @ direction)[:, None], corners @ axes / slope
-        one, other = (near + across).max(axis=0), (near - across).max(axis=0)
-        middle = axes @ (slope * (one - other) / 2)
-        eye = middle + (one + other).max() / 2 * direction
+        positive, negative = (near + across).max(axis=0), (near - across).max(axis=0)
+        middle = axes @ (slope * (positive - negative) / 2)
+        eye = middle + (positive + negative).max() / 2 * direction
         return {
             name: dict(zip("xyz", point.round(3).tolist(), strict=True))
             for name, point in (("eye", eye), ("center", middle))

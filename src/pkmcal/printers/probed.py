@@ -99,7 +99,7 @@ def _height_map_points(text: str, label: str) -> Array:
     values = [word.strip() for word in (lines[1] if len(lines) > 1 else "").split(",")]
     numbers = dict(zip(names, values, strict=False))
 
-    def value(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
+    def number_under(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
         """Number of the map's grid, under the first of several names that the map has."""
         text = next((numbers[name] for name in called if name in numbers), "")
         try:
@@ -116,9 +116,9 @@ def _height_map_points(text: str, label: str) -> Array:
         return value
 
     # names of newer and older versions of RepRapFirmware
-    x0, y0 = value("xmin", "min0"), value("ymin", "min1")
-    dx = value("xspacing", "spacing0", "spacing", above=0.0)
-    dy = value("yspacing", "spacing1", "spacing", above=0.0)
+    x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
+    dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
+    dy = number_under("yspacing", "spacing1", "spacing", above=0.0)
     # RepRapFirmware writes a plain 0 for a point that was not probed
     out: list[tuple[float, float, float]] = []
     for row, line in enumerate(lines[2:]):

@@ -49,14 +49,14 @@ def printer(text: str, label: str) -> Printer:
                 expected="a number above zero",
             )
     # complete command: corrections and adjustments default to 0
-    filled = dict(words)
-    filled["665L"] = rod
+    command = dict(words)
+    command["665L"] = rod
     for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
-        filled.setdefault(name, np.zeros(1))
-    filled["665R"], filled["665H"] = radius[:1], height[:1]
+        command.setdefault(name, np.zeros(1))
+    command["665R"], command["665H"] = radius[:1], height[:1]
     with np.errstate(invalid="ignore"):
-        ends = homed_carriages(filled)
-    corrections = np.array([filled[f"665{letter}"][0] for letter in "XYZ"])
+        ends = homed_carriages(command)
+    corrections = np.array([command[f"665{letter}"][0] for letter in "XYZ"])
     return Printer(
         program="RepRapFirmware",
         label=label,
@@ -66,7 +66,7 @@ def printer(text: str, label: str) -> Printer:
         rod=rod,
         homed=ends,
         reach=float(reach[0]),
-        carriages=partial(reprap_carriage_heights, filled),
+        carriages=partial(reprap_carriage_heights, command),
     )
 
 

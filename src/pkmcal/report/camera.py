@@ -266,11 +266,11 @@ def _field(c: CameraCalibration) -> Markup:
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     factor = charts.enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
-    drawn = ImageField(
+    field = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
         tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
-    return page.filled_template("field.html.j2", field=drawn, cells=cells, factor=factor)
+    return page.filled_template("field.html.j2", field=field, cells=cells, factor=factor)
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:

@@ -228,11 +228,11 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     # places of one edge in a cell are one measurement, corners are two
     steep = np.abs(some.direction).argmax(axis=1)
     keys = np.column_stack([at[:, 1] * FIELD_CELLS_ACROSS + at[:, 0], some.thing, steep])
-    each, first, one = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    one, direction = one.reshape(-1), some.direction[first]
-    same = np.sign(dot(some.direction, direction[one]))
-    value = np.bincount(one, same * some.value) / np.bincount(one)
-    cells, number_of = np.unique(each[:, 0], return_inverse=True)
+    distinct, first, measurement = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    measurement, direction = measurement.reshape(-1), some.direction[first]
+    sign = np.sign(dot(some.direction, direction[measurement]))
+    value = np.bincount(measurement, sign * some.value) / np.bincount(measurement)
+    cells, number_of = np.unique(distinct[:, 0], return_inverse=True)
     n = np.bincount(number_of)
 
     def total(values: Array) -> Array:
@@ -254,7 +254,9 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     freedom = np.maximum(n - rank, 1)
     residual = np.maximum(total(value**2) - explained, 1e-300)
     # F-test of the shift against the scatter about it
-    loud = fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
+    significant = (
+        fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
+    )
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5
@@ -269,5 +271,5 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
         )
         size_of = np.abs(value[number_of == c])
         lead = links.to_largest(some.station[here], some.configuration[here], size_of)
-        out.append(Arrow(x, y, right, down, not loud[c], tip, lead))
+        out.append(Arrow(x, y, right, down, not significant[c], tip, lead))
     return out

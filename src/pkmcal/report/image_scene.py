@@ -129,8 +129,8 @@ def _moving_traces(machine: Machine, first: list[dict[str, Any]]) -> list[dict[s
             )
         else:
             name, colour, width = lines[n - machine.n_legs]
-            passes = line(name, colour, width, (), showlegend=False)
-            out.append({**passes, **trace})
+            style = line(name, colour, width, (), showlegend=False)
+            out.append({**style, **trace})
     return out
 
 
@@ -161,15 +161,15 @@ def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
 
 def _faces(tubes: int) -> Integers:
     """Triangles (n, 3) between the two rings of each tube."""
-    here = np.arange(TUBE_RING_CORNERS)
-    there = (here + 1) % TUBE_RING_CORNERS
-    one = np.concatenate(
+    corner = np.arange(TUBE_RING_CORNERS)
+    following = (corner + 1) % TUBE_RING_CORNERS
+    sides = np.concatenate(
         [
-            np.column_stack([here, there, here + TUBE_RING_CORNERS]),
-            np.column_stack([there, there + TUBE_RING_CORNERS, here + TUBE_RING_CORNERS]),
+            np.column_stack([corner, following, corner + TUBE_RING_CORNERS]),
+            np.column_stack([following, following + TUBE_RING_CORNERS, corner + TUBE_RING_CORNERS]),
         ]
     )
-    return (one + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
+    return (sides + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
 
 
 # ------------------------------------------------------------------ static traces

@@ -73,7 +73,7 @@ def _table(
     links: LinkSet,
     off: Array,
     white: Array,
-    retained: Booleans,
+    inliers: Booleans,
     unit: str,
     factor: float,
 ) -> Table:
@@ -88,7 +88,7 @@ def _table(
             number(float(links.value[k] + off[k]) * factor, digits),
             number(float(off[k]) * factor, digits),
             number(float(white[k]), 1),
-            "used" if retained[k] else "rejected",
+            "used" if inliers[k] else "rejected",
         )
         rows.append(Row(first, cells))
     values = (f"Measured, {unit}", f"Calibrated, {unit}", f"Off, {unit}")

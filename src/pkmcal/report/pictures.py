@@ -311,16 +311,16 @@ class _ImageOverlays:
         # pose of the nominal machine in its own frames
         old_pose = inverse(base) @ pose @ platform
         before = session.machine.ends_at(joints, old_pose)
-        visible = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
-        drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
-        inside = camera.in_image(visible)
+        calibrated = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
+        nominal = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
+        inside = camera.in_image(calibrated)
         for n, k in enumerate(configurations.tolist()):
             labelled: set[int] = set()
             for side, end in enumerate(("base", "platform")):
                 for j in np.flatnonzero(inside[side, n]).tolist():
-                    old = drawn[side, n, j]
+                    old = nominal[side, n, j]
                     cross = _rounded_pixel(old) if np.isfinite(old).all() else None
-                    new = _rounded_pixel(visible[side, n, j])
+                    new = _rounded_pixel(calibrated[side, n, j])
                     self.spots[s, k].append(Spot(j + 1, end, new, cross, j not in labelled))
                     labelled.add(j)
 

@@ -221,15 +221,15 @@ def _image(c: Calibration, s: int, k: int) -> Iterator[Logged]:
         }
         yield Logged((*path, part), "lines2d", logged, at)
     if estimate.configurations[k]:
-        drawn, _ = machine_laid_over(
+        contour, _ = machine_laid_over(
             estimate.machine,
             station.camera,
             estimate.state.T_camera_base[s],
             session.joints[k],
             estimate.state.T_base_platform[k],
         )
-        strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in drawn]
-        labels = [edge.tip for edge in drawn]
+        strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in contour]
+        labels = [edge.tip for edge in contour]
         logged = {"strips": strips, "colours": [RECORDED_WHITE] * len(strips), "labels": labels}
         yield Logged((*path, "contour"), "lines2d", logged, at)
     if len(mine):

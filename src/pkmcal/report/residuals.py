@@ -79,10 +79,10 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     legs = legs_in_camera(
         machine, state.T_camera_base[edges.station], state.T_base_platform[k], joints[k]
     )
-    each = np.arange(len(edges))
+    rows = np.arange(len(edges))
     radius = machine.radii_of(edges.leg, edges.tube)
     # measured minus predicted normal in the tangent basis of the measured one
-    normal = edge_normal_jacobians(legs.a[each, j], legs.b[each, j], radius, edges.side).n
+    normal = edge_normal_jacobians(legs.a[rows, j], legs.b[rows, j], radius, edges.side).n
     error = -np.einsum("nij,ni->nj", edges.basis, normal)
     error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]
     weighted = np.linalg.solve(edges.covariance, edges.shift[..., None])[..., 0]

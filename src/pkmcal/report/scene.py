@@ -183,11 +183,11 @@ def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
 def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     """Projection of the scene onto two axes, the second one upwards."""
     pick = list(axes)
-    drawn = np.array([joint.drawing[pick] for joint in scene.joints])
-    visible = np.array([joint.displaced[pick] for joint in scene.joints])
+    nominal = np.array([joint.drawing[pick] for joint in scene.joints])
+    displaced = np.array([joint.displaced[pick] for joint in scene.joints])
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
     # scale and limits, so that all points fit into the width of a chart
-    corners = np.concatenate([drawn, visible, *arms])
+    corners = np.concatenate([nominal, displaced, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = (CHART_WIDTH - 2 * PLANE_VIEW_MARGIN) / (high - low).max()
     width, height = CHART_WIDTH, float((high - low)[1] * scale + 2 * PLANE_VIEW_MARGIN)
@@ -203,7 +203,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         JointMark(
             j.leg, j.side, place(d), place(s), _ellipse(j.spread[np.ix_(pick, pick)], scale), j.tip
         )
-        for j, d, s in zip(scene.joints, drawn, visible, strict=True)
+        for j, d, s in zip(scene.joints, nominal, displaced, strict=True)
     )
     half = len(marks) // 2  # base joints come first, then the platform's
     return Projection(

@@ -125,14 +125,14 @@ def outcome_of(study: Study) -> Outcome:
 def stillness(s: Study) -> str:
     """Sentence on the platform's motion when held at the goal."""
     position, turn = rms(s.held.position), rms(s.held.turn)
-    one, one_turn = rms(s.image.position), rms(s.image.turn)
+    image_position, image_turn = rms(s.image.position), rms(s.image.turn)
     if not position > 0:
         return "The edges are without noise."
     return (
         f"Held at its goal, noise of {s.plan.loop.noise.shift:g} px moves the platform by"
         f" {brief(1e3 * position)} mm and {brief(np.rad2deg(turn))}° (root mean square);"
-        f" one image alone is good to {brief(1e3 * one)} mm and"
-        f" {brief(np.rad2deg(one_turn))}°."
+        f" one image alone is good to {brief(1e3 * image_position)} mm and"
+        f" {brief(np.rad2deg(image_turn))}°."
     )
 
 

@@ -63,7 +63,7 @@ def outcome_of(v: Validation) -> Outcome:
 def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
     """Main numbers."""
     session, again = v.session, int(v.repeated[judged.rows].sum())
-    new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
+    calibrated, nominal = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
     weighed = ""
     if unit:
@@ -81,10 +81,11 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
             "Where is the tool, by the readings?",
             tuple(
                 (_magnitude(value, unit), DISPLAY_UNITS[unit][1])
-                for value, unit in ((new.position, "m"), (new.orientation, "rad"))
+                for value, unit in ((calibrated.position, "m"), (calibrated.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
-            f" the drawing {amount(old.position, 'm')} and {amount(old.orientation, 'rad')}",
+            f" the drawing {amount(nominal.position, 'm')} and"
+            f" {amount(nominal.orientation, 'rad')}",
         ),
         Figure(
             "Is the promise kept?",
@@ -102,7 +103,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
 
 def _readings(judged: BesideDrawing, session: Session) -> Part:
     """Section on readings and tool: charts, residuals as in [C] Table 3, and tool point errors."""
-    old, new = judged.figures(judged.drawing), judged.figures(judged.calibrated)
+    nominal, calibrated = judged.figures(judged.drawing), judged.figures(judged.calibrated)
     test = judged.promise
     residuals = Table(
         "Readings: measured less predicted",
@@ -111,8 +112,8 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
             Row(
                 name,
                 (
-                    *_mean_rms(old, k, unit),
-                    *_mean_rms(new, k, unit),
+                    *_mean_rms(nominal, k, unit),
+                    *_mean_rms(calibrated, k, unit),
                     _magnitude(test.joint_rms[k], unit),
                     _signed(test.common[k], test.common_sigma[k], unit),
                     _magnitude(test.common_sigma[k], unit),
@@ -129,7 +130,7 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
-            for name, f in (("Drawing", old), ("Calibrated", new))
+            for name, f in (("Drawing", nominal), ("Calibrated", calibrated))
         ),
         "Root mean squares, frames laid over each other for the drawing. The photographs' own noise"
         " is in both.",
@@ -206,15 +207,15 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         f"On {held} held out, the calibrated machine predicts the"
         f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{broken}"
     )
-    in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
-    drawn = out.figures(out.drawing)
+    in_use, held_out = used.figures(used.calibrated), out.figures(out.calibrated)
+    nominal = out.figures(out.drawing)
     rows = [
         Row(
             name,
             (
                 *_mean_rms(in_use, k, unit),
-                *_mean_rms(new, k, unit),
-                _magnitude(drawn.joint_rms[k], unit),
+                *_mean_rms(held_out, k, unit),
+                _magnitude(nominal.joint_rms[k], unit),
             ),
         )
         for k, (name, unit) in enumerate(_joints(session))
@@ -223,7 +224,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         ("tool position, mm", "position", "m"),
         ("tool orientation, °", "orientation", "rad"),
     ):
-        cells = [_magnitude(getattr(f, field), unit) for f in (in_use, new, drawn)]
+        cells = [_magnitude(getattr(f, field), unit) for f in (in_use, held_out, nominal)]
         rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
     table = Table(
         "Residuals of configurations in use and held out",

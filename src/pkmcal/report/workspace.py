@@ -202,7 +202,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
     visible = np.where(cut.rows >= 0, values[cut.rows], np.nan)
     with np.errstate(divide="ignore"):
         level = np.log10(visible)
-    one, other = "xyz"[cut.across], "xyz"[cut.up]
+    x_name, y_name = "xyz"[cut.across], "xyz"[cut.up]
     return {
         "type": "heatmap",
         "name": name,
@@ -210,7 +210,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "y": np.round(cut.v * 1e3, 1).tolist(),
         "z": np.round(level, 4),
         "customdata": _significant(visible, 4),
-        "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
+        "hovertemplate": f"{x_name} %{{x:.0f}}, {y_name} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
         "hoverongaps": False,
         "coloraxis": "coloraxis",
@@ -222,8 +222,8 @@ def _significant(values: Array, digits: int) -> Array:
     """Numbers rounded to significant digits."""
     with np.errstate(divide="ignore", invalid="ignore"):
         places = digits - 1 - np.floor(np.log10(np.abs(values)))
-    one = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
-    return np.round(values * one) / one
+    scale = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
+    return np.round(values * scale) / scale
 
 
 def _crosses(
@@ -279,8 +279,8 @@ def _add_axes(
     common = {**COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "tickfont": {"size": 10}}
     common |= {"nticks": 4, "tickangle": 0}
     last = row == down - 1
-    one, other = "xyz"[cut.across], "xyz"[cut.up]
-    named = column == 0 or other == "z"  # slices side by side share their y
+    x_name, y_name = "xyz"[cut.across], "xyz"[cut.up]
+    named = column == 0 or y_name == "z"  # slices side by side share their y
     layout[f"xaxis{panel}"] = {
         **common,
         "domain": [left, left + wide],
@@ -288,7 +288,7 @@ def _add_axes(
         "anchor": f"y{panel}",
         "constrain": "domain",
         "showticklabels": last,
-        "title": {"text": f"{one}, mm" if last else "", "font": {"size": 11}, "standoff": 4},
+        "title": {"text": f"{x_name}, mm" if last else "", "font": {"size": 11}, "standoff": 4},
     }
     layout[f"yaxis{panel}"] = {
         **common,
@@ -297,7 +297,7 @@ def _add_axes(
         "anchor": f"x{panel}",
         "scaleanchor": f"x{panel}",
         "constrain": "domain",
-        "title": {"text": f"{other}, mm" if named else "", "font": {"size": 11}, "standoff": 2},
+        "title": {"text": f"{y_name}, mm" if named else "", "font": {"size": 11}, "standoff": 2},
     }
 
 
@@ -361,10 +361,10 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     return components, tuple(names[k] for k in components)
 
 
-def _plot_coordinates(poses: Array, home: Array, which: Integers) -> Array:
+def _plot_coordinates(poses: Array, home: Array, components: Integers) -> Array:
     """Plotted components (n, 3) of poses: rotations from home in degrees, positions in mm."""
     turns = np.rad2deg(pose_difference(poses, home)[:, :3])
-    return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
+    return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, components]
 
 
 def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | None:
