@@ -7,7 +7,6 @@ solution of the offsets of its edges and corners along their own directions.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -195,25 +194,14 @@ def fields(
     lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in arrows for cell in cells])
     width = max(session.stations[s].camera.image_size[0] for _, s, _ in arrows)
     factor = enlargement(lengths, FIELD_ARROW_LENGTH * width)
-    return (
-        tuple(_field(session, entry, s, cells, factor) for entry, s, cells in arrows),
-        factor,
-        float(lengths.max()),
-    )
-
-
-def _field(
-    session: Session, entry: str, s: int, cells: Sequence[Arrow], factor: float
-) -> ImageField:
-    """Field of a station, with enlarged arrows."""
-    camera = session.stations[s].camera
-    values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
-    return ImageField(
-        entry,
-        *camera.image_size,
-        (values["center.x"], values["center.y"]),
-        tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells),
-    )
+    out: list[ImageField] = []
+    for entry, s, cells in arrows:
+        camera = session.stations[s].camera
+        intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+        middle = intrinsics["center.x"], intrinsics["center.y"]
+        enlarged = tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells)
+        out.append(ImageField(entry, *camera.image_size, middle, enlarged))
+    return tuple(out), factor, float(lengths.max())
 
 
 def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:

@@ -140,21 +140,15 @@ def parameters_csv(estimates: ParameterEstimates) -> str:
 
 def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
     """LaTeX tabular, rounded as on the page."""
+    signs = str.maketrans(LATEX_SIGNS)
     lines = [
         r"\begin{tabular}{rlrrrl}",
         r"Leg & Parameter & Drawing & Calibrated & $\sigma$ & Unit \\ \hline",
     ]
     for row in (row for group in groups for row in group.rows):
         cells = (str(row.leg or ""), row.label, row.drawing, row.calibrated, row.sigma, row.unit)
-        lines.append(" & ".join(map(_for_tex, cells)) + r" \\")
+        lines.append(" & ".join(cell.translate(signs) for cell in cells) + r" \\")
     return "\n".join([*lines, r"\end{tabular}"]) + "\n"
-
-
-def _for_tex(text: str) -> str:
-    """Text with LaTeX's special characters replaced."""
-    for sign, command in LATEX_SIGNS.items():
-        text = text.replace(sign, command)
-    return text
 
 
 def _data_url(kind: str, text: str) -> str:

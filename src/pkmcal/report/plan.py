@@ -69,6 +69,9 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
     gain = plan.by_chance.position / plan.promised.position
+    findings = [_worth_note(plan)]
+    if blocked := [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]:
+        findings.append(note("plan.blocked", listed(blocked), names=blocked))
     return Outcome(
         command="plan",
         title=f"What to measure next on {machine.name}",
@@ -77,7 +80,7 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
             usable=True,
             headline=f"These {count(len(plan.names), 'configuration')} will determine the tool's"
             f" {_accuracy_text(plan.promised)}, standard deviations, mean over the workspace.",
-            findings=(_worth_note(plan), *_blocked_notes(plan)),
+            findings=tuple(findings),
         ),
         stamp="Plan",
         figures=(
@@ -138,12 +141,6 @@ def _worth_note(plan: MeasurementPlan) -> Finding:
     if until is None:
         return note("plan.all_pay", **facts)
     return note("plan.pays_until", number=until, **facts)
-
-
-def _blocked_notes(plan: MeasurementPlan) -> tuple[Finding, ...]:
-    """Note on configurations that a straight path does not reach."""
-    names = [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]
-    return (note("plan.blocked", listed(names), names=names),) if names else ()
 
 
 def _order(plan: MeasurementPlan) -> Part:

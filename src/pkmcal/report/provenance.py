@@ -211,8 +211,11 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             if s.n_edges
         ),
         *(
-            (f"What the data allow of the {name}' stated noise", f"{_interval_text(limits)} times")
-            for name, limits, n in (
+            (
+                f"What the data allow of the {name}' stated noise",
+                f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)} times",
+            )
+            for name, (low, high), n in (
                 ("poses", s.pose_range, s.n_poses),
                 ("readings", s.reading_range, s.n_joints),
                 (linked, s.link_range, s.n_links),
@@ -225,12 +228,6 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
 def link_labels(session: Session) -> str:
     """Kinds of links in the session, in the plural."""
     return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
-
-
-def _interval_text(limits: tuple[float, float | None]) -> str:
-    """Interval in words."""
-    low, high = limits
-    return f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)}"
 
 
 @dataclass(frozen=True)

@@ -79,15 +79,6 @@ def _narrow(tool_map: ToolMap) -> bool:
     return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
-def _quantities(tool_map: ToolMap) -> tuple[tuple[str, Array], ...]:
-    """Displayed quantities of each pose, m, with their names."""
-    return (
-        ("By the drawing, σ", tool_map.before.position),
-        ("Drawing's error", tool_map.after.off_position),
-        ("Calibrated, σ", tool_map.after.position),
-    )
-
-
 def _headline(tool_map: ToolMap) -> str:
     """Main numbers in a sentence."""
     _, after = tool_map.evenly
@@ -141,7 +132,11 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
     """
     if not tool_map.slices:
         return None
-    quantities = _quantities(tool_map)
+    quantities = (
+        ("By the drawing, σ", tool_map.before.position),
+        ("Drawing's error", tool_map.after.off_position),
+        ("Calibrated, σ", tool_map.after.position),
+    )
     single = len(tool_map.slices) == 1
     # table of panels: a column for each slice and a row for each quantity, or one row
     across, down = (len(quantities), 1) if single else (len(tool_map.slices), len(quantities))
