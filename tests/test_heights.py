@@ -564,11 +564,11 @@ WRONG_PRINTERS = {
     changed(CFG, "angle: 330.0", "angle: 220"): "two towers stand in nearly one direction",
     changed(CFG, "height0_pos = ", "height0_pos = 1e8,1e8,1e8 #"): "far below the bed",
     changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
-    changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not tell where",
+    changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not give",
     "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
     "M665 R105 H300 B90\n": "M665 has no value L that could be used",
     printers.printer_cfg(SAYS, np.tile(SAYS.homed + 2, (7, 1))): "stepper_a 2.0 mm above it",
-    printers.printer_cfg(SAYS): "nothing tells where the bed is",
+    printers.printer_cfg(SAYS): "no point of the bed is known",
     printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (6, 1))): "too few points of the bed",
 }
 
@@ -615,7 +615,7 @@ MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,ys
 WRONG_POINTS = {
     "ok\n": "there is no point of a bed in this file",
     "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
-    MAP + "-10,10\n0.1\n": "the height map does not tell its grid",
+    MAP + "-10,10\n0.1\n": "the height map does not define its grid",
     MAP + "-10,10,-10,10,-1,0,10,3,3\n0.1,0.2,0.2\n": "a number above zero under xspacing",
     MAP + "-10,10,nan,10,-1,10,10,3,3\n0.1,0.2,0.2\n": "a number under ymin",
     MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,high,0.2\n": "a height is no number",

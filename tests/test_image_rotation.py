@@ -92,13 +92,10 @@ def test_where_it_is_likely_it_is_said(demo, monkeypatch):
 
     monkeypatch.setattr(calibrate, "upside_down", likely)
     results = pkmcal.calibrate(demo.session)
-    (warning,) = [text for text in results.verdict.warnings if "upside down" in text]
-    assert warning == (
-        "The photographs of station1 may be upside down against cameras/camera.yaml: so say their"
-        " edges, at odds of 376 to 1, too few to be believed. They are measured as they are; if it"
-        " is so, errors are larger than stated. Hold one beside the machine: if a program has"
-        " turned them by half, turn them back."
-    )
+    (warning,) = results.verdict.of("image.perhaps_upside_down")
+    assert (warning.subject, warning.station) == ("cameras/camera.yaml", None)
+    assert warning.facts["stations"] == ("station1",)
+    assert warning.facts["odds"] == pytest.approx(376.0)
     assert results.upside_down == ()
     own = load_camera(demo.session / "cameras" / "camera.yaml")
     np.testing.assert_array_equal(results.session.stations[0].camera.parameters, own.parameters)
@@ -108,8 +105,11 @@ def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
     camera = calibrated.session.stations[0].camera.turned_by_half()
     one = UpsideDown("cameras/camera.yaml", ("station1",), camera, np.log(376.0))
     assert not one.sure
-    assert "may be upside down against cameras/camera.yaml" in one.finding.text
-    assert "at odds of 376 to 1" in one.finding.text
+    assert (one.finding.code, one.finding.subject) == (
+        "image.perhaps_upside_down",
+        "cameras/camera.yaml",
+    )
+    assert "odds of 376 to 1" in one.finding.text
 
 
 def lens(session, centre, covariance=None):

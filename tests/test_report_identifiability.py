@@ -92,7 +92,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     bars = drawn.bars
     assert len(bars) == 42
     assert [bar.value > STUB_BAR_HEIGHT for bar in bars] == [True] * 34 + [False] * 8
-    assert bars[-1].tip == "Direction 42: the data say nothing"
+    assert bars[-1].tip == "Direction 42: the data do not determine it"
     assert not bars[-1].quiet
     assert bars[0].quiet
     assert "times better than the drawing" in bars[0].tip

@@ -163,7 +163,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     coarse = [row[rows["columns"].index("coarse")] for row in rows["edges"]]
     assert coarse == edges.coarse.tolist()
     count = int(edges.coarse.sum())
-    text = f"{len(edges) - count} edges measured and {count} told by silhouettes"
+    text = f"{len(edges) - count} edges measured and {count} from silhouettes"
     page = page_html(values)
     assert text in page
     # what depends on where they were looked for is in the deviations, and said

@@ -199,11 +199,8 @@ def test_better_than_the_drawing(hexapod, new):
     assert "times better than the drawing: 0." in verdict.headline
     assert judged.ratio.low > 3
     assert finite_rms(judged.after) < np.sqrt(2) * judged.floor
-    assert "the photographs' own noise" in verdict.advice[0]
-    assert verdict.advice[0].endswith(
-        "Each of these configurations is seen from one of the 3 stations only: photographs of the"
-        " same ones from several would tell."
-    )
+    (advice,) = verdict.of("validation.noise_each_once")
+    assert advice.facts["stations"] == 3
 
     def report(seen_from):
         """What is advised where station ``seen_from(row)`` sees a configuration, for each edge."""

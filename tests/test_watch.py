@@ -320,7 +320,7 @@ def test_causes_that_look_alike_are_all_named(watched):
     similar = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
     assert ("platform", (3,)) in similar
     assert len(similar) > 1
-    assert "These data cannot tell that from" in watch_verdict(judged, looked(3)).reasons[0]
+    assert watch_verdict(judged, looked(3)).findings[0].facts["others"]
 
 
 def test_detectable_changes_are_detected_so_often(watched):
@@ -441,7 +441,7 @@ def test_too_few_poses_of_a_board(h4):
     verdict = watch_verdict(judged, looked(1))
     assert not verdict.usable
     assert "too few to tell" in verdict.headline
-    assert "Of legs 1 to 4 these data tell nothing." in verdict.reasons
+    assert [one.facts["legs"] for one in verdict.of("watch.leg_blind")] == ["legs 1 to 4"]
     document = judged.document(estimate.machine)
     assert not document["changed"]
     assert len(document["legs"]) == 4
@@ -500,7 +500,7 @@ def test_a_family_that_sees_nothing():
     assert not judged.changed
     verdict = watch_verdict(judged, looked(1))
     assert not verdict.usable
-    assert "Of legs 1 to 6 these data tell nothing." in verdict.reasons
+    assert [one.facts["legs"] for one in verdict.of("watch.leg_blind")] == ["legs 1 to 6"]
 
 
 # studies

@@ -1,1 +1,1 @@
-"""A machine for other programs: one format a file, behind the contract of ``contract.py``."""
+"""Export of machines to other programs: one format a file, by the contract of ``contract.py``."""

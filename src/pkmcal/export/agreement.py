@@ -1,4 +1,4 @@
-"""A model of bodies read again, beside the machine it was made of."""
+"""Comparison of an exported multibody model, read again, with its machine."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ from pkmcal.mechanisms.closure import limb_ends
 AGREEMENT_POSES = 8
 MODEL_GEOMETRY_ROUNDING = 1e-12
 MODEL_POSE_ROUNDING = 1e-9
-"""m, rad: rounding of 1e-14 in a length, told through the poses' nearness to singular ones."""
+"""Tolerance of poses, m and rad: rounding of 1e-14 in a length, amplified near singular poses."""
 
 
 def differences(model: ReadModel, machine: Machine) -> list[Difference]:
-    """Joint centres at home, loops there and at other poses, radii."""
-    turned, shifted, n = _forward(model, machine)
-    reference_values = {
+    """Differences of joint centres at home, loop closure, radii, and platform poses by readings."""
+    # platform of the model, closed at the machine's readings; NaN where its loops do not close
+    poses, readings = samples(machine, AGREEMENT_POSES)
+    x = model.at(readings, poses)
+    away: Array = pose_difference(model.places(x)["platform"], poses)
+    away[np.abs(model.gaps(x)).max(axis=1) > MODEL_GEOMETRY_ROUNDING] = np.nan
+    turned, shifted, n = largest(away[:, :3]), largest(away[:, 3:]), len(poses)
+    tube_radii = {
         f"leg{j + 1}_tube{t + 1}": float(radius)
         for j, radii in enumerate(machine.radii())
         for t, radius in enumerate(radii)
     }
-    results = [model.radii.get(name, np.nan) for name in reference_values]
+    radii_read = [model.radii.get(name, np.nan) for name in tube_radii]
     loops = largest(model.gaps(model.key))
     return [
         *_centres(model, machine),
         Difference("loops at home", loops, MODEL_GEOMETRY_ROUNDING),
         Difference(
             "tubes' radii",
-            largest(results, list(reference_values.values())),
+            largest(radii_read, list(tube_radii.values())),
             MODEL_GEOMETRY_ROUNDING,
         ),
         Difference(f"platform's place at {n} poses", shifted, MODEL_POSE_ROUNDING),
@@ -42,7 +47,7 @@ def differences(model: ReadModel, machine: Machine) -> list[Difference]:
 
 
 def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
-    """Limbs' ends at home beside the machine's at the keyframe's pose and readings."""
+    """Differences of joint centres and readings at the pose of the model's keyframe."""
     T = model.places(model.key)["platform"]
     fk = machine.forward_result(model.ctrl, T)
     ends = limb_ends(machine.layout, machine.values, model.ctrl, T, fk.internal)
@@ -56,14 +61,3 @@ def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
         out.append(Difference(f"{what} at home", gap, MODEL_GEOMETRY_ROUNDING))
     readings = largest(model.gear * model.key[model.actuated], model.ctrl)
     return [*out, Difference("readings at home", readings, MODEL_GEOMETRY_ROUNDING)]
-
-
-def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
-    """How far, rad and m, the model's platform is from the machine's where both have the same
-    readings, and at how many poses.
-    """
-    poses, readings = samples(machine, AGREEMENT_POSES)
-    x = model.at(readings, poses)
-    away: Array = pose_difference(model.places(x)["platform"], poses)
-    away[np.abs(model.gaps(x)).max(axis=1) > MODEL_GEOMETRY_ROUNDING] = np.nan
-    return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

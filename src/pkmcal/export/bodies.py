@@ -1,8 +1,8 @@
-"""A machine as bodies in a tree, drawn at home, and the loops that close it.
+"""Machine as a tree of bodies at its home pose, and the loops that close it.
 
-What MuJoCo, URDF and SDF have in common: each of them writes this in its own words. Limbs come as
-elementary joints (:mod:`pkmcal.export.limbs`). All bodies of a leg stand parallel to the base frame
-at home, so that their axes and points are told along the base's axes.
+MuJoCo, URDF and SDF exports write this tree in their own syntax. Limbs come as elementary joints
+(:mod:`pkmcal.export.limbs`). At home the frames of all bodies of a leg are parallel to the base
+frame, so their axes and points are components along the base's axes.
 """
 
 from __future__ import annotations
@@ -46,20 +46,21 @@ WHY_RESTRICTED = {
     "for the parallelograms that hold it.",
 }
 NOT_WEIGHED = "NOT KNOWN: masses and inertias, since photographs weigh nothing"
-"""How the conventions begin that say what a format makes of it."""
+"""Beginning of the convention line in which each format states how it treats missing masses."""
 
 
 def without_masses(form: str) -> Finding:
-    """That links have no masses, and what follows for a format."""
+    """Note that links have no masses, with the consequence for a format."""
     return note("export.no_masses", format=form)
 
 
 @dataclass(frozen=True)
 class BodyJoint:
-    """A joint at a body's origin, between it and its parent.
+    """Joint between a body and its parent, at the body's origin.
 
-    axis : (3,) unit, in the body's frame. value : m or rad, as drawn. column : of the reading that
-    drives it, by its scale; -1 for none.
+    axis : (3,) unit, in the body's frame.
+    value : m or rad, at home.
+    column : index of the reading that drives the joint, by its scale; -1 for none.
     """
 
     name: str
@@ -71,7 +72,7 @@ class BodyJoint:
 
 @dataclass(frozen=True)
 class RoundBar:
-    """A round bar between two points (3,) of a body's frame, m; a ball where there is no second."""
+    """Cylinder between two points (3,) of a body's frame, m; a sphere if ``stop`` is None."""
 
     start: Array
     stop: Array | None
@@ -81,14 +82,17 @@ class RoundBar:
 
     @property
     def flat(self) -> bool:
-        """Whether it has no length to speak of, and is not drawn."""
+        """Whether the cylinder is too short to be drawn."""
         return self.stop is not None and bool(
             np.linalg.norm(self.stop - self.start) < self.radius / 10
         )
 
     @property
     def drawn(self) -> tuple[Array, float, Array]:
-        """Its middle (3,) and length, m, and roll, pitch and yaw (3,) that lay z along it."""
+        """Midpoint (3,) and length, m, and the rotation of the z axis to the cylinder's.
+
+        The rotation is roll, pitch and yaw (3,), rad.
+        """
         if self.stop is None:
             return self.start, 0.0, np.zeros(3)
         x, y, z = line = self.stop - self.start
@@ -98,10 +102,13 @@ class RoundBar:
 
 @dataclass(frozen=True)
 class TreeBody:
-    """A body, its place (4, 4) as drawn in its parent's frame, and its joints, one after the other.
+    """Body of the tree, with the joints to its parent in series.
 
-    free : it has all six freedoms instead. middle, size : m, the middle of what is drawn of it and
-    its length. comment : what people should know of it. points : named places (3,).
+    T_parent_body : (4, 4) at home.
+    middle, size : centre (3,) and length, m, of the body's shapes.
+    free : all six degrees of freedom in place of the joints.
+    comment : remark for readers of the exported file.
+    points : named points (3,) in the body's frame.
     """
 
     name: str
@@ -117,18 +124,20 @@ class TreeBody:
 
     @property
     def T_base_body(self) -> Array:
-        """Its place as drawn, (4, 4)."""
+        """Pose at home, (4, 4)."""
         up = np.eye(4) if self.parent is None else self.parent.T_base_body
         return up @ self.T_parent_body
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A leg's end, and where it is held: two points that coincide.
+    """Closure of a loop: a leg's end coincides with a point of the platform or of a bar on it.
 
-    name : the leg's. held, point : the platform, or a bar on it, and the point (3,) in its frame.
-    tip, end : likewise on the leg. hinges : what the joint there turns about, its names and axes
-    (3,) in the leg's frame, from the leg on; none for a ball.
+    name : name of the leg.
+    held, point : platform or bar, and the point (3,) in its frame.
+    tip, end : body of the leg, and the point (3,) in its frame.
+    hinges : names and axes (3,), in the leg's frame, of the joint there, from the leg on; empty
+        for a ball joint.
     """
 
     name: str
@@ -141,7 +150,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A joint that turns back by what another turns, counted from where they are drawn."""
+    """Joint that turns by the negative angle of another; both angles count from home."""
 
     name: str
     follower: str
@@ -151,7 +160,10 @@ class Coupling:
 
 @dataclass(frozen=True)
 class BodyTree:
-    """bodies : each after its parent, the base first, the platform second."""
+    """Bodies with loops and couplings.
+
+    bodies : each after its parent, the base first, the platform second.
+    """
 
     home: HomeState
     bodies: tuple[TreeBody, ...]
@@ -160,21 +172,24 @@ class BodyTree:
 
     @property
     def platform(self) -> TreeBody:
-        """The platform, whose frame is the machine's."""
+        """Platform; its frame is the machine's platform frame."""
         return self.bodies[1]
 
     def children(self, of: TreeBody) -> list[TreeBody]:
-        """Bodies that stand on one."""
+        """Bodies whose parent is the given one."""
         return [body for body in self.bodies if body.parent is of]
 
 
 def body_tree(machine: Machine) -> BodyTree:
-    """The tree. Raises InputError for a machine that bodies with loops cannot be."""
+    """Body tree of a machine.
+
+    Raises InputError for a machine that rigid bodies with loops cannot represent.
+    """
     home = home_state(machine)
     base = TreeBody("base", None, np.eye(4), np.zeros(3), home.size)
     bodies, couplings = [base], list[Coupling]()
     held = _add_platform(bodies, couplings, home)
-    loops = tuple(_add_legs(bodies, home, held))  # which adds to the bodies
+    loops = tuple(_add_legs(bodies, home, held))  # also appends to bodies
     return BodyTree(home, tuple(bodies), loops, tuple(couplings))
 
 
@@ -189,7 +204,7 @@ def _body(bodies: list[TreeBody], body: TreeBody) -> TreeBody:
 def _add_platform(
     bodies: list[TreeBody], couplings: list[Coupling], home: HomeState
 ) -> list[tuple[TreeBody, Array]]:
-    """The platform with its bars; returns the body and the point that hold each leg."""
+    """Add the platform with its bars; return the body and the point that hold each leg."""
     motion = home.machine.document.motion
     spread = home.b - home.b.mean(axis=0)
     radius = float(np.sqrt(dot(spread, spread).mean())) or home.size / 4
@@ -207,12 +222,13 @@ def _add_platform(
         ),
     )
     if not platform.free:
-        own = home.rot.T  # joints' axes are told in the body's frame
+        own = home.rot.T  # joint axes are in the body's frame
         for k, axis in enumerate("xy" if motion in PLANAR_MOTIONS else "xyz"):
             name = f"platform_{axis}"
             platform.joints.append(BodyJoint(name, "slide", own[:, k], float(at[k])))
         if "translation" not in motion:
-            # its value is a turn about z; another orientation is what the value is counted from
+            # the joint's value is the rotation about z; any other orientation of the platform at
+            # home is its zero
             omega = rotation_vector(home.rot)
             turn = float(omega[2]) if np.abs(omega[:2]).max() < SAME_HINGE_DIFFERENCE else 0.0
             platform.joints.append(BodyJoint("platform_turn", "hinge", own[:, 2], turn))
@@ -227,7 +243,7 @@ def _add_platform(
 def _holders(
     bodies: list[TreeBody], couplings: list[Coupling], home: HomeState
 ) -> list[tuple[TreeBody, Array]]:
-    """What holds each leg; bars are made as legs ask for them."""
+    """Body and point that hold each leg; bars are added when the first leg on them is met."""
     limbs, out = home.limbs, list[tuple[TreeBody, Array]]()
     numbers: dict[str, tuple[int, TreeBody]] = {}
     for j, held in enumerate(limbs.held):
@@ -240,6 +256,7 @@ def _holders(
         if name not in numbers:
             numbers[name] = j, _side_bar(bodies, couplings, home, j, name)
         first, bar = numbers[name]
+        # a bar is one body, so its legs must have the same hinge
         hinges = np.stack([limbs.platform, limbs.hinge_axis], axis=1)
         if np.abs(hinges[j] - hinges[first]).max() > SAME_HINGE_DIFFERENCE:
             raise InputError(
@@ -255,7 +272,10 @@ def _holders(
 def _side_bar(
     bodies: list[TreeBody], couplings: list[Coupling], home: HomeState, j: int, name: str
 ) -> TreeBody:
-    """A bar, hinged on the platform: free, or held in its direction."""
+    """Add a bar hinged on the platform.
+
+    The hinge is free, or coupled to keep the bar's direction.
+    """
     platform, hinge, axis = bodies[1], home.limbs.platform[j], home.limbs.hinge_axis[j]
     platform.shapes.append(RoundBar(home.middle, hinge, home.size / 60, "motor"))
     reach = 2 * float(np.linalg.norm(home.limbs.bar[j]))
@@ -282,16 +302,17 @@ def _side_bar(
 def _add_legs(
     bodies: list[TreeBody], home: HomeState, held: list[tuple[TreeBody, Array]]
 ) -> Iterator[Loop]:
-    """Every leg as a chain from the base, closed on the platform."""
-    made: dict[int, TreeBody] = {}
+    """Add each leg as a chain from the base, and yield the loop that closes it on the platform."""
+    motors: dict[int, TreeBody] = {}
     for j, (holder, point) in enumerate(held):
-        parent = _carrier(bodies, home, j, made)
+        parent = _carrier(bodies, home, j, motors)
         origin = parent.T_base_body[:3, 3]
         name, length = f"leg{j + 1}", float(home.distance[j])
         place = pose(np.eye(3), home.a[j] - origin)
         middle = home.u[j] * length / 2
         rod = _body(
-            bodies, TreeBody(f"{name}_rod", parent, place, middle, length, comment=_words(home, j))
+            bodies,
+            TreeBody(f"{name}_rod", parent, place, middle, length, comment=_description(home, j)),
         )
         for hinge, axis in _base_hinges(home, j):
             rod.joints.append(BodyJoint(f"{name}_{hinge}", "hinge", axis))
@@ -301,41 +322,43 @@ def _add_legs(
         yield Loop(name, holder, point, tip, end, _end_hinges(home, j))
 
 
-def _words(home: HomeState, j: int) -> str:
-    """A leg in words."""
-    leg, value = home.leg(j), home.equations[j]
+def _description(home: HomeState, j: int) -> str:
+    """Description of a leg for the file's comment."""
+    leg, equations = home.leg(j), home.equations[j]
     rod = "a rod of constant length"
     if home.length_varies(j):
         driven = home.limbs.drive[j] == TELESCOPE_ROD
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not value and home.machine.document.motion not in PLANAR_MOTIONS:
+    if not equations and home.machine.document.motion not in PLANAR_MOTIONS:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
-    if "torsion" in value:
+    if "torsion" in equations:
         out += " Its universal joints keep it from twisting."
-    if any("platform" in kind for kind in value):
-        out += " It may turn about its own line; its equations say nothing of that."
+    if any("platform" in kind for kind in equations):
+        out += " It may turn about its own line; its equations do not restrict that."
     return out
 
 
 def _carrier(
-    bodies: list[TreeBody], home: HomeState, j: int, made: dict[int, TreeBody]
+    bodies: list[TreeBody], home: HomeState, j: int, motors: dict[int, TreeBody]
 ) -> TreeBody:
-    """What the leg's base joint stands on: the base, or its motor's body, which all legs on the
-    motor share.
+    """Body that carries a leg's base joint: the base, or the motor body of all legs on that motor.
+
+    Raises InputError if legs on one motor do not share its axis.
     """
     limbs, column, thick = home.limbs, home.column(j), home.size / 40
     if limbs.drive[j] not in (SLIDE_CARRIER, TURN_CARRIER):
         bodies[0].shapes.append(RoundBar(home.a[j], None, thick, "base"))
         return bodies[0]
     axis, turns = limbs.axis[j], limbs.drive[j] == TURN_CARRIER
-    if column not in made:
-        made[column] = _motor(bodies, home, column, limbs.base[j] if turns else home.a[j], axis)
-    body = made[column]
+    if column not in motors:
+        motors[column] = _motor(bodies, home, column, limbs.base[j] if turns else home.a[j], axis)
+    body = motors[column]
     first = home.motor_legs(column)[0]
-    # a carriage has no line of its own
+    # a carriage has a direction, but no axis in space
+    # legs on one motor turn about the same line, or slide in the same direction
     off = cross(limbs.base[j] - limbs.base[first], axis) if turns else np.zeros(3)
     if max(np.abs(axis - limbs.axis[first]).max(), np.abs(off).max()) > SAME_HINGE_DIFFERENCE:
         raise InputError(
@@ -357,7 +380,7 @@ def _carrier(
 def _motor(
     bodies: list[TreeBody], home: HomeState, column: int, at: Array, axis: Array
 ) -> TreeBody:
-    """A crank or carriage, by what its motor has moved."""
+    """Add a motor's crank or carriage, at its displacement at home."""
     name, thick, base = home.reading_name(column), home.size / 40, bodies[0]
     turns = home.limbs.drive[home.motor_legs(column)[0]] == TURN_CARRIER
     size = home.lever(column) if turns else home.size / 10
@@ -378,40 +401,47 @@ def _motor(
 
 
 def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
-    """Names and axes (3,) of a leg's hinges on the base side, in their order."""
-    value = home.equations[j]
+    """Names and axes (3,) of a leg's hinges on the base side, in series."""
+    equations = home.equations[j]
     if home.machine.document.motion in PLANAR_MOTIONS:
         yield "base", BASE_FRAME_UP
         return
-    if "revolute base" in value:
+    if "revolute base" in equations:
         axis = joint_axis(home, "base", j)
         yield "base", BASE_FRAME_UP if axis is None else axis
     else:
         first, second = universal_hinges(home, j)
         yield "base_first", first
         yield "base_second", second
-    if "revolute platform" in value:
+    if "revolute platform" in equations:
         yield "twist", home.u[j]
 
 
 def _end_hinges(home: HomeState, j: int) -> tuple[tuple[str, Array], ...]:
-    """Likewise on the platform side where its axes count; none for a ball."""
-    value, own = home.equations[j], joint_axis(home, "platform", j)
-    if own is not None and "torsion" in value:
+    """Names and axes (3,) of a leg's hinges on the platform side.
+
+    Empty where they act as a ball joint.
+    """
+    equations, own = home.equations[j], joint_axis(home, "platform", j)
+    if own is not None and "torsion" in equations:
         second = universal_hinges(home, j)[1]
         return ("platform_second", second), ("platform_first", home.rot @ own)
-    if own is not None and "revolute platform" in value:
+    if own is not None and "revolute platform" in equations:
         return (("platform", home.rot @ own),)
     return ()
 
 
 def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tuple[TreeBody, Array]:
-    """The body at the rod's far end and the end in it (3,): the rod, or the piston in it."""
+    """Body at the rod's far end, and the end point (3,) in its frame.
+
+    The body is the rod, or the piston that slides in it.
+    """
     u, length, column = home.u[j], float(home.distance[j]), home.column(j)
-    reach = length  # m, that the leg may have
+    reach = length  # longest leg, m
     if home.limbs.drive[j] == TELESCOPE_ROD:
         now, _, high = home.values(column).tolist()
         reach = high + length - now if np.isfinite(high) else length
+    # names of the file's tubes; cylinders added for display have none
     tubes = _tubes(home, j, reach)
     names = [f"leg{j + 1}_tube{k + 1}" for k in range(len(home.leg(j).tubes))]
     names += [""] * (len(tubes) - len(names))
@@ -419,6 +449,7 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
         for (radius, start, stop), name in zip(tubes, names, strict=True):
             rod.shapes.append(RoundBar(start * u, min(stop, length) * u, radius, "rod", name))
         return rod, length * u
+    # a telescope: all tubes but the last are the rod, the last one is the piston
     for (radius, start, stop), name in zip(tubes[:-1], names[:-1], strict=True):
         rod.shapes.append(RoundBar(start * u, stop * u, radius, "rod", name))
     place = pose(np.eye(3), length * u)
@@ -435,7 +466,10 @@ def _tip(bodies: list[TreeBody], rod: TreeBody, home: HomeState, j: int) -> tupl
 
 
 def _tubes(home: HomeState, j: int, reach: float) -> list[tuple[float, float, float]]:
-    """(radius, from, to) of what is drawn of a leg, m from A: its tubes, or thin rods instead."""
+    """Cylinders (radius, start, stop) that depict a leg, m from A.
+
+    The leg's tubes, or thin rods for a leg without any.
+    """
     length, radii = float(home.distance[j]), home.machine.radii()[j]
     tubes = [
         (float(r), float(t.start), float(t.stop))
@@ -445,6 +479,6 @@ def _tubes(home: HomeState, j: int, reach: float) -> list[tuple[float, float, fl
         return tubes or [(length / 80, 0.0, length)]
     if not tubes:
         tubes = [(length / 60, 0.0, 0.55 * length)]
-    if len(tubes) == 1:  # what telescopes out of it
+    if len(tubes) == 1:  # the piston
         tubes.append((0.6 * tubes[0][0], min(tubes[0][2], length), reach))
     return tubes

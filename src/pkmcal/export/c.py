@@ -1,7 +1,7 @@
-"""``c``: a C99 header and source with the machine's values and kinematics, and a self-test.
+"""``c``: C99 header and source with the machine's parameters and kinematics, and a self-test.
 
-The C files lie in ``c_source/``, complete, with a built-in machine's numbers. Here the comment on
-top and the part between two marks are written anew; everything else goes out as it stands there.
+``c_source/`` holds the complete C files with a built-in machine's parameters. An export replaces
+the comment on top and the part between two marks; the rest is copied.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ MACHINE_NUMBERS_END = "/* ---- what follows is the same for every machine ---- *
 NEXT_LINE = "\n    "
 SELFTEST_PAIRS = 12
 C_SOURCE_ROUNDING = 1e-12
-"""m, rad: a thousand times the rounding of a double at 1 m; poses themselves close to it."""
+"""Tolerance, m and rad: a thousand times the rounding of a double at 1 m.
+
+Poses amplify rounding as they approach singular ones.
+"""
 CONVENTIONS = (
     "Units: m and rad.",
     "pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.",
@@ -60,7 +63,7 @@ CONVENTIONS = (
 
 @final
 class CSource(Exporter):
-    """The machine's kinematics as C99, without dependencies."""
+    """Machine's kinematics as C99, without dependencies."""
 
     name: ClassVar = "c"
     title: ClassVar = "C99 header and source: inverse and forward kinematics"
@@ -97,15 +100,21 @@ class CSource(Exporter):
         }
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """The numbers as they stand in the text close the machine where it closes."""
+        """Differences of the constants read from the texts.
+
+        Closure of the machine's equations, home pose and ranges, and readings of the self-test's
+        poses.
+        """
         machine = source.machine
         poses, joints = samples(machine)
         hinges = inverse_result(machine.layout, machine.values, poses)[1]
+        # closure with the constants as they stand in the text
         off = closure_by_source(files[C_SOURCE_FILE], poses, joints, hinges)
         home, ranges = (numbers_of(files[C_SOURCE_FILE], name) for name in ("HOME", "RANGE"))
-        same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
-            ranges.reshape(-1, 2), _bounds(machine)
-        )
+        T = machine.home()
+        same = np.array_equal(home, np.concatenate([T[:3, :3].ravel(), T[:3, 3]]))
+        same = same and np.array_equal(ranges.reshape(-1, 2), _bounds(machine))
+        # readings of the self-test by the machine's inverse kinematics
         pairs = numbers_of(files[C_SELFTEST_FILE], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
         transform[:, :3, :3], transform[:, :3, 3] = pairs[:, :9].reshape(-1, 3, 3), pairs[:, 9:]
@@ -126,7 +135,7 @@ class CSource(Exporter):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """How to run the self-test, and what is not in the source."""
+        """Use of the self-test, and limits of the source."""
         out = [note("export.c_selftest", identity=source.identity)]
         passive = np.flatnonzero(~source.machine.layout.closing) + 1
         if passive.size:
@@ -138,21 +147,21 @@ class CSource(Exporter):
 
 
 def _coupled(machine: Machine) -> bool:
-    """Whether a reading does not follow from its own rod alone."""
+    """Whether some reading depends on more than one rod."""
     return machine.layout.shares_motors or machine.layout.n_internal > 0
 
 
 def _bounds(machine: Machine) -> Array:
-    """Smallest and largest readings (m, 2), without end where the file is silent."""
+    """Smallest and largest readings (m, 2), infinite where the mechanism file has no range."""
     silent = np.array([-np.inf, np.inf])
     return np.where(np.isfinite(machine.joint_ranges), machine.joint_ranges, silent)
 
 
-# What is written into the files
+# Texts of the files
 
 
 def filled(path: Path, about: Iterable[str], numbers: str) -> str:
-    """A C file with another comment on top and another machine's numbers."""
+    """C file with another comment on top and another machine's constants."""
     text = path.read_text(encoding="utf-8")
     above, _, below = text.partition(MACHINE_NUMBERS_BEGIN)
     above = above[above.index("*/\n") + 3 :]
@@ -162,6 +171,7 @@ def filled(path: Path, about: Iterable[str], numbers: str) -> str:
 
 
 def _sizes(machine: Machine, rods: Limbs) -> str:
+    """Definitions of the header: numbers of readings and rods."""
     readings = ", ".join(f"joint {k + 1} {unit}" for k, unit in enumerate(machine.joint_units))
     return (
         f"#define PKMCAL_JOINTS {machine.n_joints} /* readings: {readings} */\n"
@@ -172,12 +182,12 @@ def _sizes(machine: Machine, rods: Limbs) -> str:
 
 
 def _tables(machine: Machine, rods: Limbs) -> str:
-    """The machine's numbers, each in the fewest digits that give it back."""
+    """Constants of the machine, each in the fewest digits that reproduce it."""
     layout, home = machine.layout, machine.home()
     free = np.argmax(layout.motion, axis=0).tolist()
     away = rods.ends - rods.ends.mean(axis=0)
     radius = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) or 1.0
-    # what rounding is measured by
+    # length scale for rounding
     size = max(
         np.abs(part).max()
         for part in (machine.base_centers(), home[:3, 3], machine.platform_centers())
@@ -204,12 +214,16 @@ def _tables(machine: Machine, rods: Limbs) -> str:
 
 
 def _rods(machine: Machine, rods: Limbs) -> str:
-    """RODS, the fields of each rod in the structure's order; C++ takes no names there."""
+    """Constant RODS: values of each rod in the order of the structure's members.
+
+    C++ does not take designated initializers in C99's form, so the values have no names.
+    """
     foot, swing, rate, floating = np.zeros((4, len(rods), 3))
+    # a bar's end: foot + cos(phi) swing + sin(phi) rate for a turning bar
     for k, held in enumerate(rods.held):
         bar, w = rods.bar[k], rods.hinge_axis[k]
         if held == TURN_CARRIER:
-            foot[k] = dot(w, bar) * w  # what lies along the hinge does not turn
+            foot[k] = dot(w, bar) * w  # the component along the hinge does not turn
             swing[k], rate[k] = bar - foot[k], cross(w, bar)
         if held == FLOAT_CARRIER:
             floating[k] = bar
@@ -241,7 +255,7 @@ def _rods(machine: Machine, rods: Limbs) -> str:
 
 
 def _axes(machine: Machine, rods: Limbs) -> str:
-    """AXIS, of each equation its rod, its kind, and the axes that take part in it."""
+    """Constant AXIS: of each axis equation the rod, the kind, and the axes in base and platform."""
     angles = machine.layout.angles
     base, platform = machine.base_axes(), machine.platform_axes()
     none = np.zeros(3)
@@ -262,11 +276,11 @@ def _axes(machine: Machine, rods: Limbs) -> str:
 
 
 def _pairs(source: MachineSource) -> str:
-    """Reference poses and readings, with starts nearby."""
+    """Reference poses and readings of the self-test, and starts nearby for its iteration."""
     machine = source.machine
     poses, joints = samples(machine, SELFTEST_PAIRS)
     starts = perturb(poses, 0.02 * machine.layout.motion.sum(axis=1))
-    # names may hold anything; in a string they must not end it
+    # names are free text, and must not end the string literal
     name, identity = (
         "".join(c for c in text if c.isalnum() or c in " -_.,")
         for text in (machine.name, source.identity)
@@ -286,18 +300,16 @@ def _pairs(source: MachineSource) -> str:
 
 
 def _pose(T: Array, between: str = " ") -> str:
-    """A pose as a C value; between : what parts its rows."""
+    """Pose as a C initializer.
+
+    between : separator of rows.
+    """
     rows = f",{between}".join(c_value(row) for row in T[:3, :3])
     return f"{{{{{rows}}},{between}{c_value(T[:3, 3])}}}"
 
 
-def _flat(T: Array) -> Array:
-    """A pose's numbers (12,) in the order of the C structure."""
-    return np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
-
-
 def c_number(value: float) -> str:
-    """A C constant of the type that the source counts in; whole numbers as they are."""
+    """C constant of the source's number type; integers are written without a point."""
     if not np.isfinite(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     text = exact(value)
@@ -305,7 +317,7 @@ def c_number(value: float) -> str:
 
 
 def c_value(value: Any) -> str:
-    """A number, a name as it is, or rows of numbers in braces."""
+    """C initializer of a number, of nested rows of numbers, or of a name, which stays as it is."""
     if isinstance(value, str):
         return value
     if np.ndim(value):
@@ -314,14 +326,14 @@ def c_value(value: Any) -> str:
 
 
 def c_array(name: str, shape: str, values: Array | Sequence[Array], note: str = "") -> str:
-    """A C constant array of numbers, a row a line, with a comment above."""
+    """C constant array, one row a line, with a comment above."""
     above = f"/* {note} */\n" if note else ""
     body = ",\n    ".join(c_value(row) for row in values)
     return f"{above}static const pkmcal_real {name}{shape} = {{\n    {body}\n}};\n"
 
 
 def c_comment(lines: Iterable[str]) -> str:
-    """Lines as one C comment; nothing in them ends it, or joins lines."""
+    """Lines as one C comment; sequences that would end it or join lines are replaced."""
     safe = (
         legible(line).replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("?", ".")
         for line in lines
@@ -331,7 +343,7 @@ def c_comment(lines: Iterable[str]) -> str:
     return f"/*\n{body}\n */\n"
 
 
-# What is read from the files again
+# Reader of the files
 
 _CONSTANT = re.compile(r"static const \w+ (\w+)")
 _NUMBER = re.compile(r"-?INFINITY|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -340,26 +352,30 @@ _WORD = re.compile(r"(?<![\w.])[A-Z_]+")
 
 
 def _body(text: str, name: str) -> str:
-    """A constant's value, with its braces, without comments."""
+    """Initializer of a constant, with its braces, without comments."""
     plain = _without_comments(text)
     ends = (match.end() for match in _CONSTANT.finditer(plain) if match[1] == name)
     return next((plain[end:].partition("= ")[2].partition(";")[0] for end in ends), "")
 
 
 def _without_comments(text: str) -> str:
+    """C text without its comments."""
     code, *others = text.split("/*")
     return "".join([code, *(other.partition("*/")[2] for other in others)])
 
 
 def numbers_of(text: str, name: str) -> Array:
-    """A constant's numbers, flat."""
+    """Numbers of a constant's initializer, flat."""
     huge = {"INFINITY": np.inf, "-INFINITY": -np.inf}
     words = _NUMBER.findall(_body(text, name))
     return np.array([huge[word] if word in huge else float(word) for word in words])
 
 
 def _records(text: str, name: str, structure: str) -> list[dict[str, Any]]:
-    """A constant's rows, by the fields of a structure in the order in which the text has them."""
+    """Rows of a constant as dictionaries by the members of its structure.
+
+    The order of the members is that of the structure's declaration in the text.
+    """
     plain = _without_comments(text)
     end = plain.index(f"}} {structure};")
     declared = plain[plain.rindex("{", 0, end) + 1 : end].split(";")[:-1]
@@ -376,15 +392,19 @@ def _records(text: str, name: str, structure: str) -> list[dict[str, Any]]:
 
 
 def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
-    """The rods' and axes' equations (n, E), m, by the numbers in a source, in the words of its
-    comments.
+    """Equations (n, E) of rods and axes, m, evaluated with the constants of a source.
 
-    poses (n, 4, 4), joints (n, m), hinges (n, h): as for the machine.
+    The formulas are those in the source's comments.
+
+    poses : (n, 4, 4).
+    joints : (n, m) readings.
+    hinges : (n, h) angles, rad.
     """
     rot = poses[:, :3, :3]
     lines: list[Array] = []
     out: list[Array] = []
     for rod in _records(text, "RODS", "rod_data"):
+        # rods: end on the base a, end on the platform b, |b - a| = length
         q = rod["scale"] * joints[:, rod["joint"], None]
         phi = hinges[:, rod["hinge"] - 1, None] if rod["hinge"] else np.zeros(1)
         a, longer = rod["base"], np.zeros(1)
@@ -401,6 +421,7 @@ def closure_by_source(text: str, poses: Array, joints: Array, hinges: Array) -> 
         b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod["floating"]
         lines.append(b - a)
         out.append(np.linalg.norm(b - a, axis=1) - rod["length"] - longer)
+    # axes: the rod is perpendicular to an axis, or to the normal of two
     axes = int(re.findall(r"#define AXES (\d+)", text)[0])
     for axis in _records(text, "AXIS", "axis_data")[:axes]:
         turned = (rot @ axis["platform"][:, None])[..., 0]

@@ -1,9 +1,9 @@
-"""What a format of other programs offers, and an export from start to end.
+"""Contract of export formats, and an export from start to end.
 
-A format is one file in this folder: a subclass of :class:`Exporter`, which turns a
-:class:`~pkmcal.calibration.machine_source.MachineSource` into texts and reads them again by itself,
-as the other program would: with that program's units, signs and formulas, and with nothing of ours
-but the text. :func:`make_export` gives out only what agrees with the machine.
+A format is one file in this folder with a subclass of :class:`Exporter`. It turns a
+:class:`~pkmcal.calibration.machine_source.MachineSource` into texts and reads them again
+independently, as the target program would: with that program's units, signs and formulas, from the
+text alone. :func:`make_export` returns only texts that agree with the machine.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from pkmcal.wording import listed
 
 @dataclass(frozen=True)
 class Difference:
-    """How far a text read again is from the machine it was made of, in one quantity.
+    """Difference of one quantity between a text, read again, and the machine.
 
-    what : the quantity in words, "readings at 64 poses". largest : the largest difference, in unit.
-    limit : what rounding, or a format that says less and said so, accounts for.
+    what : the quantity in words, as "readings at 64 poses".
+    largest : largest difference, in ``unit``.
+    limit : tolerance for rounding, or for a stated approximation of the format.
     """
 
     what: str
@@ -41,16 +42,18 @@ class Difference:
 
     @property
     def beyond(self) -> bool:
-        """Whether it is more than the limit; a difference that is no number is."""
+        """Whether the difference exceeds the limit; NaN counts as beyond."""
         return not self.largest <= self.limit
 
 
 class Exporter(ABC):
-    """One format. Exporters have no state; all is in the source.
+    """Format. Exporters are stateless; all data come from the source.
 
-    name : the word after ``--to``. title : what it is, for people. trial : a command, for the
-    files' folder, that tries them out. leaves : what it leaves there, which a later export removes:
-    an old result must not be taken for the new one's.
+    name : word after ``--to``.
+    title : description in words.
+    trial : shell command that tries the files out in their folder.
+    leaves : files that the trial leaves there; a later export removes them, so that an old result
+        is not taken for the new one's.
     """
 
     name: ClassVar[str]
@@ -62,45 +65,46 @@ class Exporter(ABC):
     def files(self, source: MachineSource) -> dict[str, str]:
         """Texts by file name; nothing is written.
 
-        Raises InputError with a sentence where the format cannot express the machine.
+        Raises InputError if the format cannot express the machine.
         """
 
     @abstractmethod
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """The texts read again, as the other program reads them, beside the machine."""
+        """Differences between the texts, read as the target program reads them, and the machine."""
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """What a person should know of the files beside what stands in them."""
+        """Findings on the use of the files."""
         del source
         return ()
 
 
 @cache
 def exporters() -> dict[str, Exporter]:
-    """Every format of this folder by its name, in alphabetical order."""
+    """All formats by name, in alphabetical order."""
     package = __name__.rpartition(".")[0]
+    # import every module of this folder, so that its subclasses exist
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
-    made: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
-    return {one.name: one for one in sorted((make() for make in made), key=lambda one: one.name)}
+    formats: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
+    return {one.name: one for one in sorted((make() for make in formats), key=lambda one: one.name)}
 
 
 def exporter_of(name: str) -> Exporter:
-    """A format by its word after ``--to``; InputError lists them."""
-    reference_values = exporters()
-    if name in reference_values:
-        return reference_values[name]
-    guess = closest(name, reference_values)
+    """Format by name. Raises InputError for an unknown name."""
+    known_formats = exporters()
+    if name in known_formats:
+        return known_formats[name]
+    guess = closest(name, known_formats)
     raise InputError(
         "there is no such format to export to",
         found=name,
-        expected=(f"{guess}, or another of " if guess else "") + listed(list(reference_values), 20),
+        expected=(f"{guess}, or another of " if guess else "") + listed(list(known_formats), 20),
     )
 
 
 @dataclass(frozen=True)
 class Export:
-    """What was made: texts by file name, how far they are from the machine, and what to know."""
+    """Texts by file name, their differences from the machine, and findings on their use."""
 
     exporter: Exporter
     files: dict[str, str]
@@ -109,10 +113,10 @@ class Export:
 
 
 def make_export(source: MachineSource, name: str, *, force: bool = False) -> Export:
-    """Make a format's texts, read them again, and compare; nothing is written.
+    """Texts of a format, verified against the machine; nothing is written.
 
-    Raises InputError for a machine that the format cannot express, ResultError for a calibration
-    that was refused, unless forced, and where a text read again is not the machine.
+    Raises InputError for a machine that the format cannot express, and ResultError for a refused
+    calibration (unless forced) and for a text that disagrees with the machine.
     """
     exporter = exporter_of(name)
     if not (source.usable or force):
@@ -138,23 +142,23 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
 
 
 def write_export(made: Export, folder: Path) -> None:
-    """Write the files, whole or not at all; what a trial of earlier ones left goes."""
+    """Write the files, all or none, and remove what a trial of earlier ones left."""
     leaves = made.exporter.leaves
     check_own_folder(folder, {*made.files, *leaves}, "this export", "an earlier export")
     write_folder(folder, made.files, over=leaves)
 
 
 def exact(value: float) -> str:
-    """The fewest digits that a double comes back from as it was; whole numbers without a point."""
+    """Shortest decimal that parses to the same double; integers without a point."""
     return repr(float(value) + 0.0).removesuffix(".0")
 
 
 def commented(lines: Iterable[str], mark: str) -> str:
-    """Lines behind a mark each, such as ``#`` or ``;``."""
+    """Lines, each after a comment mark such as ``#`` or ``;``."""
     return "".join(f"{mark} {legible(line)}".rstrip() + "\n" for line in lines)
 
 
 def largest(values: Any, expected: Any = 0.0) -> float:
-    """The largest absolute difference of two arrays, or sets of numbers; 0 for none."""
+    """Largest absolute difference of two arrays; 0 for empty ones."""
     off = np.asarray(values, dtype=float) - np.asarray(expected, dtype=float)
     return float(np.abs(off).max(initial=0.0))

@@ -1,12 +1,13 @@
-"""Deltas as firmwares know them: parameters fitted over the workspace, and how they are told.
+"""Delta robots in the parameters of firmwares, fitted over the workspace, and header texts.
 
-Firmwares know ideal deltas: parallel towers on one circle, arms in vertical planes through one
-axis. A calibrated machine has more freedoms, so a firmware's model follows it with an error, which
-is told. The firmware's frame may lie otherwise than the base frame: where it lies is found along.
+Firmwares model ideal deltas: parallel towers on one circle, or arms in vertical planes through one
+axis. A calibrated machine has more degrees of freedom, so a firmware's model deviates from it; the
+export states the deviation. The firmware's frame may differ from the base frame: the fit includes
+the transformation.
 
-Model, firmware's frame, mm and degrees: a linear tower j carries its rod's end at
-``(R cos a_j, R sin a_j, m_j)``, an arm at ``((R + U_j cos m_j) (cos a_j, sin a_j), H_j + U_j sin
-m_j)``; the rod's length is L_j, and m_j = rate_j * reading_j + zero_j the motor's position.
+Model, in the firmware's frame, mm and degrees: a linear tower j carries its rod's end at ``(R cos
+a_j, R sin a_j, m_j)``, an arm at ``((R + U_j cos m_j) (cos a_j, sin a_j), H_j + U_j sin m_j)``;
+L_j is the length of the rod, and m_j = rate_j * reading_j + zero_j the motor's position.
 """
 
 from __future__ import annotations
@@ -35,37 +36,42 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note
 
 STEPS_FROM_HOME = 8
-"""Steps from home to a pose of the grid."""
+"""Continuation steps from home to a pose of the grid."""
 GRID_READINGS_A_MOTOR = 7
-"""Readings of each motor in the grid: ends, middle, and two on each side."""
+"""Grid readings of each motor: ends, middle, and two on either side."""
 LEAST_DELTA_SINGULARITY = 0.12
-"""Least singular value of the scaled inverse Jacobian: a reading's error grows by eight at most."""
+"""Least singular value of the scaled inverse Jacobian: readings' errors grow at most eightfold."""
 FASTEST_MOTOR_RATIO = 4.0
-"""Carriage's or elbow's way per way of the tool, at most: beyond, a rod stands nearly square to the
-motion of its motor, and firmwares divide by that angle."""
+"""Largest ratio of a carriage's or elbow's speed to the tool's.
+
+Beyond it a rod is nearly perpendicular to the motion of its motor, and firmwares divide by the
+cosine.
+"""
 LEAST_UPRIGHT_PART = 0.8
-"""Least vertical part of a tower, and radial part of an arm's plane: 37 degrees off at most."""
+"""Least vertical component of a tower, or radial component of an arm's plane: within 37 degrees."""
 MM_A_METRE = 1e3
 DEGREES_A_RADIAN = 180 / np.pi
 UNWARNED_TOOL_ERROR = 0.05
-"""mm at the tool beyond which a person is warned: a good kit's repeatability."""
+"""Largest tool error without a warning, mm: the repeatability of a good kit."""
 MOST_TOOL_ERROR = 5.0
-"""mm at the tool beyond which the parameters describe another machine."""
+"""Largest tool error, mm; beyond it the parameters describe another machine."""
 UNTOLD_SCALE_DIFFERENCE = 1e-9
-"""Difference of a scale from 1 beyond which it is told: beyond the digits of the files."""
+"""Least difference of a scale from 1 that is reported: beyond the digits of the files."""
 SWITCH_READINGS = 11
-"""Of each motor, for which an end switch's value is compared, or told."""
+"""Readings of each motor at which an end switch's value is compared or tabulated."""
 SWITCH_ROUNDING = 1e-3
-"""mm or degrees of a motor at its end switch, 2 µm of an arm: values have 0.1 µm, and a height
-belongs weakly to the angle of an arm that stands up.
+"""Tolerance of a motor's position at its end switch, mm or degrees; of an arm 2 µm.
+
+Values are written to 0.1 µm, and the height depends weakly on the angle of an arm that is nearly
+upright.
 """
 TOOL_ROUNDING = 2e-6
-"""m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
+"""Tolerance at the tool, m: settings have 0.1 µm and 0.00001 degrees, amplified up to eightfold."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
 _STATED = re.compile(r"off by ([0-9.]+) mm at most")
 
 Inverse = Callable[[Array], Array]
-"""A firmware's own inverse kinematics: points (n, 3) mm to motor positions (n, 3)."""
+"""Inverse kinematics of a firmware: points (n, 3) mm to motor positions (n, 3)."""
 
 
 # The machine
@@ -73,16 +79,22 @@ Inverse = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Delta:
-    """A machine's three legs, in the order of its file; mm and degrees as firmwares have them.
+    """Three legs of a machine as a delta, in the order of its file; mm and degrees as in firmwares.
 
-    program : the firmware that asks. kind : linear or rotary. joint : (3,) reading's column.
-    hinge : (3, 3) m, a tower's joint at reading zero, or an arm's axis, less the platform's joint:
-    what the rod's far end, moved to the platform's origin, hangs on. arm, rod : (3,) m.
-    rate, zero : (3,) the firmware's motor position (carriage height in mm, or angle above the
-    horizontal in degrees) is rate * reading + zero, for an ideal machine. ends : (3,) readings at
-    the upper end of the range. poses : (n, 4, 4) over the workspace. readings : (n, 3), by leg.
-    by_reading : (n, 3, 3) m of the platform's position by the legs' readings. bed : z of the
-    platform's origin on a bed that was felt, m; None where none was.
+    program : target firmware.
+    kind : linear or rotary.
+    joint : (3,) columns of the readings.
+    hinge : (3, 3) m; a tower's joint at reading zero, or a point of an arm's axis, less the
+        platform's joint: the fixed point of the rod when its far end is moved to the platform's
+        origin.
+    arm, rod : (3,) m.
+    rate, zero : (3,); motor position (carriage height in mm, or angle above the horizontal in
+        degrees) = rate * reading + zero for an ideal machine.
+    ends : (3,) readings at the upper end of the range.
+    poses : (n, 4, 4) over the workspace.
+    readings : (n, 3) by leg.
+    by_reading : (n, 3, 3) derivative of the platform's position, m, by the legs' readings.
+    bed : z of the platform's origin on a probed bed, m; None without.
     """
 
     machine: Machine
@@ -102,20 +114,21 @@ class Delta:
 
     @property
     def positions(self) -> Array:
-        """Where the grid's platforms are, (n, 3) m, base frame."""
+        """Platform positions of the grid, (n, 3) m, base frame."""
         return self.poses[:, :3, 3]
 
 
 def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
-    """The machine as a delta; InputError with a sentence where it is none.
+    """Machine as a delta. Raises InputError for a machine that is none, or without ranges.
 
-    program, bed : as of :class:`Delta`.
+    program, bed : as in :class:`Delta`.
     """
+    # a delta: three rods, each on a slide or crank of its own, platform without rotation
     limbs, motion = all_limbs(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
         joints = sorted({leg.base.joint for leg in machine.document.legs})
-        value = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
-        raise _no_delta(machine, program, value)
+        description = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
+        raise _no_delta(machine, program, description)
     rods = rod_limbs(machine)
     if len(rods) != 3 or machine.n_joints != 3 or FLOAT_CARRIER in rods.held:
         raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
@@ -126,6 +139,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
             expected="range: [min, max] at every slider or crank",
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
         )
+    # motor position = rate * reading + zero, for the ideal machine
     linear = rods.drive[0] == SLIDE_CARRIER
     rate, zero = _towers(rods) if linear else _arms(rods, rods.scale * ranges.mean(axis=1))
     rate = rods.scale * rate
@@ -153,6 +167,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
 
 
 def _no_delta(machine: Machine, program: str, text: str) -> InputError:
+    """Error for a machine that is no delta."""
     return InputError(
         f"{program} has settings for linear and rotary deltas, and mechanism {machine.name!r}"
         " is neither",
@@ -163,7 +178,7 @@ def _no_delta(machine: Machine, program: str, text: str) -> InputError:
 
 
 def _towers(rods: Limbs) -> tuple[Array, Array]:
-    """Rate (mm/m of their way) and zero (mm) of ideal towers; NaN where they lean."""
+    """Rate (mm/m) and zero (mm) of ideal towers; NaN where they lean."""
     up = rods.axis[:, 2]
     return np.sign(up) * MM_A_METRE, np.where(
         np.abs(up) > LEAST_UPRIGHT_PART, MM_A_METRE * rods.base[:, 2], np.nan
@@ -171,13 +186,16 @@ def _towers(rods: Limbs) -> tuple[Array, Array]:
 
 
 def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
-    """Rate (degree/rad of their turn) and zero (degrees) of ideal arms, as they are in the middle
-    of their way (3,) rad; NaN where they are none.
+    """Rate (degree/rad) and zero (degrees) of ideal arms, exact at the middle of the range.
+
+    middle : (3,) rad. NaN where an arm does not swing in a radial vertical plane.
     """
+    # direction outwards from the centre, in the horizontal plane
     radial = (rods.base - rods.base.mean(axis=0)) * [1, 1, 0]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
     size = np.sqrt(dot(rods.arm, rods.arm))[:, None]
     c, s = np.cos(middle)[:, None], np.sin(middle)[:, None]
+    # arm and its derivative at mid-range, in the plane of radial direction and z
     at, ahead = (c * rods.arm + s * rods.rate) / size, (c * rods.rate - s * rods.arm) / size
     out, d_out = dot(at, radial), dot(ahead, radial)
     sign = np.sign(out * ahead[:, 2] - at[:, 2] * d_out)
@@ -188,32 +206,38 @@ def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
 
 
 def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Array, Array]:
-    """Poses of a grid of readings that are well held, readings by leg, and position by reading."""
+    """Grid poses far from singularities, their readings by leg, and derivatives of the position.
+
+    Raises InputError if no grid pose closes.
+    """
     ends = machine.joint_ranges
     axes = [np.linspace(low, high, GRID_READINGS_A_MOTOR) for low, high in ends]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(ends))
-    # from home on in small steps: from afar the tool is also found above the carriages
+    # continuation from home: a start far away may converge to the assembly mode with the tool
+    # above the carriages
     home = machine.home()
     begin = machine.inverse(home)
-    begin = np.where(np.isfinite(begin), begin, grid)  # of a motor that cannot reach home
+    begin = np.where(np.isfinite(begin), begin, grid)  # for a motor that cannot reach home
     fk = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
     for share in np.linspace(0, 1, STEPS_FROM_HOME + 1)[1:]:
-        here = begin + share * (grid - begin)
-        fk = machine.forward_result(here, fk.T_base_platform)
+        readings = begin + share * (grid - begin)
+        fk = machine.forward_result(readings, fk.T_base_platform)
     poses = fk.T_base_platform
+    # reachable poses, away from singularities, with the readings that were put in
     back = machine.inverse(poses)
-    good = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
-    good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
-    ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
-    good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
-    if not good.any():
+    usable = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
+    usable &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
+    # speed of each carriage or elbow per speed of the tool
+    speed_ratios = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
+    usable &= np.nan_to_num(speed_ratios * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
+    if not usable.any():
         raise InputError(
             f"mechanism {machine.name!r} closes nowhere within its ranges",
             next_step="Check the ranges in the mechanism file",
         )
-    poses = poses[good]
+    poses = poses[usable]
     by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., joint]
-    return poses, grid[good][:, joint], by_reading
+    return poses, grid[usable][:, joint], by_reading
 
 
 # The fit
@@ -221,10 +245,12 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
 
 @dataclass(frozen=True)
 class Freedoms:
-    """What a format's parameters leave free.
+    """Free parameters of a format.
 
-    nominal : (3,) degrees, the towers' directions; angles : they may differ from it. rods, arms,
-    heights : one for each leg, else one for all. flat : hips at Z = 0, so that Z moves instead.
+    nominal : (3,) degrees, directions of the towers.
+    angles : directions are free.
+    rods, arms, heights : one value for each leg, else one for all.
+    flat : shoulders are at Z = 0; the frame's Z shift is free instead.
     """
 
     nominal: tuple[float, float, float]
@@ -237,11 +263,13 @@ class Freedoms:
 
 @dataclass(frozen=True)
 class Fit:
-    """A firmware's parameters, mm and degrees; arrays (3,) in the firmware's order of towers.
+    """Parameters of a firmware, mm and degrees; arrays (3,) in the firmware's order of towers.
 
-    delta : the machine that they are to follow. order : the legs of the mechanism file, from 0.
-    angle : tower directions. T_firmware_base : (4, 4) m.
-    largest, rms : mm, error at the tool over the grid, its poses taken as commands.
+    delta : the machine fitted to.
+    order : legs of the mechanism file, from 0.
+    angle : tower directions.
+    T_firmware_base : (4, 4) m.
+    largest, rms : mm; error at the tool over the grid, its poses taken as commands.
     """
 
     delta: Delta
@@ -269,8 +297,9 @@ class Fit:
 
     @property
     def following(self) -> Finding:
-        """How well the settings follow the machine, a warning where it is not well; rounded up, so
-        that it holds.
+        """Finding on the agreement of settings and machine, a warning if it is poor.
+
+        The error is rounded up, so that the statement holds.
         """
         facts = {
             "program": self.delta.program,
@@ -282,16 +311,19 @@ class Fit:
         return doubtful("export.follows_badly", **facts, kind=self.kind)
 
     def motors(self, points: Array, near: Array) -> Array:
-        """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame; of an arm's two the
-        one nearest to ``near`` (n, 3) degrees.
+        """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame.
+
+        near : (n, 3) degrees; of an arm's two solutions the nearest is taken.
         """
         angle = self.angle / DEGREES_A_RADIAN
+        # coordinates of the tool in each tower's vertical plane: along, across, up
         along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle) - self.radius
         across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
         square = self.rod**2 - across**2
         if self.kind == "linear":
             return points[:, 2:] + np.sqrt(np.maximum(square - along**2, 0.0))
         up = points[:, 2:] - self.height
+        # law of cosines for the angle between arm and line from shoulder to tool
         away = np.hypot(along, up)
         share = (away**2 + self.arm**2 - square) / (2 * self.arm * away)
         half = np.arccos(np.clip(share, -1.0, 1.0))
@@ -301,20 +333,21 @@ class Fit:
 
 
 def fit_of(source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
-    """A firmware's parameters for a source's machine; by its kind what they leave free."""
+    """Parameters of a firmware for a source's machine, with the free parameters of its kind."""
     delta = delta_of(source.machine, program, source.bed)
     return nearest_fit(delta, linear if delta.kind == "linear" else rotary)
 
 
 def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
-    """The parameters that put the tool nearest to where it should be, over the workspace.
+    """Parameters that minimise the tool's error over the workspace.
 
-    Raises InputError where they leave an error of more than :data:`MOST_TOOL_ERROR`.
+    Raises InputError if the error remains above :data:`MOST_TOOL_ERROR`.
     """
     from scipy.optimize import least_squares
 
+    # minimise the tool's error over the grid, from the ideal machine
     start = _start(delta, freedoms)
-    packed = _Packed(start, freedoms)
+    packed = _ParameterVector(start, freedoms)
     points = delta.positions
     readings = delta.readings[:, start.order]
     by_reading = MM_A_METRE * delta.by_reading[:, :, start.order]
@@ -322,33 +355,32 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
     def off(x: Array) -> Array:
         return _tool_error(packed.fit(x), points, readings, by_reading).ravel()
 
-    # central differences: at an exact model the error ends below a nanometre
+    # central differences: at an exact model the error falls below a nanometre
     solution = least_squares(off, packed.zeros, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14)
-    values = packed.fit(solution.x)
-    error = np.linalg.norm(_tool_error(values, points, readings, by_reading), axis=1)
-    values = replace(
-        values, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
-    )
-    if not values.largest <= MOST_TOOL_ERROR:
+    fit = packed.fit(solution.x)
+    error = np.linalg.norm(_tool_error(fit, points, readings, by_reading), axis=1)
+    fit = replace(fit, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error)))))
+    if not fit.largest <= MOST_TOOL_ERROR:
         raise InputError(
             f"{delta.program} cannot follow this machine: its parameters leave the tool off",
-            found=f"{values.largest:.2f} mm",
+            found=f"{fit.largest:.2f} mm",
             expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
             next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
         )
-    return values
+    return fit
 
 
 def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
-    """How far (n, 3) mm the tool goes wrong, to first order, where the firmware commands it."""
+    """Tool error (n, 3) mm, to first order, at positions that the firmware commands."""
+    # motor positions that the firmware commands for the tool's true positions
     points = MM_A_METRE * apply(fit.T_firmware_base, positions)
     own = fit.rate * readings + fit.zero
     wrong = (fit.motors(points, own) - own) / fit.rate
     return (by_reading @ wrong[..., None])[..., 0]
 
 
-class _Packed:
-    """Changes of a start's parameters as one vector x, in mm and degrees, zero at the start."""
+class _ParameterVector:
+    """Changes of the start's parameters as a vector x, mm and degrees; zero at the start."""
 
     def __init__(self, start: Fit, freedoms: Freedoms) -> None:
         self.start = start
@@ -366,26 +398,27 @@ class _Packed:
         self.zeros = np.zeros(sum(count for _, count in parts))
 
     def fit(self, x: Array) -> Fit:
-        """The parameters at x."""
+        """Parameters at x."""
         cuts = np.cumsum([count for _, count in self.parts])[:-1]
         names = [name for name, _ in self.parts]
-        by = dict(zip(names, np.split(x, cuts), strict=True))
+        changes = dict(zip(names, np.split(x, cuts), strict=True))
         own = {
-            name: getattr(self.start, name) + by[name]
+            name: getattr(self.start, name) + changes[name]
             for name in ("rod", "angle", "arm", "height", "zero")
-            if name in by
+            if name in changes
         }
-        turn = np.concatenate([by["tilt"], by.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
-        shift = np.concatenate([by["shift"], by.get("lift", np.zeros(1))]) / MM_A_METRE
+        turn = np.concatenate([changes["tilt"], changes.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
+        shift = np.concatenate([changes["shift"], changes.get("lift", np.zeros(1))]) / MM_A_METRE
         placed = self.start.T_firmware_base
         placed = pose(rotation(turn) @ placed[:3, :3], placed[:3, 3] + shift)
-        radius = self.start.radius + float(by["radius"][0])
+        radius = self.start.radius + float(changes["radius"][0])
         return replace(self.start, radius=radius, T_firmware_base=placed, **own)
 
 
 def _start(delta: Delta, freedoms: Freedoms) -> Fit:
-    """The machine taken as ideal: circle through the three hinges, order by their directions."""
+    """Start of the fit: the machine as an ideal delta, with the circle through the three hinges."""
     hinge = MM_A_METRE * delta.hinge
+    # circle through the hinges, and the order of the legs by their directions
     centre = _circle(hinge[:, :2])
     away = hinge[:, :2] - centre
     azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREES_A_RADIAN
@@ -393,6 +426,7 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     order = _order(azimuth, nominal)
     off = _wrapped(azimuth[order] - nominal)
     yaw = 0.0 if freedoms.angles else -float(off.mean())
+    # heights: of each hinge, common, or zero with the frame at the hinges
     height = hinge[order, 2]
     lift = _lift(delta)
     if freedoms.flat and delta.kind == "rotary":
@@ -400,8 +434,10 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     if not freedoms.heights or freedoms.flat:
         height = np.full(3, height.mean())
     height = np.zeros(3) if freedoms.flat else height + lift
+    # frame: origin at the circle's centre, turned to the nominal directions if these are fixed
     turn = rotation(np.array([0.0, 0.0, yaw / DEGREES_A_RADIAN]))
     shift = np.array([0.0, 0.0, lift]) - turn @ np.append(centre, 0.0)
+    # lengths: of each leg, or their mean
     each = (freedoms.rods, freedoms.arms)
     rod, arm = (
         v[order] if own else np.full(3, v.mean())
@@ -423,9 +459,10 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
 
 
 def _lift(delta: Delta) -> float:
-    """How far, mm, the firmware's Z is above the base's z: so that it is 0 on a bed that was felt;
-    else not where home is above z = 0, which then is the bed; of a machine that hangs from its base
-    so that no Z is negative.
+    """Z of the firmware's frame above the base's z, mm.
+
+    A probed bed gets Z = 0. Without one: 0 if home is above z = 0, which then is the bed; for a
+    machine that hangs from its base the least whole number of mm that leaves no Z negative.
     """
     if delta.bed is not None:
         return -MM_A_METRE * delta.bed
@@ -435,7 +472,7 @@ def _lift(delta: Delta) -> float:
 
 
 def _order(azimuth: Array, nominal: Array) -> Integers:
-    """The legs nearest to the nominal directions, of the orders that go anticlockwise."""
+    """Cyclic order of the legs, anticlockwise, that is nearest to the nominal directions."""
     around = np.argsort(azimuth % 360)
     first = np.argsort(nominal % 360)
     place = np.argsort(first)
@@ -445,6 +482,7 @@ def _order(azimuth: Array, nominal: Array) -> Integers:
 
 
 def _wrapped(angle: Array) -> Array:
+    """Angle in [-180, 180) degrees."""
     return (angle + 180) % 360 - 180
 
 
@@ -454,20 +492,21 @@ def _circle(points: Array) -> Array:
     return points[0] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
 
 
-# The words of the files
+# Texts of the files
 
 
 def firmware_length(value: float) -> str:
-    """A length as firmwares read it."""
+    """Length in the digits that firmwares read."""
     return _number(value, 4)
 
 
 def firmware_angle(value: float) -> str:
-    """An angle as firmwares read it."""
+    """Angle in the digits that firmwares read."""
     return _number(value, 5)
 
 
 def _number(value: float, digits: int) -> str:
+    """Number with fixed digits, without a negative zero."""
     text = f"{value:.{digits}f}"
     return text[1:] if float(text) == 0 and text.startswith("-") else text
 
@@ -478,10 +517,10 @@ def scales_of(fit: Fit) -> Array:
 
 
 def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[str]:
-    """Header lines: conventions, which leg is which motor, the frame, and the error that is left.
+    """Header lines: conventions, legs of the motors, the frame, and the remaining error.
 
-    names : the motors' letters, in the firmware's order. correcting : what to do about a motor
-    whose reading has a scale.
+    names : letters of the motors, in the firmware's order.
+    correcting : instruction for a motor whose reading has a scale other than 1.
     """
     delta = fit.delta
     unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
@@ -490,9 +529,10 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
         f" motor position ({unit}) = {rate:.9g} * reading ({word}) {round(zero, 6) + 0.0:+.6f}."
         for name, j, rate, zero in zip(names, fit.order, fit.rate, fit.zero, strict=True)
     ]
+    in_mm = fit.T_firmware_base * np.array([1.0, 1.0, 1.0, MM_A_METRE])
     rows = [
         f"firmware_from_base row {k + 1}: {' '.join(f'{v:.12g}' for v in np.round(row, 12) + 0.0)}"
-        for k, row in enumerate(_in_mm(fit.T_firmware_base)[:3])
+        for k, row in enumerate(in_mm[:3])
     ]
     factors = [
         f"Motor {name} goes {factor:.9g} times as far as its reading says."
@@ -520,15 +560,16 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
 
 
 def workspace_radius(source: MachineSource) -> str | None:
-    """The radius that the printer was configured for, mm, as firmwares read it; None where the
-    mechanism file has none. It is a limit, and no value of the machine's: no export makes one up.
+    """Print radius of the mechanism file, mm, as firmwares read it; None without one.
+
+    The radius is a limit rather than a property of the machine, so no export invents it.
     """
     radius = source.machine.document.workspace_radius
     return None if radius is None else _digits(MM_A_METRE * radius)
 
 
 def end_switches(fit: Fit) -> str:
-    """Where the values put the end switches."""
+    """Sentence on the assumed readings at the end switches."""
     word = "m" if fit.kind == "linear" else "rad"
     ends = ", ".join(f"{q:.9g}" for q in fit.delta.ends[fit.order])
     return (
@@ -538,31 +579,34 @@ def end_switches(fit: Fit) -> str:
 
 
 def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list[str]:
-    """A line a motor: the value (3,) of its end switch for any reading, where it goes with the
-    motor's position. :func:`switch_values` reads them again.
+    """Line for each motor: its end switch's value as a linear function of the reading there.
+
+    values : (3,) at the upper ends of the ranges. :func:`switch_values` reads the lines.
     """
     ends = fit.delta.ends[fit.order]
     return [
-        f"{name} = {_digits(value)} {_signed(rate)} * (reading - {end:.9g})"
+        f"{name} = {_digits(value)} {'-' if rate < 0 else '+'} {abs(rate):.9g}"
+        f" * (reading - {end:.9g})"
         for name, value, rate, end in zip(names, values, fit.rate, ends, strict=True)
     ]
 
 
 def switch_values(text: str, readings: Array) -> Array:
-    """The values (3,) that lines of :func:`proportional_switches` give at readings (3,)."""
+    """Values (3,) by the lines of :func:`proportional_switches` at readings (3,)."""
     lines = (line.partition(" * (reading - ") for line in text.splitlines())
-    results = [
+    terms = [
         (*head.replace("+ ", "+").replace("- ", "-").split()[-2:], tail.partition(")")[0])
         for head, times, tail in lines
         if times
     ]
-    value, rate, end = np.array(results, dtype=float).T
+    value, rate, end = np.array(terms, dtype=float).T
     return value + rate * (readings - end)
 
 
 def readings_elsewhere(fit: Fit) -> Array:
-    """Readings (n, 3) of end switches that are not where they are taken to be: downwards from there
-    through the upper half of each range.
+    """Readings (n, 3) of end switches other than the assumed ones.
+
+    From the upper end of each range down to its middle.
     """
     machine = fit.delta.machine
     ranges = machine.joint_ranges[fit.delta.joint][fit.order]
@@ -572,21 +616,12 @@ def readings_elsewhere(fit: Fit) -> Array:
 
 
 def _digits(value: float) -> str:
+    """Number with up to six decimals."""
     return f"{value:.6f}".rstrip("0").rstrip(".") if abs(value) > 5e-7 else "0"
 
 
-def _signed(value: float) -> str:
-    return f"{'-' if value < 0 else '+'} {abs(value):.9g}"
-
-
-def _in_mm(transform: Array) -> Array:
-    out = np.array(transform)
-    out[:3, 3] *= MM_A_METRE
-    return out
-
-
 def read_firmware_from_base(text: str) -> Array:
-    """``firmware_from_base`` read again from a text, (4, 4), its shift in m."""
+    """``firmware_from_base`` (4, 4) of a text, translation in m."""
     out = np.eye(4)
     rows = _ROW.findall(text)
     out[:3] = [[float(word) for word in row.split()] for row in rows]
@@ -595,34 +630,40 @@ def read_firmware_from_base(text: str) -> Array:
 
 
 def stated(text: str) -> float:
-    """The error that a text admits, m."""
+    """Tool error that a text states, m; 0 without one."""
     match = _STATED.search(text)
     return float(match.group(1)) / MM_A_METRE if match else 0.0
 
 
 def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
-    """The firmware's formulas on the text's values, the machine's own forward kinematics after.
+    """Tool error by the firmware's formulas with the text's values, over the workspace.
+
+    The machine's forward kinematics follows the firmware's inverse.
 
     zero : (3,) motor positions at reading zero by the text's end switches.
     """
     delta = fit.delta
     points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
+    # readings at the commanded motor positions, and the tool there by the machine's kinematics
     readings = np.zeros_like(delta.readings)
     readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
     off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
     largest = float(np.where(result.converged, off, np.inf).max())
-    given_values = stated(text)
+    stated_error = stated(text)
     return Difference(
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         largest,
-        # the fit is judged to first order, so a large error may be a fiftieth larger
-        1.02 * given_values + TOOL_ROUNDING,
+        # the fit's error is of first order, so a large one may be 2 % larger
+        1.02 * stated_error + TOOL_ROUNDING,
     )
 
 
 def redo(source: MachineSource) -> tuple[Finding, ...]:
-    """What a firmware has to measure again once it has these values; nothing of a drawing."""
+    """What has to be measured again with these values in a firmware.
+
+    Nothing for a nominal model.
+    """
     if not source.calibrated:
         return ()
     bed = "unknown" if source.bed is None else "probed"

@@ -1,4 +1,4 @@
-"""A machine closed at home, limb by limb: what models of bodies and joints are drawn from."""
+"""Machine closed at its home pose, limb by limb: the basis of multibody models."""
 
 from __future__ import annotations
 
@@ -17,21 +17,26 @@ from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
 
 SAME_HINGE_DIFFERENCE = 1e-9
-"""Metres and radians by which two legs' common axis or hinge may differ: rounding."""
+"""Tolerance, m and rad, between a common axis or hinge of two legs: rounding."""
 LEAST_SINE_TO_LEG = 0.5
-"""Sine of the angle between a leg and a first axis of its universal joint, below which another
-axis is taken: at zero the two hinges of the joint would turn alike.
+"""Least sine of the angle between a leg and the first axis of its universal joint.
+
+Below it another axis is taken: at zero both hinges of the joint would be parallel in effect.
 """
 BASE_FRAME_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class HomeState:
-    """A machine closed at home.
+    """Machine closed at home.
 
-    T_base_platform : (4, 4). readings : (m,) m or rad. internal : (n,) the bars' hinges, rad.
-    a, b : (L, 3) the limbs' ends, m, base frame; u : (L, 3) unit directions from a to b;
-    distance : (L,) m. equations : what the axes of each leg add to the closure.
+    T_base_platform : (4, 4).
+    readings : (m,) m or rad.
+    internal : (n,) angles of the bars' hinges, rad.
+    a, b : (L, 3) ends of the limbs, base frame, m.
+    u : (L, 3) unit directions from a to b.
+    distance : (L,) m.
+    equations : closure equations of each leg's axes.
     """
 
     machine: Machine
@@ -47,64 +52,68 @@ class HomeState:
 
     @property
     def rot(self) -> Array:
-        """The platform's orientation, (3, 3)."""
+        """Orientation of the platform, (3, 3)."""
         return self.T_base_platform[:3, :3]
 
     @property
     def size(self) -> float:
-        """A length of the machine, m: its rods' mean."""
+        """Characteristic length of the machine, m: the mean of its rods."""
         return float(self.distance.mean())
 
     @property
     def middle(self) -> Array:
-        """The mean of the platform's joints (3,), platform frame."""
+        """Mean of the platform's joint centres (3,), platform frame, m."""
         T_platform_base = inverse(self.T_base_platform)
         return T_platform_base[:3, :3] @ self.b.mean(axis=0) + T_platform_base[:3, 3]
 
     def leg(self, j: int) -> Any:
-        """Leg j (from 0) as its file has it."""
+        """Leg j (from 0) of the mechanism file."""
         return self.machine.document.legs[j]
 
     def column(self, j: int) -> int:
-        """The reading of leg j, -1 without."""
+        """Column of leg j's reading, -1 without."""
         return int(self.limbs.joint[j])
 
     def motor_legs(self, column: int) -> tuple[int, ...]:
-        """The legs (from 0) that a reading moves."""
+        """Legs (from 0) that a reading drives."""
         return tuple(int(j) for j in np.flatnonzero(self.limbs.joint == column))
 
     def reading_name(self, column: int) -> str:
-        """``leg1`` where the reading moves one leg, as columns of joints.csv; else ``motor1``."""
+        """Name of a reading: ``leg1`` if it drives one leg, as in joints.csv, else ``motor1``."""
         legs = self.motor_legs(column)
         return f"leg{legs[0] + 1}" if len(legs) == 1 else f"motor{column + 1}"
 
     def scale(self, column: int) -> float:
-        """What the motor moves is scale * reading."""
+        """Scale of a reading: displacement = scale * reading."""
         return float(self.limbs.scale[self.motor_legs(column)[0]])
 
     def values(self, column: int) -> Array:
-        """What a motor has moved at home and at both ends of its range, (3,) m or rad."""
+        """Displacement of a motor at home and at both ends of its range, (3,) m or rad."""
         reading = self.readings[column]
         return self.scale(column) * np.append(reading, self.machine.joint_ranges[column])
 
     def lever(self, column: int) -> float:
-        """What makes a motor's stiffness that of a slide: 1, or a turning arm, m."""
+        """Lever that converts a motor's stiffness to that of a slide.
+
+        An arm's length in m for a crank, 1 for a slide.
+        """
         j = self.motor_legs(column)[0]
         return (
             float(np.linalg.norm(self.limbs.arm[j])) if self.limbs.drive[j] == TURN_CARRIER else 1.0
         )
 
     def length_varies(self, j: int) -> bool:
-        """Whether leg j's length changes, by its motor or because it is passive."""
+        """Whether the length of leg j changes, driven or passively."""
         return self.limbs.drive[j] == TELESCOPE_ROD or not np.isfinite(self.limbs.length[j])
 
 
 def home_state(machine: Machine) -> HomeState:
-    """The machine at its home pose, or, where constant rods or axes forbid that, next to it.
+    """Machine at its home pose, or at the nearest pose that constant rods and axes allow.
 
-    Raises GeometryError where it cannot be closed there.
+    Raises GeometryError if it cannot be closed there.
     """
     layout, values = machine.layout, machine.values
+    # closest pose on the manifold of constant rods and axes, then readings, then closure by Newton
     near = on_manifold(layout, values, machine.home()).T_base_platform
     readings, internal = inverse_result(layout, values, near)
     reached = bool(np.isfinite(readings).all())
@@ -119,7 +128,7 @@ def home_state(machine: Machine) -> HomeState:
     ends = limb_ends(layout, values, readings, fk.T_base_platform, fk.internal)
     line = ends.b - ends.a
     distance = np.sqrt(dot(line, line))
-    reference = equations(machine.document)
+    closure = equations(machine.document)
     return HomeState(
         machine,
         all_limbs(machine),
@@ -130,15 +139,15 @@ def home_state(machine: Machine) -> HomeState:
         np.array(ends.b),
         line / distance[:, None],
         distance,
-        tuple(
-            frozenset(kind for leg, kind in reference if leg == j) for j in range(machine.n_legs)
-        ),
+        tuple(frozenset(kind for leg, kind in closure if leg == j) for j in range(machine.n_legs)),
     )
 
 
 def joint_axis(home: HomeState, side: str, j: int) -> Array | None:
-    """The unit axis (3,) of a joint in its body's frame: as calibrated where it is a parameter, as
-    drawn where nothing depends on it; None where the joint has none.
+    """Unit axis (3,) of a joint in its body's frame; None for a joint without one.
+
+    The parameter's value if the axis is a parameter, else the nominal one, on which nothing
+    depends.
     """
     machine = home.machine
     finite = (machine.base_axes() if side == "base" else machine.platform_axes())[j]
@@ -149,16 +158,16 @@ def joint_axis(home: HomeState, side: str, j: int) -> Array | None:
 
 
 def universal_hinges(home: HomeState, j: int) -> tuple[Array, Array]:
-    """First and second hinge (3,) of leg j's universal joint on the base side, base frame.
+    """First and second hinge axis (3,) of leg j's universal joint on the base side, base frame.
 
-    The second is square to the first and to the leg. Where a torsion depends on the first it is
-    the file's; else the file's, or the motor's that the leg turns with, as long as the leg does not
-    lie along it; else the horizontal one square to the leg.
+    The second is perpendicular to the first and to the leg. If a torsion equation depends on the
+    first, it is the file's. Otherwise it is the file's axis, or that of the motor that turns the
+    leg, unless the leg is nearly parallel; then the horizontal axis perpendicular to the leg.
     """
     u, drive = home.u[j], home.limbs.drive[j]
     drawn = home.limbs.axis[j] if drive == TURN_CARRIER else joint_axis(home, "base", j)
     least = SAME_HINGE_DIFFERENCE if "torsion" in home.equations[j] else LEAST_SINE_TO_LEG
-    # the axis of a slide is no hinge's
+    # the axis of a slide is not a hinge
     if drawn is not None and drive != SLIDE_CARRIER and np.linalg.norm(cross(drawn, u)) > least:
         first = drawn
     else:
@@ -170,4 +179,5 @@ def universal_hinges(home: HomeState, j: int) -> tuple[Array, Array]:
 
 
 def _unit(v: Array) -> Array:
+    """Vector of length one."""
     return v / np.sqrt(dot(v, v))

@@ -1,10 +1,11 @@
-"""``klipper``: [printer] and [stepper_a] to [stepper_c] of kinematics delta and rotary_delta.
+"""``klipper``: printer.cfg sections of linear and rotary deltas.
 
-Meaning of the values: Klipper's configuration reference and its klippy/kinematics/delta.py,
-rotary_delta.py and chelper/kin_rotary_delta.c. A tower's carriage is at ``position_endstop +
-sqrt(arm_length^2 - delta_radius^2)`` where its switch triggers; an arm's switch is told by the
-height at which the nozzle would be in the middle if all arms were at that arm's angle.
-``print_radius``, beyond which Klipper accepts no position, is ``delta_radius`` where none stands.
+The sections are [printer] and [stepper_a] to [stepper_c], for kinematics delta and rotary_delta.
+Semantics: Klipper's configuration reference, klippy/kinematics/delta.py, rotary_delta.py and
+chelper/kin_rotary_delta.c. A tower's carriage is at ``position_endstop + sqrt(arm_length^2 -
+delta_radius^2)`` where its switch triggers. An arm's switch is given by the height of the nozzle
+on the central axis if all arms were at that arm's angle. ``print_radius``, beyond which Klipper
+accepts no position, defaults to ``delta_radius``.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ NO_KLIPPER_PRINT_RADIUS = (
 
 
 def _fit(source: MachineSource) -> Fit:
+    """Klipper's parameters of a source's machine."""
     return fit_of(source, PROGRAM, KLIPPER_LINEAR_FREEDOMS, KLIPPER_ROTARY_FREEDOMS)
 
 
@@ -60,7 +62,7 @@ class Klipper(Exporter):
     title: ClassVar = "Klipper: values for printer.cfg"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """One file of configuration; pins, speeds and the like are the printer's own."""
+        """Configuration file; pins, speeds and the like remain the printer's own."""
         fit = _fit(source)
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
         lines = about(source, fit, KLIPPER_STEPPERS, f"{word} by that.")
@@ -84,7 +86,7 @@ class Klipper(Exporter):
         return {FILE: commented(lines, "#") + body}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Read as Klipper does, and moved by its formulas."""
+        """Differences by Klipper's formulas, with the values read as Klipper reads them."""
         fit = _fit(source)
         text = files[FILE]
         config = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
@@ -114,16 +116,17 @@ class Klipper(Exporter):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """How well the settings follow the machine, and what to do after they are in."""
+        """Agreement of settings and machine, and the steps after installing them."""
         return (_fit(source).following, note("export.klipper_saved"), *redo(source))
 
 
 def _tower_endstops(fit: Fit) -> Array:
-    """Heights (3,) mm of the tool where the towers' switches trigger."""
+    """Heights (3,) mm of the tool at which the towers' switches trigger."""
     return fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
 
 
 def _linear(fit: Fit, radius: str | None) -> dict[str, dict[str, str]]:
+    """Sections of a linear delta."""
     endstops = _tower_endstops(fit)
     sections = {
         "printer": {
@@ -143,8 +146,9 @@ def _linear(fit: Fit, radius: str | None) -> dict[str, dict[str, str]]:
 
 
 def _arm_endstops(fit: Fit, motors: Array) -> Array:
-    """Heights (..., 3) mm of the tool in the middle where all arms are at one's angle (..., 3)
-    degrees; NaN where no rod reaches the middle from there.
+    """Tool heights (..., 3) mm on the central axis with all arms at the angle of each.
+
+    motors : (..., 3) degrees. NaN where the rod does not reach the axis.
     """
     angle = motors / DEGREES_A_RADIAN
     below = fit.rod**2 - (fit.radius + fit.arm * np.cos(angle)) ** 2
@@ -152,8 +156,10 @@ def _arm_endstops(fit: Fit, motors: Array) -> Array:
 
 
 def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[str]:
-    """A line an arm: the heights that belong to readings of its switch, in no proportion to them,
-    where Klipper makes the arm's angle of the height again.
+    """Line for each arm with the end switch's heights for a table of readings.
+
+    The relation is not linear. Only readings are listed at which Klipper recovers the arm's angle
+    from the height.
     """
     config = ConfigParser()
     config.read_dict(sections)
@@ -163,17 +169,16 @@ def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[st
     back = np.array([_homed_by(config, row) for row in heights])
     lines: list[str] = []
     for k, name in enumerate(KLIPPER_STEPPERS):
-        above_limit = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
-        pairs = [
-            f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in above_limit
-        ]
+        recovered = np.flatnonzero(np.abs(back[:, k] - motors[:, k]) < SWITCH_ROUNDING)
+        pairs = [f"{firmware_length(heights[n, k])} at {readings[n, k]:.9g} rad" for n in recovered]
         lines.append(f"stepper_{name}.position_endstop = {', '.join(pairs)}")
     return lines
 
 
 def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
-    """Readings of switches elsewhere, and the values that the text has for them; one motor at a
-    time where values are in a table, NaN for the others.
+    """Readings of switches elsewhere and their values by the text, (3,) each.
+
+    For tables one motor at a time, NaN for the others.
     """
     if fit.kind == "linear":
         return [(q, switch_values(text, q)) for q in readings_elsewhere(fit)]
@@ -188,9 +193,7 @@ def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
 
 
 def _homed_by(config: ConfigParser, endstops: Array) -> Array:
-    """Motor positions (3,) by other end switches than those of a configuration; NaN where one's is
-    not given.
-    """
+    """Motor positions (3,) with other end switch values; NaN where a value is NaN."""
     other = ConfigParser()
     other.read_dict(config)
     for name, value in zip(KLIPPER_STEPPERS, endstops, strict=True):
@@ -199,11 +202,15 @@ def _homed_by(config: ConfigParser, endstops: Array) -> Array:
 
 
 def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
+    """Sections of a rotary delta.
+
+    Raises InputError for an arm that no end switch height describes.
+    """
     endstops = _arm_endstops(fit, fit.end_motors)
     if not np.isfinite(endstops).all() or fit.radius <= 0:
         out = fit.radius + fit.arm * np.cos(fit.end_motors / DEGREES_A_RADIAN)
         raise InputError(
-            "Klipper tells an arm's end switch by a height in the middle, and none belongs to it",
+            "Klipper gives an arm's end switch by a height in the middle, and none belongs to it",
             found=f"an arm that reaches {out.max():.1f} mm out, a rod of {fit.rod.min():.1f} mm",
             next_step="Give the cranks a smaller range in the mechanism file",
         )
@@ -225,11 +232,12 @@ def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
 
 
 def _each(config: ConfigParser, key: str) -> Array:
+    """Values (3,) of a key in the steppers' sections."""
     return np.array([config.getfloat(f"stepper_{name}", key) for name in KLIPPER_STEPPERS])
 
 
 def homed(config: ConfigParser) -> Array:
-    """Motor positions (3,), mm or degrees, where the end switches trigger."""
+    """Motor positions (3,), mm or degrees, at which the end switches trigger."""
     ends = _each(config, "position_endstop")
     if config.get("printer", "kinematics") == "delta":
         radius = config.getfloat("printer", "delta_radius")
@@ -240,7 +248,7 @@ def homed(config: ConfigParser) -> Array:
 
 
 def klipper_carriage_heights(config: ConfigParser, points: Array) -> Array:
-    """Carriages' heights (n, 3) mm at points (n, 3) mm."""
+    """Carriage heights (n, 3) mm at points (n, 3) mm."""
     radius = config.getfloat("printer", "delta_radius")
     angle = _each(config, "angle") / DEGREES_A_RADIAN
     dx = radius * np.cos(angle) - points[:, :1]
@@ -249,7 +257,10 @@ def klipper_carriage_heights(config: ConfigParser, points: Array) -> Array:
 
 
 def klipper_arm_angles(config: ConfigParser, points: Array) -> Array:
-    """Arms' angles (n, 3) degrees at points (n, 3) mm: a circle cut by a line, as Klipper does."""
+    """Arm angles (n, 3) degrees at points (n, 3) mm.
+
+    Intersection of a circle with a line, as in Klipper.
+    """
     angle = _each(config, "angle") / DEGREES_A_RADIAN
     c, s = np.cos(angle), np.sin(angle)
     across = points[:, 1:2] * c - points[:, :1] * s

@@ -1,7 +1,7 @@
-"""A machine's limbs as elementary joints: what C sources, models and firmwares are made of.
+"""Limbs of a machine as elementary joints, for C sources, multibody models and firmwares.
 
-Each limb's end is carried by a joint that its carrier names (:class:`Chain`), so that no format
-knows a kind of joint by its word in mechanism files.
+Carriers state the elementary joint that moves a limb's end (:class:`Chain`), so no format knows
+the joint kinds of mechanism files by name.
 """
 
 from __future__ import annotations
@@ -25,21 +25,25 @@ FIXED_CARRIER, FLOAT_CARRIER = "fixed", "float"
 
 @dataclass(frozen=True)
 class Limbs:
-    """Numbers by limb (L of them), m and rad.
+    """Limbs (L of them) as arrays, m and rad.
 
-    leg : (L,) its number in the mechanism file, from 1.
-    drive : what its reading moves: the rod's length, or its end along or about an axis; nothing.
-    joint : (L,) column of the reading, -1 without. scale : (L,) what the motor moves is scale *
-    reading. length : (L,) the rod's, of a telescope at
-    reading zero; NaN for a passive rod.
-    base : (L, 3) base frame, the fixed end, a sliding end at reading zero, or on a turning end's
-    axis the foot of its arm. axis : (L, 3) unit. arm : (L, 3) from the foot to the end at reading
-    zero, square to the axis; zero where nothing turns.
-    held : what its end on the platform stands on: the platform itself (``fixed``), or a bar that
-    turns on it (``turn``) or keeps its direction (``float``).
-    platform : (L, 3) platform frame, the end or the bar's hinge. bar : (L, 3) from the hinge to the
-    end, platform frame at angle zero, or base frame. hinge : (L,) column of the bar's angle, -1
-    without. hinge_axis : (L, 3) unit, platform frame.
+    leg : (L,) number in the mechanism file, from 1.
+    drive : what the reading moves: the rod's length, its base end along or about an axis, or
+        nothing.
+    joint : (L,) column of the reading, -1 without.
+    scale : (L,) displacement = scale * reading.
+    length : (L,) length of the rod, of a telescope at reading zero; NaN for a passive rod.
+    base : (L, 3) base frame; the fixed end, the sliding end at reading zero, or the foot of a
+        turning end's arm on the axis.
+    axis : (L, 3) unit vectors.
+    arm : (L, 3) from the foot to the end at reading zero, perpendicular to the axis; zero if
+        nothing turns.
+    held : body of the platform end: the platform (``fixed``), or a bar that turns on it (``turn``)
+        or keeps its direction (``float``).
+    platform : (L, 3) platform frame; the end, or the hinge of the bar.
+    bar : (L, 3) from hinge to end; platform frame at angle zero, or base frame for ``float``.
+    hinge : (L,) column of the bar's angle, -1 without.
+    hinge_axis : (L, 3) unit vectors, platform frame.
     """
 
     leg: Integers
@@ -61,18 +65,18 @@ class Limbs:
 
     @property
     def rate(self) -> Array:
-        """How the end on the base moves with what its motor moves where that is zero, (L, 3)."""
+        """Derivative of the base end by the motor's displacement, at zero, (L, 3)."""
         slides = np.array([drive == SLIDE_CARRIER for drive in self.drive])
         return np.where(slides[:, None], self.axis, cross(self.axis, self.arm))
 
     @property
     def ends(self) -> Array:
-        """The ends on the platform (L, 3), platform frame; of a floating bar its hinge."""
+        """Platform ends (L, 3), platform frame; the hinge for a floating bar."""
         turns = np.array([held == TURN_CARRIER for held in self.held])
         return np.where(turns[:, None], self.platform + self.bar, self.platform)
 
     def of(self, limbs: Integers) -> Limbs:
-        """Some of them."""
+        """Subset of the limbs, by index."""
 
         def chosen(values: Any) -> Any:
             return tuple(values[k] for k in limbs) if isinstance(values, tuple) else values[limbs]
@@ -81,7 +85,7 @@ class Limbs:
 
 
 def all_limbs(machine: Machine) -> Limbs:
-    """All limbs of a machine; InputError where a carrier is no elementary joint."""
+    """All limbs of a machine. Raises InputError for a carrier that is no elementary joint."""
     layout, values = machine.layout, machine.parameters.unit_axes(machine.values)
     base, axis, arm, shifted = _chains(
         machine, "base", layout.base, (FIXED_CARRIER, SLIDE_CARRIER, TURN_CARRIER)
@@ -89,9 +93,11 @@ def all_limbs(machine: Machine) -> Limbs:
     hinge, hinge_axis, bar, held = _chains(
         machine, "platform", layout.platform, (FIXED_CARRIER, TURN_CARRIER, FLOAT_CARRIER)
     )
-    # an arm that nothing turns belongs to its place; of one that turns, what lies along the axis
+    # an arm that does not turn is part of the base point, and so is the axial part of one that
+    # turns
     turns = np.array([kind == TURN_CARRIER for kind in shifted])[:, None]
     along = np.where(turns, dot(axis, arm)[:, None] * axis, arm)
+    # a platform end on the platform itself has no bar; its offset is part of the point
     barred = np.array([kind != FIXED_CARRIER for kind in held])[:, None]
     driven = np.where(layout.rod_reads, TELESCOPE_ROD, shifted)
     rods = np.where(layout.rod >= 0, layout.rod, 0)
@@ -113,9 +119,9 @@ def all_limbs(machine: Machine) -> Limbs:
 
 
 def rod_limbs(machine: Machine) -> Limbs:
-    """The limbs whose length is known: passive ones move nothing.
+    """Limbs of known length; passive ones move nothing.
 
-    Raises InputError where they and the joints' axes do not just hold the platform.
+    Raises InputError if they and the joints' axes do not determine the platform exactly.
     """
     layout = machine.layout
     unknowns = layout.motion.shape[1] + layout.n_internal
@@ -131,7 +137,7 @@ def rod_limbs(machine: Machine) -> Limbs:
 def _chains(
     machine: Machine, side: str, groups: tuple[CarrierGroup, ...], names: tuple[str, ...]
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """Points, axes and arms (L, 3) of one side's joints, and their motions."""
+    """Points, axes and arms (L, 3) of the joints on one side, and their motions."""
     values = machine.parameters.unit_axes(machine.values)
     point, axis, arm = np.zeros((3, machine.n_legs, 3))
     motion = [""] * machine.n_legs

@@ -1,23 +1,23 @@
-"""``linuxcnc``: kinematics for LinuxCNC, and words for its INI file.
+"""``linuxcnc``: kinematics for LinuxCNC, and entries for its INI file.
 
-Three kinds. Hexapods: pins of genhexkins, exactly. Deltas that lineardeltakins or rotarydeltakins
-follow to some hundredths of a millimetre: their pins, fitted. All others with as many joints as
-coordinates, leaning towers too: a module of one's own, exactly (:mod:`.linuxcnc_module`).
+Three cases. Hexapods: pins of genhexkins, exact. Deltas that lineardeltakins or rotarydeltakins
+approximate to some hundredths of a millimetre: their pins, fitted. All other machines with as many
+joints as coordinates, leaning towers too: a generated module, exact (:mod:`.linuxcnc_module`).
 
-Meaning of the pins: LinuxCNC's src/emc/kinematics. genhexkins' joint is the strut's length from
+Semantics of the pins: LinuxCNC's src/emc/kinematics. genhexkins' joint is the strut's length from
 ``base.N`` to ``platform.N``; A, B, C are roll, pitch and yaw in degrees, R = Rz(C) Ry(B) Rx(A).
 
 Homing (src/emc/motion/homing.c): with HOME_ABSOLUTE_ENCODER = 2 a joint is at the encoder's
-position plus HOME_OFFSET, and nothing moves. Without it the place of the switch, or with both
-velocities 0 the present one, becomes HOME_OFFSET, and the joint then moves to HOME, without soft
-limits, at HOME_FINAL_VEL. A latch velocity without a search velocity is an error, by which nothing
-moves.
+position plus HOME_OFFSET, and nothing moves. Otherwise the position of the switch, or the present
+one if both velocities are 0, becomes HOME_OFFSET, and the joint then moves to HOME, without soft
+limits, at HOME_FINAL_VEL. A latch velocity without a search velocity is an error, upon which
+nothing moves.
 
-Both delta modules know ideal deltas alone: one radius, one length of rods, towers 120 degrees
-apart; they are fitted. Joint 0 of lineardeltakins is the tower at (0, R), joints 1 and 2 are at 210
-and 330 degrees; rotarydeltakins' arms are at -90, 30 and 150 degrees, and turn downwards
-(lineardeltakins-common.h, rotarydeltakins-common.h; some older rotarydeltakins exchange joints 1
-and 2).
+Both delta modules know ideal deltas only: one radius, one rod length, towers 120 degrees apart;
+they are fitted. Joint 0 of lineardeltakins is the tower at (0, R), joints 1 and 2 are at 210 and
+330 degrees; rotarydeltakins' arms are at -90, 30 and 150 degrees, and turn downwards
+(lineardeltakins-common.h, rotarydeltakins-common.h; some older versions of rotarydeltakins
+exchange joints 1 and 2).
 """
 
 from __future__ import annotations
@@ -71,18 +71,21 @@ LINUXCNC_ROTARY_FREEDOMS = Freedoms(
 GENHEXKINS_STRUTS = 6
 HEXAPOD_PARAMETERS = ("center", "offset", "scale")
 MAX_ERROR = 500.0
-"""genhexkins' own limit on the sum of the struts' errors, beyond which it gives up."""
+"""genhexkins' default limit on the sum of the struts' errors, beyond which it gives up."""
 LINUXCNC_READING_ROUNDING = 1e-12
-"""m: pins hold all digits; angles go through degrees and back."""
+"""Tolerance, m: pins hold all digits; angles are converted to degrees and back."""
 _STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
 _PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
 _WORD = re.compile(r"^([A-Z_]+) = (\S+)$", re.M)
 _RATE = re.compile(r"^# joint \d = (\S+) \* reading", re.M)
 SCALE_CORRECTION_ADVICE = "Divide its SCALE in the INI file, steps or counts per unit, by that."
 HOME_FINAL_VELOCITY = 5.0
-"""mm/s or degrees/s: LinuxCNC takes a joint's largest velocity where none stands."""
+"""Velocity to HOME, mm/s or degrees/s; without it LinuxCNC uses the joint's largest velocity."""
 UNSEARCHED_LATCH_VELOCITY = 1.0
-"""Any: without a search velocity LinuxCNC refuses to home a joint without an absolute encoder."""
+"""Latch velocity without a search velocity; any value but 0.
+
+LinuxCNC then refuses to home a joint that has no absolute encoder.
+"""
 HOMING_CONVENTIONS = (
     "Homing by these values is for absolute encoders: LinuxCNC sets joint = encoder + HOME_OFFSET"
     " where the machine is, and moves nothing. The encoder counts as the comment in the joint's"
@@ -100,11 +103,12 @@ HOMING_CONVENTIONS = (
 
 @dataclass(frozen=True)
 class Joints:
-    """LinuxCNC's joints (J,), mm or degrees: rate * reading + offset.
+    """Joints (J,) of LinuxCNC, mm or degrees: rate * reading + offset.
 
-    kind : LINEAR or ANGULAR. home : at the machine's home pose. limits : (J, 2), not finite where
-    the mechanism file has no range. scale : of the readings, where a joint's SCALE is to be
-    corrected by it.
+    kind : LINEAR or ANGULAR.
+    home : at the machine's home pose.
+    limits : (J, 2), not finite where the mechanism file has no range.
+    scale : of the readings; a joint's SCALE is to be corrected by it unless it is 1.
     """
 
     kind: tuple[str, ...]
@@ -118,7 +122,8 @@ class Joints:
 def _joints(
     machine: Machine, columns: Integers, rate: Array, offset: Array, scale: Array
 ) -> Joints:
-    """Joints that follow the readings of some columns; InputError where home is beyond a limit."""
+    """Joints that follow some columns of readings. Raises InputError if home is beyond a limit."""
+    # joints at home, and limits at the ends of the readings' ranges
     readings = machine.inverse(machine.home()[None])[0][columns]
     home = rate * readings + offset
     limits = np.sort(rate[:, None] * machine.joint_ranges[columns] + offset[:, None], axis=1)
@@ -134,7 +139,7 @@ def _joints(
 
 
 def joint_sections(joints: Joints) -> list[str]:
-    """A section of each joint, with what homing needs."""
+    """Section of each joint, with the entries for homing."""
     lines: list[str] = []
     for n, kind in enumerate(joints.kind):
         lines.append(f"\n[JOINT_{n}]\nTYPE = {kind}")
@@ -161,8 +166,11 @@ def joint_sections(joints: Joints) -> list[str]:
 
 
 def _ini(about: tuple[str, ...], module: str, letters: str, home: Array, joints: Joints) -> str:
-    """The INI file; home : (6,) X, Y, Z mm, A, B, C degrees."""
-    # what is none of the machine's coordinates is 0, as forward kinematics leaves it
+    """INI file.
+
+    home : (6,) X, Y, Z mm, A, B, C degrees.
+    """
+    # coordinates that the machine lacks are 0, as forward kinematics leaves them
     world_home = [
         float(value) if letter in letters else 0.0
         for letter, value in zip("XYZABC", home, strict=True)
@@ -178,13 +186,16 @@ def _ini(about: tuple[str, ...], module: str, letters: str, home: Array, joints:
 
 
 def ini_words(ini: str, word: str) -> Array:
-    """A word's values in the sections of the joints."""
+    """Values of an entry in the joints' sections."""
     own = ini[ini.index("[JOINT_0]") :]
     return np.array([float(value) for name, value in _WORD.findall(own) if name == word])
 
 
 def homing_difference(ini: str, joints: Joints) -> Difference:
-    """Rates, offsets, home and limits read again; without end where home is beyond a limit."""
+    """Difference of rates, offsets, home and limits in the text.
+
+    Infinite if home is beyond a limit.
+    """
     rates = np.array([float(word) for word in _RATE.findall(ini)])
     offset, home = ini_words(ini, "HOME_OFFSET"), ini_words(ini, "HOME")
     low, high = ini_words(ini, "MIN_LIMIT"), ini_words(ini, "MAX_LIMIT")
@@ -201,19 +212,19 @@ def homing_difference(ini: str, joints: Joints) -> Difference:
 
 
 def _kind(source: MachineSource) -> Limbs | Fit | None:
-    """What of LinuxCNC's own follows the machine: struts of genhexkins, a delta's fit; or None."""
+    """Built-in kinematics for the machine: struts of genhexkins, the fit of a delta, or None."""
     if source.machine.document.motion != "translation":
         return _hexapod(source.machine)
     try:
-        fit = _fit(source)
-    except InputError:  # no delta, or none that parameters follow
+        fit = fit_of(source, PROGRAM, LINUXCNC_LINEAR_FREEDOMS, LINUXCNC_ROTARY_FREEDOMS)
+    except InputError:  # not a delta, or one that the parameters do not describe
         return None
     return fit if fit.largest <= UNWARNED_TOOL_ERROR else None
 
 
 @final
 class LinuxCnc(Exporter):
-    """HAL and INI lines for hexapods and ideal deltas; for other machines a kinematics module."""
+    """HAL and INI lines for hexapods and ideal deltas; a kinematics module for other machines."""
 
     name: ClassVar = "linuxcnc"
     title: ClassVar = "LinuxCNC: kinematics, and INI words"
@@ -223,7 +234,7 @@ class LinuxCnc(Exporter):
     )
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """A HAL file, or the source of a module, and words for the INI file."""
+        """HAL file or source of a module, and the INI file's entries."""
         kind = _kind(source)
         if kind is None:
             return {**module_files(source), LINUXCNC_INI_FILE: _module_ini(source)}
@@ -234,7 +245,7 @@ class LinuxCnc(Exporter):
         return dict(zip((LINUXCNC_HAL_FILE, LINUXCNC_INI_FILE), texts, strict=True))
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Pins and words read again, moved by LinuxCNC's own formulas."""
+        """Differences by LinuxCNC's own formulas, with the pins and entries of the texts."""
         ini, machine, kind = files[LINUXCNC_INI_FILE], source.machine, _kind(source)
         if kind is None:
             homing = homing_difference(ini, _module_joints(machine))
@@ -258,7 +269,7 @@ class LinuxCnc(Exporter):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """How to use the files, and how well the pins follow the machine."""
+        """Use of the files, and agreement of pins and machine."""
         kind = _kind(source)
         if isinstance(kind, Fit):
             return (kind.following, note("export.linuxcnc_homing"))
@@ -268,20 +279,22 @@ class LinuxCnc(Exporter):
         return (note("export.linuxcnc_genhexkins"),)
 
 
-# Machines of no module of LinuxCNC's
+# Machines with a generated module
 
 
 def _module_joints(machine: Machine) -> Joints:
+    """Joints of the generated module: the readings in mm or degrees."""
     columns, none = np.arange(machine.n_joints), np.zeros(machine.n_joints)
     return _joints(machine, columns, joint_units(machine), none, none + 1)
 
 
 def _module_ini(source: MachineSource) -> str:
+    """INI file for the generated module."""
     machine = source.machine
     home = world(machine.home()[None])[0]
     letters = linuxcnc_coordinates(machine)
     if "A" not in letters:
-        home[3:] = 0.0  # C counts from home
+        home[3:] = 0.0  # C counts from the orientation at home
     return _ini(
         source.header(*MODULE_CONVENTIONS), MODULE_NAME, letters, home, _module_joints(machine)
     )
@@ -291,7 +304,7 @@ def _module_ini(source: MachineSource) -> str:
 
 
 def _hexapod(machine: Machine) -> Limbs | None:
-    """The struts in the order of the joints where genhexkins can express the machine; else None."""
+    """Struts in the order of the joints if genhexkins can express the machine, else None."""
     layout = machine.layout
     rods, axes = int(layout.closing.sum()), len(layout.angles)
     ok = machine.document.motion == "spatial" and rods == GENHEXKINS_STRUTS and not axes
@@ -302,6 +315,7 @@ def _hexapod(machine: Machine) -> Limbs | None:
 
 
 def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
+    """Header lines on the conventions of genhexkins."""
     return source.header(
         "Units: mm and degrees. Strut N is joint N; base.N in the base frame, platform.N in the"
         " platform frame.",
@@ -314,11 +328,13 @@ def _hexapod_header(source: MachineSource) -> tuple[str, ...]:
 
 
 def _hexapod_joints(machine: Machine, struts: Limbs) -> Joints:
+    """Joints of a hexapod: the lengths of its struts."""
     rate, offset = MM_A_METRE * struts.scale, MM_A_METRE * struts.length
     return _joints(machine, struts.joint, rate, offset, struts.scale)
 
 
 def _hal(source: MachineSource, struts: Limbs) -> str:
+    """HAL file of a hexapod: genhexkins' pins."""
     limits = _hexapod_joints(source.machine, struts).limits
     limit = max(MAX_ERROR, GENHEXKINS_STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
@@ -347,13 +363,14 @@ def _hal(source: MachineSource, struts: Limbs) -> str:
 
 
 def _hexapod_ini(source: MachineSource, struts: Limbs) -> str:
+    """INI file of a hexapod."""
     home = world(source.machine.home()[None])[0]
     joints = _hexapod_joints(source.machine, struts)
     return _ini(_hexapod_header(source), "genhexkins", "XYZABC", home, joints)
 
 
 def world(poses: Array) -> Array:
-    """X, Y, Z (mm), A, B, C (degrees) of poses (n, 4, 4); (n, 6)."""
+    """Coordinates (n, 6) of poses (n, 4, 4): X, Y, Z in mm, A, B, C in degrees."""
     r = poses[:, :3, :3]
     roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
     pitch = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 2, 1], r[:, 2, 2]))
@@ -363,10 +380,14 @@ def world(poses: Array) -> Array:
 
 
 def genhexkins(hal: str, pose: Array) -> Array:
-    """Joints (n, 6) mm at X, Y, Z, A, B, C (n, 6), by the pins that a HAL file sets."""
+    """Joints (n, 6) mm at coordinates (n, 6), by genhexkins' formulas.
+
+    hal : HAL file that sets the pins.
+    """
     pins = {name: np.zeros((GENHEXKINS_STRUTS, 3)) for name in ("base", "platform")}
     for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
+    # R = Rz(C) Ry(B) Rx(A)
     angle = pose[:, 3:].T / DEGREES_A_RADIAN
     (sa, sb, sc), (ca, cb, cc) = np.sin(angle), np.cos(angle)
     rows = [
@@ -382,11 +403,8 @@ def genhexkins(hal: str, pose: Array) -> Array:
 # Deltas
 
 
-def _fit(source: MachineSource) -> Fit:
-    return fit_of(source, PROGRAM, LINUXCNC_LINEAR_FREEDOMS, LINUXCNC_ROTARY_FREEDOMS)
-
-
 def _delta_hal(source: MachineSource, fit: Fit) -> str:
+    """HAL file of a delta: pins of lineardeltakins or rotarydeltakins."""
     lines = about(source, fit, "012", SCALE_CORRECTION_ADVICE)
     if fit.kind == "linear":
         pins = [
@@ -407,6 +425,7 @@ def _delta_hal(source: MachineSource, fit: Fit) -> str:
 
 
 def _delta_joints(fit: Fit) -> Joints:
+    """Joints of a delta."""
     sign = 1.0 if fit.kind == "linear" else -1.0  # arms count downwards
     columns = fit.delta.joint[fit.order]
     zero = np.round(sign * fit.zero, 5 if sign < 0 else 4)
@@ -414,6 +433,7 @@ def _delta_joints(fit: Fit) -> Joints:
 
 
 def _delta_ini(source: MachineSource, fit: Fit) -> str:
+    """INI file of a delta."""
     about = source.header("Units: mm and degrees. An absolute encoder counts rate * reading.")
     at = MM_A_METRE * apply(fit.T_firmware_base, source.machine.home()[:3, 3])
     home = np.append(at, np.zeros(3))
@@ -421,7 +441,7 @@ def _delta_ini(source: MachineSource, fit: Fit) -> str:
 
 
 def linear_joints(pins: dict[str, float], points: Array) -> Array:
-    """Joints (n, 3) mm at points (n, 3) mm."""
+    """Joints (n, 3) mm at points (n, 3) mm, by lineardeltakins' formulas."""
     half, side = 0.5 * pins["R"], np.sqrt(3) / 2 * pins["R"]
     towers = np.array([[0.0, pins["R"]], [-side, -half], [side, -half]])
     d = towers - points[:, None, :2]
@@ -429,8 +449,10 @@ def linear_joints(pins: dict[str, float], points: Array) -> Array:
 
 
 def rotary_joints(pins: dict[str, float], points: Array) -> Array:
-    """Joints (n, 3) degrees at points (n, 3) mm, downwards: joint 0 swings in the YZ plane, the
-    others are it, the point turned.
+    """Joints (n, 3) degrees, downwards, at points (n, 3) mm, by rotarydeltakins' formulas.
+
+    Joint 0 swings in the YZ plane; the others are computed as joint 0 for the point turned by 120
+    degrees.
     """
     pfr, thigh, shin, foot = (
         pins[name] for name in ("platformradius", "thighlength", "shinlength", "footradius")

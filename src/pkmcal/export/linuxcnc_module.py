@@ -1,8 +1,9 @@
-"""A LinuxCNC kinematics module made of the C export, for machines that its own modules have not.
+"""LinuxCNC kinematics module around the C export, for machines without a module in LinuxCNC.
 
-Coordinates are the platform's freedoms: X, Y, Z in mm, A, B, C in degrees. A joint is a reading as
-it was calibrated, in mm or degrees. ``halcompile`` builds it; ``linuxcnc_source/pkmcal_kins.c`` is
-the text around the C source, with the built-in hexapod's numbers.
+Coordinates are the platform's degrees of freedom: X, Y, Z in mm, A, B, C in degrees. A joint is a
+calibrated reading, in mm or degrees. ``halcompile`` builds the module;
+``linuxcnc_source/pkmcal_kins.c`` is the text around the C source, with the built-in hexapod's
+constants.
 """
 
 from __future__ import annotations
@@ -32,19 +33,21 @@ MODULE_CONVENTIONS = (
     f"Build it with: {MODULE_BUILD_COMMAND}",
 )
 COORDINATE_LETTERS = "ABCXYZ"
-"""Of the freedoms omega_x, omega_y, omega_z, tau_x, tau_y, tau_z."""
+"""Letters of the degrees of freedom omega_x, omega_y, omega_z, tau_x, tau_y, tau_z."""
 
 
 def joint_units(machine: Machine) -> Array:
-    """LinuxCNC's joint over the reading (m,), mm/m or degrees/rad."""
+    """Ratio of LinuxCNC's joints to the readings (m,), mm/m or degrees/rad."""
     return np.array(
         [MM_A_METRE if unit == "m" else DEGREES_A_RADIAN for unit in machine.joint_units]
     )
 
 
 def linuxcnc_coordinates(machine: Machine) -> str:
-    """LinuxCNC's letters of the platform's freedoms, X first; InputError where joints are not as
-    many, so that not every command of coordinates is a pose.
+    """LinuxCNC's letters of the platform's degrees of freedom, X first.
+
+    Raises InputError if the number of joints differs from theirs: not every command would be a
+    pose.
     """
     free = np.argmax(machine.layout.motion, axis=0).tolist()
     if len(free) != machine.n_joints:
@@ -60,24 +63,21 @@ def linuxcnc_coordinates(machine: Machine) -> str:
 
 
 def module_files(source: MachineSource) -> dict[str, str]:
-    """The C source and header, and the module around them."""
+    """C source and header, and the module around them."""
     linuxcnc_coordinates(source.machine)
     files = CSource().files(source)
     del files[C_SELFTEST_FILE]
-    units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {_plain(source.machine)};\n"
+    # constants of type double, without the macro of the C source's number type
+    plain = c_value(joint_units(source.machine)).replace("REAL(", "").replace(")", "")
+    units = f"static const double JOINT_UNITS[PKMCAL_JOINTS] = {plain};\n"
     numbers = f"/* LinuxCNC's joint is the reading times this: mm/m or degrees/rad */\n{units}"
     about = source.header(*MODULE_CONVENTIONS)
     files[MODULE_SOURCE_FILE] = filled(MODULE_SOURCE_FOLDER / MODULE_SOURCE_FILE, about, numbers)
     return files
 
 
-def _plain(machine: Machine) -> str:
-    """The joints' units in braces, of type double."""
-    return c_value(joint_units(machine)).replace("REAL(", "").replace(")", "")
-
-
 def module_differences(files: dict[str, str], source: MachineSource) -> list[Difference]:
-    """The C source read again, as the C export does, and the joints' units."""
+    """Differences of the C source, read as in the C export, and of the joints' units."""
     own = CSource().files(source)
     units = numbers_of(files[MODULE_SOURCE_FILE], "JOINT_UNITS")
     again = {C_SELFTEST_FILE: own[C_SELFTEST_FILE], **files}

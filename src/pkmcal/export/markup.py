@@ -1,4 +1,4 @@
-"""XML as exports write it: numbers to the last digit, comments that nothing in them can end."""
+"""XML of exports: numbers with all digits, and comments that their text cannot end."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pkmcal.errors import legible
 
 
 def numbers_text(*values: float | Array) -> str:
-    """Numbers to the last digit, or the 16th behind the point; no negative zeros."""
+    """Numbers with all digits, at most 16 decimals; no negative zeros."""
     flat = np.concatenate([np.atleast_1d(np.asarray(v, dtype=float)).ravel() for v in values])
     return " ".join(repr(round(float(v), 16) + 0.0) for v in flat)
 
 
 def comment_text(text: str) -> str:
-    """Text that may stand in an XML comment: legible, and no two hyphens in a row."""
+    """Text that is valid in an XML comment: printable, without two hyphens in a row."""
     text = legible(text)
     while "--" in text:
         text = text.replace("--", "- -")
@@ -28,12 +28,12 @@ def comment_text(text: str) -> str:
 
 
 def comment(parent: Element, text: str) -> None:
-    """A sentence for people."""
+    """Append a comment."""
     parent.append(Comment(f" {comment_text(text)} "))
 
 
 def document(root: Element, source: MachineSource, conventions: Iterable[str]) -> str:
-    """The whole text, on top what it is made of and the parameters with their deviations."""
+    """XML text with a comment on top: origin, conventions, and parameters with their sigmas."""
     indent(root)
     lines = [comment_text(line) for line in (*source.header(*conventions), "Parameters:")]
     lines = [part for line in lines for part in wrap(line, 96, break_on_hyphens=False)]
@@ -43,6 +43,6 @@ def document(root: Element, source: MachineSource, conventions: Iterable[str]) -
 
 
 def file_name(name: str) -> str:
-    """A machine's name as a file's, without an ending."""
-    retained = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
-    return retained.strip("-") or "machine"
+    """File name, without suffix, for a machine's name."""
+    characters = "".join(c if c.isalnum() or c in "-_" else "-" for c in name)
+    return characters.strip("-") or "machine"

@@ -1,4 +1,4 @@
-"""MuJoCo: a model (MJCF) with the machine's closed loops, driven by its readings."""
+"""MuJoCo model (MJCF) with the machine's closed loops, driven by its readings."""
 
 from __future__ import annotations
 
@@ -19,18 +19,21 @@ from pkmcal.geometry.rigid import quaternion
 from pkmcal.outcome.finding import Finding, note
 
 MUJOCO_TIME_STEP = "0.001"
-"""s; the loops' time constant is twice that, the shortest that MuJoCo allows."""
+"""Time step, s; the loops' time constant is twice as large, the shortest that MuJoCo allows."""
 DRIVE_STIFFNESS = 2.0e4
-"""N/m of a drive's position control: with the parts' masses it settles within some 20 ms."""
+"""Stiffness of a drive's position control, N/m.
+
+With the bodies' masses it settles in about 20 ms.
+"""
 DRIVE_DAMPING = 2.0e2
-"""N s/m of a drive."""
+"""Damping of a drive, N s/m."""
 MUJOCO_PART_MASS, MUJOCO_PLATFORM_MASS = 0.1, 1.0
-"""kg of a part and of the platform: placeholders, since photographs weigh nothing."""
+"""Masses of a part and of the platform, kg: placeholders, since images do not determine masses."""
 CONVENTIONS = (
     "Units: m, rad, kg, s. MuJoCo's world is the machine's base frame; the body 'platform' has the"
     " platform frame, so its xpos and xmat are T_base_platform.",
     "Actuators leg1, leg2, … (motor1, … where a motor moves several rods) have the machine's"
-    " readings as their values, and sensors of these names tell them: set data.ctrl to readings."
+    " readings as their values, and sensors of these names measure them: set data.ctrl to readings."
     " Joints of these names have scale * reading: a rod's length is that + offset, a crank's angle"
     " that + angle. An actuator's gear is 1 / scale; without one the scale is 1.",
     "The keyframe 'home' is closed by pkmcal's kinematics, and is the model as drawn (qpos0)."
@@ -48,21 +51,21 @@ class MujocoExporter(Exporter):
     title: ClassVar = "MuJoCo model (MJCF) with closed loops"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """The model's text."""
+        """MJCF text."""
         return {f"{file_name(source.machine.name)}.xml": _mjcf(source)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """By the text's own bodies, joints and loops."""
+        """Differences of the model that the text's bodies, joints and loops describe."""
         return differences(read_mujoco(next(iter(files.values()))), source.machine)
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """What the model does not know."""
+        """Note on placeholders."""
         del source
         return (note("export.mujoco_placeholders"),)
 
 
 def _mjcf(source: MachineSource) -> str:
-    """The model's XML. Raises InputError for a machine that MuJoCo's bodies cannot be."""
+    """MJCF text. Raises InputError for a machine that MuJoCo's bodies cannot represent."""
     tree = body_tree(source.machine)
     home = tree.home
     root = Element("mujoco", model=comment_text(source.machine.name))
@@ -72,6 +75,7 @@ def _mjcf(source: MachineSource) -> str:
     SubElement(world, "light", pos=size, dir="0 0 -1", directional="true")
     _fill(world, tree.bodies[0], tree)
     equality = SubElement(root, "equality")
+    # couplings and loops are equality constraints
     for coupling in tree.couplings:
         comment(equality, coupling.comment)
         out = SubElement(equality, "joint", name=coupling.name, joint1=coupling.follower)
@@ -91,7 +95,7 @@ def _mjcf(source: MachineSource) -> str:
 
 
 def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
-    """What a body has, and all that stands on it."""
+    """Add joints, shapes and sites of a body, and recursively the bodies on it."""
     for joint in body.joints:
         made = _joint(node, joint.name, joint.kind, joint.axis, joint.value)
         if joint.column >= 0:
@@ -119,7 +123,7 @@ def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
 
 
 def _end(node: Element, loop: Loop, size: float) -> None:
-    """The part of a joint whose axes count that the platform is welded to."""
+    """Add the body with a loop joint's own hinges, to which the platform is welded."""
     place = np.eye(4)
     place[:3, 3] = loop.end
     last = _body(node, f"{loop.name}_end", place, MUJOCO_PART_MASS, np.zeros(3), size)
@@ -128,22 +132,26 @@ def _end(node: Element, loop: Loop, size: float) -> None:
 
 
 def _body(parent: Element, name: str, T: Array, mass: float, middle: Array, size: float) -> Element:
-    """A body at a place (4, 4) of its parent's frame.
+    """Add a body at a pose (4, 4) in its parent's frame.
 
-    middle : (3,) its centre of mass. size : m, of a rod of that length; placeholders.
+    middle : (3,) centre of mass.
+    size : m; the placeholder inertia is that of a rod of this length.
     """
     out = SubElement(parent, "body", name=name, pos=numbers_text(T[:3, 3]))
     inertia = numbers_text(np.full(3, mass * size**2 / 12))
     SubElement(
         out, "inertial", pos=numbers_text(middle), mass=numbers_text(mass), diaginertia=inertia
     )
-    if np.abs(T[:3, :3] - np.eye(3)).max() > 1e-15:  # rounding is no turn
+    if np.abs(T[:3, :3] - np.eye(3)).max() > 1e-15:  # rounding error
         out.set("quat", numbers_text(quaternion(T[:3, :3])))
     return out
 
 
 def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0) -> Element:
-    """A ``hinge`` or ``slide`` at the body's origin; ``ref`` is its value as drawn (m, rad)."""
+    """Add a ``hinge`` or ``slide`` at the body's origin.
+
+    ref : value at home, m or rad.
+    """
     out = SubElement(parent, "joint", name=name, type=kind, axis=numbers_text(axis))
     if ref:
         out.set("ref", numbers_text(ref))
@@ -151,12 +159,13 @@ def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0)
 
 
 def _geom(parent: Element, shape: RoundBar) -> None:
+    """Add a body's shape."""
     size, rgba = numbers_text(shape.radius), BODY_COLOURS[shape.colour]
     if shape.stop is None:
         SubElement(
             parent, "geom", type="sphere", pos=numbers_text(shape.start), size=size, rgba=rgba
         )
-    elif not shape.flat:  # MuJoCo takes no cylinder without a length
+    elif not shape.flat:  # MuJoCo rejects cylinders of length 0
         ends = numbers_text(shape.start, shape.stop)
         geom = SubElement(parent, "geom", type="cylinder", fromto=ends, size=size, rgba=rgba)
         if shape.name:
@@ -167,6 +176,7 @@ def _geom(parent: Element, shape: RoundBar) -> None:
 
 
 def _settings(root: Element, home: HomeState) -> None:
+    """Add compiler, options and defaults."""
     SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     option = SubElement(
         root, "option", timestep=MUJOCO_TIME_STEP, gravity="0 0 0", integrator="implicitfast"
@@ -178,12 +188,12 @@ def _settings(root: Element, home: HomeState) -> None:
     SubElement(default, "geom", contype="0", conaffinity="0")
     SubElement(default, "site", size=numbers_text(home.size / 100))
     SubElement(default, "joint", damping="0.01")
-    # as stiff as the step allows: the loops are the machine's joints, not springs
+    # as stiff as the time step allows: the loops are rigid joints, not springs
     SubElement(default, "equality", solref="0.002 1", solimp="0.99 0.9999 0.0001 0.5 2")
 
 
 def _drives(root: Element, home: HomeState) -> None:
-    """Position control of every reading, and sensors."""
+    """Add position control of each reading, and sensors."""
     actuator, sensor = SubElement(root, "actuator"), SubElement(root, "sensor")
     for column in range(home.machine.n_joints):
         name, limits = home.reading_name(column), home.machine.joint_ranges[column]
@@ -200,7 +210,7 @@ def _drives(root: Element, home: HomeState) -> None:
 
 
 def _keyframe(root: Element, home: HomeState) -> None:
-    """All joints' values at home in MuJoCo's order, which is the text's."""
+    """Add the keyframe at home: values of all joints in MuJoCo's order, that of the text."""
     world = root.iterfind("worldbody/")
     values = [n.get("ref", "0.0") for part in world for n in part.iter("joint")]
     free = next((n for n in root.iter("body") if n.find("freejoint") is not None), None)

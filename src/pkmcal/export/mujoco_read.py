@@ -1,5 +1,6 @@
-"""MuJoCo's text read again, as its documentation of MJCF tells bodies, joints and equality
-constraints, as far as :mod:`pkmcal.export.mujoco` uses them.
+"""Reader of MJCF, as far as :mod:`pkmcal.export.mujoco` uses it.
+
+Bodies, joints and equality constraints have the meaning of MuJoCo's documentation.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pkmcal.geometry.rigid import from_quaternion, inverse, pose, pose_differenc
 
 
 def read_mujoco(text: str) -> ReadModel:
-    """The model of a text, with loops closed as MuJoCo's compiler closes them: as drawn."""
+    """Model of an MJCF text; loops close at home, as MuJoCo's compiler takes them."""
     root = fromstring(text)
     bodies = [ReadBody("world", 0, np.eye(4), ())]
     sites: dict[str, tuple[int, Array]] = {}
@@ -60,7 +61,10 @@ def _collect(
     sites: dict[str, tuple[int, Array]],
     radii: dict[str, float],
 ) -> int:
-    """Everything below a body, in the text's order; returns the freedoms counted so far."""
+    """Collect all below a body, in the text's order.
+
+    Return the degrees of freedom counted so far.
+    """
     for site in node.findall("site"):
         sites[site.attrib["name"]] = (number, _vector(site, "pos"))
     for geom in node.findall("geom"):
@@ -84,16 +88,16 @@ def _collect(
 
 
 def _coupling(node: Element, joints: dict[str, ReadJoint]) -> ReadCoupling:
-    """An equality of two joints, counted from where they are drawn."""
+    """Equality of two joints; both values count from home."""
     first, second = (joints[node.attrib[key]] for key in ("joint1", "joint2"))
     ratio = float(_vector(node, "polycoef")[1])
     return ReadCoupling(first.dof, second.dof, ratio, first.ref - ratio * second.ref)
 
 
 def _loop(node: Element, at: dict[str, tuple[int, Array]]) -> ReadLoop:
-    """A closure; the second body's share is taken from the model as drawn, as MuJoCo does.
+    """Loop closure; as in MuJoCo the second body's frame follows from the model at home.
 
-    ``connect``: its anchor is a point of the first body. ``weld``: the second body's origin.
+    ``connect``: the anchor is a point of the first body. ``weld``: the second body's origin.
     """
     (first, T1), (second, T2) = at[node.attrib["body1"]], at[node.attrib["body2"]]
     if node.tag == "weld":
@@ -105,7 +109,10 @@ def _loop(node: Element, at: dict[str, tuple[int, Array]]) -> ReadLoop:
 
 
 def _of_qpos(bodies: Sequence[ReadBody], drawn: Array, qpos: Array) -> Array:
-    """The state (d,) of a keyframe: scalars, and of a free joint its place and quaternion."""
+    """State (d,) of a keyframe.
+
+    ``qpos`` has scalars, and position and quaternion of a free joint.
+    """
     x, at = drawn.copy(), 0
     for body in bodies:
         for j in body.joints:
@@ -120,4 +127,5 @@ def _of_qpos(bodies: Sequence[ReadBody], drawn: Array, qpos: Array) -> Array:
 
 
 def _vector(node: Element, key: str, default: str = "") -> Array:
+    """Numbers of an attribute."""
     return np.array([float(v) for v in node.get(key, default).split()])

@@ -1,4 +1,4 @@
-"""``yaml`` and ``json``: the machine's values with their deviations, for programs of one's own."""
+"""``yaml`` and ``json``: the machine's parameters with their sigmas, for other programs."""
 
 from __future__ import annotations
 
@@ -27,28 +27,30 @@ CONVENTIONS = (
 
 @final
 class MechanismYaml(Exporter):
-    """The mechanism file with the present values, which pkmcal reads back."""
+    """Mechanism file with the present values, which pkmcal reads as any other."""
 
     name: ClassVar = "yaml"
     title: ClassVar = "pkmcal's own mechanism file"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """``mechanism.yaml`` with everything that is known of its values on top."""
+        """``mechanism.yaml`` with origin and sigmas of the values in a comment on top."""
         lines = [*source.header(*CONVENTIONS), "", *source.sigma_lines()]
         return {PLAIN_MECHANISM_FILE: commented(lines, "#") + mechanism_text(source.machine)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Read by another YAML parser than ours, each value by its path."""
+        """Difference of the values, by path, read with another YAML parser than pkmcal's."""
         document = yaml.safe_load(files[PLAIN_MECHANISM_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        count = _values_in(document, table.names)
-        return [Difference(f"{len(count)} values read again", largest(count, values), 0.0)]
+        read_again = _values_in(document, table.names)
+        return [
+            Difference(f"{len(read_again)} values read again", largest(read_again, values), 0.0)
+        ]
 
 
 @final
 class MachineJson(Exporter):
-    """All numbers of the machine, its cameras' poses included, as JSON."""
+    """All numbers of the machine, and the poses of its cameras, as JSON."""
 
     name: ClassVar = "json"
     title: ClassVar = "names, values, units, deviations and covariance"
@@ -90,14 +92,14 @@ class MachineJson(Exporter):
         return {PLAIN_MACHINE_FILE: json_text(document)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Read by the standard library, values and covariance."""
+        """Differences of values and covariance, read with the standard library."""
         document = json.loads(files[PLAIN_MACHINE_FILE])
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
-        results = [p["value"] for p in document["parameters"]]
+        read_values = [p["value"] for p in document["parameters"]]
         again = _values_in(document["mechanism"], table.names)
         out = [
-            Difference(f"{len(results)} values read again", largest(results, values), 0.0),
+            Difference(f"{len(read_values)} values read again", largest(read_values, values), 0.0),
             Difference("values in the mechanism", largest(again, values), 0.0),
         ]
         if source.covariance is not None:
@@ -107,5 +109,5 @@ class MachineJson(Exporter):
 
 
 def _values_in(document: Any, names: tuple[str, ...]) -> list[float]:
-    """Parameters' values in a mechanism file's fields."""
+    """Values of parameters in the fields of a mechanism document."""
     return [float(node[key]) for node, key in (field_of(document, name) for name in names)]

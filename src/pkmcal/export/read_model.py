@@ -1,7 +1,7 @@
-"""A model of bodies, joints and loops as it was read again from a text, with kinematics of its own.
+"""Multibody model as read from a text, with kinematics of its own.
 
-The other programs need not be there for an export, so that what is written is tested by this.
-Nothing here knows a machine.
+It stands in for the target programs, which need not be installed, and knows nothing of machines;
+this is what makes it a test of the texts.
 """
 
 from __future__ import annotations
@@ -25,16 +25,22 @@ from pkmcal.geometry.rigid import (
 NO_TRANSLATION = np.zeros(3)
 MOST_CLOSING_STEPS = 30
 LOOPS_CLOSED_STEP = 1e-13
-"""m or rad of a step below which nothing changes any more."""
+"""Largest step of a converged closure, m or rad."""
 DIFFERENCE_QUOTIENT_STEP = 1e-7
-"""m or rad, of the differences that derivatives are taken from: right to as much."""
+"""Step of difference quotients, m or rad; their relative error is of the same order."""
 DEPENDENT_CONSTRAINT_SHARE = 1e-6
-"""Share of the largest singular value below which constraints say the same; above that error."""
+"""Relative singular value below which constraints are redundant.
+
+Above the difference quotients' error.
+"""
 
 
 class ReadJoint(NamedTuple):
-    """A ``hinge``, ``slide`` or ``free`` joint; axis (3,) in its body's frame; first freedom; its
-    value as drawn (a free joint's is none).
+    """Joint of kind ``hinge``, ``slide`` or ``free``.
+
+    axis : (3,) in the body's frame.
+    dof : index of its first degree of freedom.
+    ref : value at home, m or rad; without meaning for a free joint.
     """
 
     name: str
@@ -45,7 +51,11 @@ class ReadJoint(NamedTuple):
 
 
 class ReadBody(NamedTuple):
-    """A body: its parent's number (0 is the world), place in it as drawn (4, 4), and joints."""
+    """Body with its joints.
+
+    parent : index of the parent; 0 is the world.
+    T_parent_body : (4, 4) at home.
+    """
 
     name: str
     parent: int
@@ -54,8 +64,10 @@ class ReadBody(NamedTuple):
 
 
 class ReadLoop(NamedTuple):
-    """Two bodies' frames, moved to where they meet (4, 4) each, that coincide: their points, and
-    where ``rigid`` their orientations as well.
+    """Constraint that the frames of two bodies coincide.
+
+    rigid : origins and orientations; otherwise origins only.
+    frames : (4, 4) each, in the frame of its body.
     """
 
     rigid: bool
@@ -64,7 +76,7 @@ class ReadLoop(NamedTuple):
 
 
 class ReadCoupling(NamedTuple):
-    """A freedom that follows another: ratio * leader's + offset, m or rad."""
+    """Constraint follower = ratio * leader + offset, m or rad."""
 
     follower: int
     leader: int
@@ -74,13 +86,17 @@ class ReadCoupling(NamedTuple):
 
 @dataclass(frozen=True)
 class ReadModel:
-    """What a text says.
+    """Bodies, joints and constraints of a text.
 
-    A state x (..., d) has each freedom's value, m or rad: a free joint's are the rotation vector
-    from its body's drawn orientation, and the shift. key : the state that the text says is closed.
-    sites, radii : points (body, (3,)) and cylinders' radii (m) by name. actuated : freedoms of the
-    readings' joints, in order; gear : (m,) what such a joint's value is multiplied by for the
-    reading; ctrl : (m,) the readings in the key.
+    A state x (..., d) has the value of each degree of freedom, m or rad; those of a free joint are
+    the perturbation of its body's pose at home.
+
+    sites : points by name, (body, (3,)).
+    radii : radii of cylinders by name, m.
+    actuated : degrees of freedom of the readings' joints, in order.
+    gear : (m,) factors from these joints' values to readings.
+    ctrl : (m,) readings at the key.
+    key : (d,) state that is closed according to the text.
     """
 
     bodies: tuple[ReadBody, ...]
@@ -99,12 +115,12 @@ class ReadModel:
         return dict(zip(names, body_poses(self.bodies, x), strict=True))
 
     def site_places(self, x: Array) -> dict[str, Array]:
-        """Where the named points are, (..., 3) m, world frame."""
+        """Positions (..., 3) of the named points, m, world frame."""
         at = body_poses(self.bodies, x)
         return {name: apply(at[body], point) for name, (body, point) in self.sites.items()}
 
     def gaps(self, x: Array) -> Array:
-        """What is left of the equality constraints (..., E), m and rad."""
+        """Residuals (..., E) of the constraints, m and rad."""
         at, out = body_poses(self.bodies, x), list[Array]()
         for loop in self.loops:
             first, second = (at[k] @ T for k, T in zip(loop.bodies, loop.frames, strict=True))
@@ -119,27 +135,31 @@ class ReadModel:
 
     @property
     def names(self) -> dict[str, int]:
-        """The freedom of each joint, by name; a free body's are left out."""
+        """Degree of freedom of each joint by name, without free joints."""
         joints = [j for body in self.bodies for j in body.joints if j.kind != "free"]
         return {j.name: j.dof for j in reversed(joints)}
 
     def at(self, readings: Array, T_base_platform: Array) -> Array:
-        """States (n, d) closed at readings (n, m), of the assembly that has the platform near poses
-        (n, 4, 4); the readings alone decide where it ends.
+        """States (n, d) closed at readings (n, m).
+
+        The poses (n, 4, 4) of the platform select the assembly mode; they do not affect the closed
+        state.
         """
         drives = np.isin(np.arange(self.key.size), self.actuated)
         x = np.tile(self.key, (len(readings), 1))
         x[:, self.actuated] = readings / self.gear
-        # the legs follow the platform; then the loops alone hold it
+        # first the legs follow the platform, then the loops alone hold it
         return self.closed(self.closed(x, drives, T_base_platform), drives)
 
     def closed(self, x: Array, held: Booleans, goal: Array | None = None) -> Array:
-        """States (n, d) with their loops closed by Gauss-Newton; held : (d,) freedoms that stay.
+        """States (n, d) with closed loops, by Gauss-Newton.
 
-        goal : (n, 4, 4) poses that the body ``platform`` shall take besides.
+        held : (d,) degrees of freedom that remain fixed.
+        goal : (n, 4, 4) poses imposed on the body ``platform``; None for none.
         """
 
         def remainder(x: Array) -> Array:
+            """Residuals of the constraints and of the goal."""
             gaps = self.gaps(x)
             if goal is None:
                 return gaps
@@ -147,13 +167,16 @@ class ReadModel:
             off = pose_difference(self.places(x)["platform"], wanted)
             return np.concatenate([gaps, off], axis=-1)
 
+        # Gauss-Newton with difference quotients; the pseudoinverse tolerates redundant constraints
         steps = DIFFERENCE_QUOTIENT_STEP * np.eye(x.shape[-1])[~held]
         for _ in range(MOST_CLOSING_STEPS):
-            value = remainder(x)
+            residual = remainder(x)
             by_freedom = (
-                remainder(x[:, None] + steps) - value[:, None]
+                remainder(x[:, None] + steps) - residual[:, None]
             ).mT / DIFFERENCE_QUOTIENT_STEP
-            step = np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ value[..., None]
+            step = (
+                np.linalg.pinv(by_freedom, rcond=DEPENDENT_CONSTRAINT_SHARE) @ residual[..., None]
+            )
             x = x.copy()
             x[:, ~held] -= step[..., 0]
             if np.abs(step).max() < LOOPS_CLOSED_STEP:
@@ -162,8 +185,10 @@ class ReadModel:
 
 
 def body_poses(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
-    """Poses (..., 4, 4) of bodies: their joints act one after the other, each in the frame so far;
-    a free joint's body stands in the world.
+    """Poses (..., 4, 4) of bodies, world frame.
+
+    The joints of a body act in series, each in the frame after the previous one. A free joint
+    perturbs the pose in the world.
     """
     at: list[Array] = []
     for body in bodies:
@@ -172,10 +197,12 @@ def body_poses(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
             if j.kind == "free":
                 here = perturb(here, x[..., j.dof : j.dof + 6])
                 continue
-            sense = (x[..., j.dof, None] - j.ref) * j.axis
+            displacement = (x[..., j.dof, None] - j.ref) * j.axis
             turns = j.kind == "hinge"
             here = here @ (
-                pose(rotation(sense), NO_TRANSLATION) if turns else pose(np.eye(3), sense)
+                pose(rotation(displacement), NO_TRANSLATION)
+                if turns
+                else pose(np.eye(3), displacement)
             )
         at.append(here)
     return at

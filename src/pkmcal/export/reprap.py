@@ -1,10 +1,10 @@
 """``reprap``: RepRapFirmware's M665 and M666 for linear deltas, M669 K10 and M666 for rotary ones.
 
-Meaning of the values: Duet3D's G-code reference and the firmware's LinearDeltaKinematics and
-RotaryDeltaKinematics. Towers X, Y, Z stand at -150, -30 and 90 degrees, corrections anticlockwise;
-a homed carriage is at ``H + sqrt(L^2 - R^2)`` plus its endstop adjustment, a homed arm at the
-larger angle of A plus its own. B is the print radius, beyond which the firmware accepts no
-position: without it, it stays as it is, 80 mm where nothing was set.
+Semantics: Duet3D's G-code reference, and the firmware's LinearDeltaKinematics and
+RotaryDeltaKinematics. Towers X, Y, Z are at -150, -30 and 90 degrees, with corrections counted
+anticlockwise. A homed carriage is at ``H + sqrt(L^2 - R^2)`` plus its endstop adjustment, a homed
+arm at the larger angle of A plus its adjustment. B is the print radius, beyond which the firmware
+accepts no position; if omitted it remains as it was, 80 mm by default.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
 
 
 def _fit(source: MachineSource) -> Fit:
+    """RepRapFirmware's parameters of a source's machine."""
     return fit_of(source, PROGRAM, Freedoms(REPRAP_TOWER_ANGLES), Freedoms(REPRAP_TOWER_ANGLES))
 
 
@@ -63,8 +64,8 @@ class RepRap(Exporter):
     def files(self, source: MachineSource) -> dict[str, str]:
         """One file of G-code."""
         fit = _fit(source)
-        sense = "mm" if fit.kind == "linear" else "degree"
-        correcting = f"Divide its steps per {sense} (M92) by that."
+        unit = "mm" if fit.kind == "linear" else "degree"
+        correcting = f"Divide its steps per {unit} (M92) by that."
         lines = about(source, fit, "XYZ", correcting)
         names = [f"M666 {letter}" for letter in "XYZ"]
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
@@ -75,7 +76,7 @@ class RepRap(Exporter):
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Read as the firmware does, and moved by its formulas."""
+        """Differences by the firmware's formulas, with values read as the firmware reads them."""
         fit = _fit(source)
         text = files[FILE]
         words = read_words(text)
@@ -83,7 +84,7 @@ class RepRap(Exporter):
         linear = fit.kind == "linear"
         homed = (homed_carriages if linear else homed_arms)(words)
         move = reprap_carriage_heights if linear else reprap_arm_angles
-        # switches elsewhere: homed by the value that the text gives for them
+        # switches at other readings: homing with the value that the text gives for them
         elsewhere = [
             (homed_carriages if linear else homed_arms)(
                 {**words, **{f"666{c}": np.array([v]) for c, v in zip("XYZ", values, strict=True)}}
@@ -92,7 +93,9 @@ class RepRap(Exporter):
             for readings in readings_elsewhere(fit)
             for values in [switch_values(text, readings)]
         ]
-        same = [*words.get("665B", words.get("669B", []))] == _radius(source)
+        radius = workspace_radius(source)
+        read_radius = [*words.get("665B", words.get("669B", []))]
+        same = read_radius == ([] if radius is None else [float(radius)])
         return [
             firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
             Difference(
@@ -105,17 +108,12 @@ class RepRap(Exporter):
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """How well the settings follow the machine, and what to do after they are in."""
+        """Agreement of settings and machine, and the steps after installing them."""
         return (_fit(source).following, *redo(source))
 
 
-def _radius(source: MachineSource) -> list[float]:
-    radius = workspace_radius(source)
-    return [] if radius is None else [float(radius)]
-
-
 def _adjustments(fit: Fit) -> Array:
-    """Endstop adjustments (3,), mm or degrees: what is not in H, or in A's larger angle."""
+    """Endstop adjustments (3,), mm or degrees, relative to H or to the larger angle of A."""
     homed = fit.end_motors
     if fit.kind == "linear":
         homed = homed - np.sqrt(fit.rod**2 - fit.radius**2)
@@ -123,12 +121,13 @@ def _adjustments(fit: Fit) -> Array:
 
 
 def _linear(fit: Fit, radius: str | None) -> list[str]:
+    """Commands of a linear delta."""
     heights = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
     homed = float(heights.mean())
     corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
     return [
         "M669 K3 ; linear delta",
-        f"M665 L{_three(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
+        f"M665 L{_by_tower(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
         + ("" if radius is None else f" B{radius}")
         + f" {_letters(corrections, firmware_angle)}"
         " ; L rods, R radius, H homed height"
@@ -139,6 +138,7 @@ def _linear(fit: Fit, radius: str | None) -> list[str]:
 
 
 def _rotary(fit: Fit, radius: str | None) -> list[str]:
+    """Commands of a rotary delta. Raises InputError for arms beyond 90 degrees."""
     delta = fit.delta
     homed = float(fit.end_motors.mean())
     ranges = delta.machine.joint_ranges[delta.joint][fit.order]
@@ -153,7 +153,7 @@ def _rotary(fit: Fit, radius: str | None) -> list[str]:
     low = float(MM_A_METRE * delta.positions[:, 2].min() + MM_A_METRE * fit.T_firmware_base[2, 3])
     high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
     return [
-        f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)}"
+        f"M669 K10 U{_by_tower(fit.arm)} L{_by_tower(fit.rod)} H{_by_tower(fit.height)}"
         f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(homed)}"
         + ("" if radius is None else f" B{radius}")
         + f" {_letters(corrections, firmware_angle)}"
@@ -166,16 +166,18 @@ def _rotary(fit: Fit, radius: str | None) -> list[str]:
     ]
 
 
-def _three(values: Array) -> str:
+def _by_tower(values: Array) -> str:
+    """Three lengths, separated by colons."""
     return ":".join(firmware_length(v) for v in values)
 
 
 def _letters(values: Array, write: Callable[[float], str]) -> str:
+    """Values after the letters X, Y and Z."""
     return " ".join(f"{letter}{write(float(v))}" for letter, v in zip("XYZ", values, strict=True))
 
 
 def read_words(text: str) -> dict[str, Array]:
-    """Values by command and letter, as ``665L``; what stands behind a semicolon is a comment."""
+    """Values by command and letter, as ``665L``; text after a semicolon is a comment."""
     out: dict[str, Array] = {}
     for line in text.splitlines():
         command, _, rest = line.partition(";")[0].strip().partition(" ")
@@ -185,22 +187,23 @@ def read_words(text: str) -> dict[str, Array]:
 
 
 def _xyz(words: dict[str, Array], command: str) -> Array:
+    """Values (3,) of the letters X, Y and Z."""
     return np.array([words[command + letter][0] for letter in "XYZ"])
 
 
 def homed_arms(words: dict[str, Array]) -> Array:
-    """Arms' angles (3,) degrees at the end switches."""
+    """Arm angles (3,) degrees at the end switches."""
     return words["669A"][1] + _xyz(words, "666")
 
 
 def homed_carriages(words: dict[str, Array]) -> Array:
-    """Carriages' heights (3,) mm at the end switches."""
+    """Carriage heights (3,) mm at the end switches."""
     rise = np.sqrt(words["665L"] ** 2 - words["665R"] ** 2)
     return words["665H"] + rise + _xyz(words, "666")
 
 
 def reprap_carriage_heights(words: dict[str, Array], points: Array) -> Array:
-    """Carriages' heights (n, 3) mm at points (n, 3): the firmware's linear Transform."""
+    """Carriage heights (n, 3) mm at points (n, 3) mm, by the firmware's linear Transform."""
     x, y, z, tower = *_xyz(words, "665"), words["665R"][0]
     towers = tower * np.array(
         [
@@ -216,9 +219,9 @@ def reprap_carriage_heights(words: dict[str, Array], points: Array) -> Array:
 
 
 def reprap_arm_angles(words: dict[str, Array], points: Array) -> Array:
-    """Arms' angles (n, 3) degrees at points (n, 3) mm: the firmware's rotary Transform.
+    """Arm angles (n, 3) degrees at points (n, 3) mm, by the firmware's rotary Transform.
 
-    Its arc sine knows angles up to 90 degrees from the horizontal.
+    The arcsine limits angles to 90 degrees from the horizontal.
     """
     angle = (np.array(REPRAP_TOWER_ANGLES) + _xyz(words, "669")) / DEGREES_A_RADIAN
     along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle)

@@ -1,8 +1,8 @@
 """``ros``: camera_info of each camera, and static transforms from the base to the cameras.
 
-A camera's frame here is ROS' optical frame (REP 103): z forward, x right, y down. Transforms are
-those of tf2_ros' static_transform_publisher, parent first, quaternion x y z w, in a ROS 2 launch
-file.
+The camera frame is ROS' optical frame (REP 103): z forward, x right, y down. Transforms are
+arguments of tf2_ros' static_transform_publisher in a ROS 2 launch file: parent first, quaternion x
+y z w.
 """
 
 from __future__ import annotations
@@ -28,18 +28,21 @@ ROS_LAUNCH_FILE = "static_transforms.launch.yaml"
 ROS_BASE_FRAME = "base"
 MIRROR_CAMERA_MODEL = "unified"
 TRANSFORM_ROUNDING = 1e-12
-"""m, and elements of a rotation matrix, which a unit quaternion of 17 digits gives back."""
+"""Tolerance, m and elements of a rotation matrix: rounding of a quaternion with 17 digits."""
 
 
 @final
 class Ros(Exporter):
-    """What a ROS 2 system wants to know of the cameras that saw the machine."""
+    """Camera files of a ROS 2 system."""
 
     name: ClassVar = "ros"
     title: ClassVar = "ROS 2: camera_info and static transforms"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """A launch file, and a camera_info file for each camera that ROS has a model for."""
+        """Launch file, and a camera_info file for each camera whose model ROS has.
+
+        Raises InputError for a source without cameras.
+        """
         if not source.T_base_camera:
             raise InputError(
                 "no camera is known to stand anywhere, so there is nothing for ROS",
@@ -56,10 +59,16 @@ class Ros(Exporter):
         return out
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Transforms by the quaternions' own formula, cameras by the reader of foreign files."""
+        """Differences of transforms and cameras, read from the texts.
+
+        Transforms by the quaternions, cameras by the reader of foreign camera files.
+        """
         frames = frame_names(source)
-        results = transforms(files[ROS_LAUNCH_FILE])
-        off = [float(np.abs(results[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
+        read_transforms = transforms(files[ROS_LAUNCH_FILE])
+        off = [
+            float(np.abs(read_transforms[frames[s]] - T).max())
+            for s, T in source.T_base_camera.items()
+        ]
         out = [Difference(f"{len(off)} transforms read again", max(off), TRANSFORM_ROUNDING)]
         for station, camera in source.cameras.items():
             text = files.get(f"camera_info_{frames[station]}.yaml")
@@ -74,7 +83,7 @@ class Ros(Exporter):
         return out
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Cameras that are not in the files, and why."""
+        """Warnings of cameras that the files lack, and the use of the launch file."""
         lost = [s for s in source.T_base_camera if s not in source.cameras]
         out: list[Finding] = []
         if lost:
@@ -87,7 +96,7 @@ class Ros(Exporter):
 
 
 def frame_names(source: MachineSource) -> dict[str, str]:
-    """A name that ROS takes, for each station: letters, digits and underscores, all different."""
+    """Distinct ROS name of each station, of letters, digits and underscores."""
     out: dict[str, str] = {}
     for station in source.T_base_camera:
         plain = re.sub(r"[^A-Za-z0-9_]+", "_", station).strip("_") or "camera"
@@ -100,6 +109,7 @@ def frame_names(source: MachineSource) -> dict[str, str]:
 
 
 def _launch(source: MachineSource) -> str:
+    """Launch file with a static transform for each station."""
     names = frame_names(source)
     nodes: list[str] = []
     for station, transform in source.T_base_camera.items():
@@ -120,22 +130,18 @@ def _launch(source: MachineSource) -> str:
         f"Transforms from {ROS_BASE_FRAME} (the machine's base frame) to each camera's optical"
         " frame: z forward, x right, y down. Metres; quaternions x y z w, which turn camera"
         " coordinates into base coordinates.",
-        *(_sigma(source)),
+        *(
+            f"Station {station}: sigma of rotation"
+            f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
+            f" {', '.join(f'{v:.2g}' for v in sigma[3:])} m, along the base's axes."
+            for station, sigma in source.sigma_camera.items()
+        ),
     )
     return commented(about, "#") + "launch:\n" + "".join(nodes)
 
 
-def _sigma(source: MachineSource) -> tuple[str, ...]:
-    return tuple(
-        f"Station {station}: sigma of rotation"
-        f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
-        f" {', '.join(f'{v:.2g}' for v in sigma[3:])} m, along the base's axes."
-        for station, sigma in source.sigma_camera.items()
-    )
-
-
 def _camera_info(source: MachineSource, station: str, frame: str) -> str:
-    """The text of a ROS camera file, whose camera_name is the frame's."""
+    """ROS camera file; its camera_name is the name of the frame."""
     text = foreign_text(source.cameras[station], f"{frame}.yaml", "ros")
     about = source.header(
         f"Camera of station {station}; pixels, pixel centres at integers, frame"
@@ -145,7 +151,7 @@ def _camera_info(source: MachineSource, station: str, frame: str) -> str:
 
 
 def transforms(text: str) -> dict[str, Array]:
-    """T_base_camera (4, 4) by frame, as tf2 makes it of a launch file's arguments."""
+    """T_base_camera (4, 4) by frame name, from a launch file's arguments, as in tf2."""
     out: dict[str, Array] = {}
     for entry in yaml.safe_load(text)["launch"]:
         words = entry["node"]["args"].split()

@@ -1,4 +1,4 @@
-"""Poses all over a machine's workspace, at which an exported text is compared with it."""
+"""Poses all over a machine's workspace at which exports are compared with it."""
 
 from __future__ import annotations
 
@@ -13,27 +13,32 @@ from pkmcal.mechanisms.kinematics import on_manifold
 COMPARED_SAMPLES = 64
 SAMPLES_SEED = 0
 LEAST_SAMPLE_SINGULARITY = 0.05
-"""Least singular value of the scaled inverse Jacobian: nearer to singular, 1e-15 of rounding in a
-length moves a platform by more than comparisons allow."""
+"""Least singular value of the scaled inverse Jacobian.
+
+Nearer to singular poses, rounding of 1e-15 in a length moves the platform by more than the
+comparison's tolerances.
+"""
 SAME_ELBOW_DIFFERENCE = 1e-9
-"""Readings (m, rad) beyond which inverse kinematics chose another elbow than was put in."""
+"""Largest difference of readings, m or rad, with which inverse kinematics is on the same branch."""
 
 
 def samples(
     machine: Machine, count: int = COMPARED_SAMPLES, seed: int = SAMPLES_SEED
 ) -> tuple[Array, Array]:
-    """Poses (n, 4, 4) and their readings (n, m), n <= count, in the home's assembly.
+    """Poses (n, 4, 4) and their readings (n, m), n <= count, in the assembly mode of home.
 
-    Raises ResultError where there are none.
+    Raises ResultError if none is found.
     """
     rng = np.random.default_rng(seed)
     ranges = machine.joint_ranges
-    if np.isfinite(ranges).all() and not machine.layout.overdetermined:  # which few readings close
+    # random readings within the ranges; of an overdetermined machine few would close, so there
+    # poses near home are projected to the manifold instead
+    if np.isfinite(ranges).all() and not machine.layout.overdetermined:
         wanted = rng.uniform(ranges[:, 0], ranges[:, 1], (4 * count, machine.n_joints))
         fk = machine.forward_result(wanted)
     else:
         away = machine.base_centers() - machine.home()[:3, 3]
-        reach = float(np.linalg.norm(away, axis=1).mean())  # m, of the limbs at home
+        reach = float(np.linalg.norm(away, axis=1).mean())  # mean length of the limbs at home, m
         shifts = rng.uniform(-1, 1, (4 * count, 6)) * [0.1, 0.1, 0.1, *[0.05 * reach] * 3]
         motion = machine.layout.motion
         shifted = perturb(machine.home(), shifts @ motion @ motion.T)
@@ -46,6 +51,7 @@ def samples(
         & (fk.singularity > LEAST_SAMPLE_SINGULARITY)
         & np.isfinite(joints).all(axis=-1)
     )
+    # readings that were put in come back unless inverse kinematics takes another branch
     if wanted is not None:
         good &= np.abs(joints - wanted).max(axis=-1) < SAME_ELBOW_DIFFERENCE
     if not good.any():

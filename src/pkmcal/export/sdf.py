@@ -1,4 +1,4 @@
-"""SDF: the machine's bodies, and its loops as joints between links of two branches."""
+"""SDF model: the machine's bodies, with loops as joints between links of two branches."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ from pkmcal.geometry.rigid import pose, roll_pitch_yaw
 from pkmcal.outcome.finding import Finding, doubtful
 
 SDF_VERSION, SDF_MIMIC_VERSION = "1.7", "1.11"
-"""The lowest that has what a model uses, since readers refuse what is newer than they are: 1.7 is
-the first with frames by name (``relative_to``, ``attached_to``, ``expressed_in``), 1.11 with joints
-that follow others (``mimic``).
+"""Lowest versions that have the features used, since readers refuse newer ones than their own.
+
+1.7 is the first with named frames (``relative_to``, ``attached_to``, ``expressed_in``), 1.11 the
+first with joints that follow others (``mimic``).
 """
 CONVENTIONS = (
     "Units: m, rad. The model's frame is the machine's base frame, the link 'platform' has the"
@@ -56,16 +57,16 @@ class SdfExporter(Exporter):
     title: ClassVar = "SDF model with closed loops"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """The model's text."""
+        """SDF text."""
         name = file_name(source.machine.name)
         return {f"{name}.sdf": _sdf(body_tree(source.machine), source, name)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """By the text's own links and joints."""
+        """Differences of the model that the text's links and joints describe."""
         return differences(read_sdf(next(iter(files.values()))), source.machine)
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """What the model does not know, and what its readers may not do."""
+        """Warning of readers that do not close loops, and note on missing masses."""
         del source
         return (
             doubtful("export.sdf_loops"),
@@ -74,14 +75,13 @@ class SdfExporter(Exporter):
 
 
 def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
+    """SDF text."""
     version = SDF_MIMIC_VERSION if tree.couplings else SDF_VERSION
     root = Element("sdf", {"version": version, "xmlns:pkmcal": SDF_NAMESPACE})
     model = SubElement(root, "model", name=name)
     for k, reading in enumerate(tree.home.readings):
-        reference_values = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
-        SubElement(
-            model, "pkmcal:reading", reference_values, scale=numbers_text(tree.home.scale(k))
-        )
+        attributes = {"joint": tree.home.reading_name(k), "home": numbers_text(reading)}
+        SubElement(model, "pkmcal:reading", attributes, scale=numbers_text(tree.home.scale(k)))
     for body in tree.bodies:
         if body.comment:
             comment(model, body.comment)
@@ -93,7 +93,7 @@ def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
         for k, shape in enumerate(body.shapes):
             _visual(node, shape, shape.name or f"shape{k + 1}")
         for point, place in body.points.items():
-            if not point.endswith("_base"):  # a rod's own origin
+            if not point.endswith("_base"):  # origin of a rod's own frame
                 frame = SubElement(model, "frame", {"name": point, "attached_to": body.name})
                 _pose(frame, pose(np.eye(3), place))
     for loop in tree.loops:
@@ -102,16 +102,18 @@ def _sdf(tree: BodyTree, source: MachineSource, name: str) -> str:
 
 
 def _chain(model: Element, body: TreeBody, tree: BodyTree) -> None:
-    """The joints that lead to a body, with a link of no size between two of them."""
+    """Add the joints that lead to a body, with a massless link between two of them."""
     if body.parent is None:
         _joint(model, "base_fixed", ("world", body.name), "fixed")
         return
+    # a free body has no joint; loops hold it
     if body.free:
         return
     last = body.parent.name
     steps = list(_steps(body.joints))
     if not steps:
         _joint(model, f"{body.name}_fixed", (last, body.name), "fixed")
+    # all joints but the last lead to a massless link
     for k, joints in enumerate(steps):
         own = joints[0].name.removesuffix("_first")
         link = body.name if k == len(steps) - 1 else f"{own}_link"
@@ -127,7 +129,7 @@ def _chain(model: Element, body: TreeBody, tree: BodyTree) -> None:
 
 
 def _steps(joints: list[BodyJoint]) -> Iterator[tuple[BodyJoint, ...]]:
-    """Joints, of which two hinges in a row that are square to one another are a universal one."""
+    """Joints in series; two consecutive perpendicular hinges form a universal joint."""
     k = 0
     while k < len(joints):
         pair = tuple(joints[k : k + 2])
@@ -141,21 +143,22 @@ def _steps(joints: list[BodyJoint]) -> Iterator[tuple[BodyJoint, ...]]:
 
 
 def _joint(model: Element, name: str, links: tuple[str, str], kind: str) -> Element:
+    """Add a joint between two links."""
     out = SubElement(model, "joint", name=name, type=kind)
     SubElement(out, "parent").text, SubElement(out, "child").text = links
     return out
 
 
 def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
-    """A joint's axis in the joint's own frame, its limits, and what it follows."""
+    """Add a joint's axis in the joint's frame, with limits and coupling."""
     out = SubElement(parent, tag)
     SubElement(out, "xyz").text = numbers_text(joint.axis)
     limit = SubElement(out, "limit")
     if joint.column < 0:
-        SubElement(limit, "effort").text = "0"  # or readers take a motor for what has no limit
+        SubElement(limit, "effort").text = "0"  # without a limit readers assume a motor
     else:
-        reference_values = np.sort(tree.home.values(joint.column)[1:] - joint.value)
-        for end, value in zip(("lower", "upper"), reference_values, strict=True):
+        limits = np.sort(tree.home.values(joint.column)[1:] - joint.value)
+        for end, value in zip(("lower", "upper"), limits, strict=True):
             if np.isfinite(value):
                 SubElement(limit, end).text = numbers_text(value)
     for coupling in tree.couplings:
@@ -166,7 +169,7 @@ def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
 
 
 def _loop(model: Element, loop: Loop) -> None:
-    """The joint that closes a leg: a ball, or what turns about its own axes."""
+    """Add the joint that closes a leg: a ball joint, or one with the leg's end hinges."""
     kind = ("ball", "revolute", "universal")[len(loop.hinges)]
     out = _joint(model, f"{loop.name}_loop", (loop.tip.name, loop.held.name), kind)
     _pose(out, np.eye(4), f"{loop.name}_platform")
@@ -177,6 +180,7 @@ def _loop(model: Element, loop: Loop) -> None:
 
 
 def _pose(parent: Element, T: Array, relative_to: str = "") -> None:
+    """Add a pose."""
     out = SubElement(parent, "pose")
     if relative_to:
         out.set("relative_to", relative_to)
@@ -184,7 +188,7 @@ def _pose(parent: Element, T: Array, relative_to: str = "") -> None:
 
 
 def _visual(link: Element, shape: RoundBar, name: str) -> None:
-    """What is drawn of a link; cylinders lie along their own z."""
+    """Add a link's shape; cylinders are along their own z."""
     if shape.flat:
         return
     out = SubElement(link, "visual", name=name)

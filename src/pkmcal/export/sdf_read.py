@@ -1,5 +1,6 @@
-"""An SDF model read again, as its specification tells links, frames and joints, as far as
-:mod:`pkmcal.export.sdf` uses them.
+"""Reader of SDF, as far as :mod:`pkmcal.export.sdf` uses it.
+
+Links, frames and joints have the meaning of the specification.
 """
 
 from __future__ import annotations
@@ -19,29 +20,29 @@ LOOP_JOINT_ENDING = "_loop"
 
 
 def read_sdf(text: str) -> ReadModel:
-    """The model of a text whose joints named ``…_loop`` close what the others leave open."""
+    """Model of an SDF text; joints named ``…_loop`` are the loop closures."""
     model = fromstring(text)[0]
-    made = _Links(model)
-    for link in made.links:
-        made.put(link)
-    loops = [made.loop(name) for name in made.joints if name.endswith(LOOP_JOINT_ENDING)]
+    tree = _Links(model)
+    for link in tree.links:
+        tree.put(link)
+    loops = [tree.loop(name) for name in tree.joints if name.endswith(LOOP_JOINT_ENDING)]
     sites = {
-        name: (made.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
-        for name, node in made.frames.items()
+        name: (tree.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
+        for name, node in tree.frames.items()
     }
-    for link in made.links:  # a rod stands on its base joint
+    for link in tree.links:  # a rod's origin is its base joint
         if link.endswith("_rod"):
-            sites[f"{link.removesuffix('rod')}base"] = (made.numbers[link], np.zeros(3))
+            sites[f"{link.removesuffix('rod')}base"] = (tree.numbers[link], np.zeros(3))
     return ReadModel(
-        bodies=tuple(made.bodies),
+        bodies=tuple(tree.bodies),
         loops=tuple(loops),
         couplings=tuple(
             ReadCoupling(
-                made.joints_by_name[name].dof,
-                made.joints_by_name[mimic.attrib["joint"]].dof,
+                tree.joints_by_name[name].dof,
+                tree.joints_by_name[mimic.attrib["joint"]].dof,
                 *_ratio_and_offset(mimic),
             )
-            for name, node in made.joints.items()
+            for name, node in tree.joints.items()
             if (mimic := node.find("axis/mimic")) is not None
         ),
         sites=sites,
@@ -49,17 +50,20 @@ def read_sdf(text: str) -> ReadModel:
             node.attrib["name"]: float(node.findtext("geometry/cylinder/radius", "nan"))
             for node in model.iter("visual")
         },
-        actuated=np.array([made.joints_by_name[name].dof for name in made.readings], dtype=int),
-        gear=np.array([1 / float(values["scale"]) for values in made.readings.values()]),
-        ctrl=np.array([float(values["home"]) for values in made.readings.values()]),
-        key=np.array(made.key),
+        actuated=np.array([tree.joints_by_name[name].dof for name in tree.readings], dtype=int),
+        gear=np.array([1 / float(values["scale"]) for values in tree.readings.values()]),
+        ctrl=np.array([float(values["home"]) for values in tree.readings.values()]),
+        key=np.array(tree.key),
     )
 
 
 class _Links:
-    """A model's links, made into bodies one after the other, each after what it stands on.
+    """Links of a model as bodies, each added after its parent.
 
-    known : joints by name, of the first axis. key : the state as drawn.
+    above : joint above each link.
+    numbers : index of each link's body.
+    joints_by_name : joints, of several axes the first.
+    key : state at home.
     """
 
     def __init__(self, model: Element) -> None:
@@ -81,7 +85,7 @@ class _Links:
         self.key: list[float] = []
 
     def drawn(self, name: str) -> Array:
-        """Where a link or a frame is drawn, (4, 4), in the model's frame."""
+        """Pose (4, 4) of a link or frame at home, model frame."""
         if name in ("", SDF_MODEL_FRAME, SDF_WORLD_FRAME):
             return np.eye(4)
         if name in self.frames:
@@ -91,7 +95,7 @@ class _Links:
         return self.drawn(above) @ _pose(self.links[name])
 
     def put(self, link: str) -> int:
-        """The number of a link's body."""
+        """Index of a link's body, added if necessary."""
         if link in self.numbers:
             return self.numbers[link]
         if link in self.above:
@@ -100,7 +104,7 @@ class _Links:
             number = self.put(parent)
             place = inverse(self.drawn(parent)) @ self.drawn(link)
             body = ReadBody(link, number, place, self._axes(name, self.drawn(link)))
-        else:  # nothing holds it but loops
+        else:  # held by loops only
             joint = ReadJoint(link, "free", np.zeros(3), len(self.key), 0.0)
             body = ReadBody(link, 0, self.drawn(link), (joint,))
             self.key.extend([0.0] * 6)
@@ -109,8 +113,10 @@ class _Links:
         return self.numbers[link]
 
     def loop(self, name: str) -> ReadLoop:
-        """A joint between two links that have their places; what turns about axes has a body of
-        its own on the parent, which the child is fastened to.
+        """Closure by a joint between two placed links.
+
+        If the joint has axes, a body of its own turns on the parent, and the child is fixed to
+        that body.
         """
         node = self.joints[name]
         parent, child = _end(node, "parent"), _end(node, "child")
@@ -126,9 +132,12 @@ class _Links:
         return ReadLoop(bool(joints), numbers, frames)
 
     def _axes(self, name: str, at: Array) -> tuple[ReadJoint, ...]:
-        """A joint's axes in its own frame, which is drawn at a place (4, 4)."""
+        """Axes of a joint, in its own frame.
+
+        at : (4, 4) pose of that frame at home.
+        """
         node, reading = self.joints[name], self.readings.get(name)
-        # a reading's joint counts from home, its state here from reading zero
+        # a reading's joint counts from home in SDF, from reading zero in this state
         ref = 0.0 if reading is None else float(reading["scale"]) * float(reading["home"])
         kind = "slide" if node.attrib["type"] == "prismatic" else "hinge"
         out: list[ReadJoint] = []
@@ -145,6 +154,7 @@ class _Links:
 
 
 def _named(model: Element, tag: str) -> dict[str, Element]:
+    """Elements of a tag by name."""
     return {node.attrib["name"]: node for node in model.findall(tag)}
 
 
@@ -157,9 +167,11 @@ def _ratio_and_offset(mimic: Element) -> tuple[float, float]:
 
 
 def _end(joint: Element, which: str) -> str:
+    """Name of a joint's parent or child."""
     return joint.findtext(which, "").strip()
 
 
 def _pose(node: Element) -> Array:
+    """Pose (4, 4) of an element; identity without one."""
     values = np.array([float(v) for v in node.findtext("pose", "0 0 0 0 0 0").split()])
     return pose(from_roll_pitch_yaw(values[3:]), values[:3])

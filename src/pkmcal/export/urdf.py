@@ -1,4 +1,4 @@
-"""URDF: the machine's bodies as a tree, and beside it what closes it."""
+"""URDF: the machine's bodies as a tree, with a second file for the loops."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from pkmcal.geometry.rigid import pose, roll_pitch_yaw, rotation
 from pkmcal.outcome.finding import Finding, doubtful
 
 JOINT_LIMIT_ROD_LENGTHS = 2.0
-"""Rods' mean lengths about home, of limits that URDF demands and nobody knows."""
+"""Limits that URDF demands where none are known, in mean rod lengths to either side of home."""
 POSE_JOINTS = ("x", "y", "z", "yaw", "pitch", "roll")
 CONVENTIONS = (
     "Units: m, rad. The link 'base' has the machine's base frame, the link 'platform' the platform"
@@ -71,17 +71,17 @@ class UrdfExporter(Exporter):
     title: ClassVar = "URDF (a tree), and the loops that it cannot hold"
 
     def files(self, source: MachineSource) -> dict[str, str]:
-        """The tree's text, and the loops'."""
+        """Texts of the tree and of its loops."""
         tree, (name, loops) = body_tree(source.machine), _file_names(source)
         return {name: _urdf(tree, source, loops), loops: _loops(tree, source)}
 
     def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """By the text's own links and joints, its loops closed as the other text says."""
+        """Differences of the model that the text's links and joints and the loops describe."""
         tree, loops = files.values()
         return differences(read_urdf(tree, loops), source.machine)
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """What the tree does not hold."""
+        """Warning that the tree lacks the loops, and note on missing masses."""
         tree, loops = _file_names(source)
         return (
             doubtful("export.urdf_tree", tree, loops=loops),
@@ -90,11 +90,13 @@ class UrdfExporter(Exporter):
 
 
 def _file_names(source: MachineSource) -> tuple[str, str]:
+    """Names of the two files."""
     name = file_name(source.machine.name)
     return f"{name}.urdf", f"{name}.loops.yaml"
 
 
 def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
+    """URDF text."""
     root = Element("robot", name=file_name(source.machine.name))
     for style, rgba in BODY_COLOURS.items():
         SubElement(SubElement(root, "material", name=style), "color", rgba=rgba)
@@ -112,22 +114,24 @@ def _urdf(tree: BodyTree, source: MachineSource, loops: str) -> str:
             _visual(node, shape)
     for loop in tree.loops:
         _ends(root, loop, tree)
-    transmissions = {
+    words = {
         "loops": loops,
         "pose": FREE_PLATFORM_WORDS if tree.platform.free else RESTRICTED_PLATFORM_WORDS,
         "reach": JOINT_LIMIT_ROD_LENGTHS,
     }
-    return document(root, source, [line.format(**transmissions) for line in CONVENTIONS])
+    return document(root, source, [line.format(**words) for line in CONVENTIONS])
 
 
 def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
-    """The link after each joint that leads to a body, the joint, and its place (4, 4) in the link
-    before: where its value is zero, as URDF counts; no joint where it is fixed.
+    """Joints in series that lead to a body: link after the joint, joint, and pose (4, 4) before it.
+
+    The pose is in the preceding link's frame at value zero, from which URDF counts. A fixed link
+    has None for the joint.
     """
     if body.parent is None:
         return
     joints, origin = list(body.joints), body.T_parent_body
-    if body.free:  # its pose's own numbers, which count from the base's frame
+    if body.free:  # the joints' values are the components of the pose in the base frame
         joints = _pose_joints(body.T_parent_body)
     if not joints:
         yield body.name, None, origin
@@ -141,7 +145,7 @@ def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
 
 
 def _pose_joints(T: Array) -> list[BodyJoint]:
-    """Joints that take a body from the base's frame to a place (4, 4), one freedom each."""
+    """Joints in series for the six components of a pose (4, 4) in the base frame."""
     axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
     values = [*T[:3, 3], *roll_pitch_yaw(T[:3, :3])[::-1]]
     return [
@@ -153,7 +157,7 @@ def _pose_joints(T: Array) -> list[BodyJoint]:
 def _joint(
     root: Element, joint: BodyJoint | None, links: tuple[str, str], T: Array, tree: BodyTree
 ) -> None:
-    """A joint between two links, or what fixes them to one another."""
+    """Add a joint between two links, fixed if ``joint`` is None."""
     limits = _limits(joint, tree)
     kind = "fixed"
     if joint is not None:
@@ -179,7 +183,10 @@ def _joint(
 
 
 def _limits(joint: BodyJoint | None, tree: BodyTree) -> Array | None:
-    """(2,) m or rad, of the drawing, or, of a slide that has none, what it will not reach."""
+    """Limits (2,) of a joint, m or rad; None for hinges without a range.
+
+    From the mechanism file's range; a slide without one gets wide limits that it does not reach.
+    """
     if joint is None:
         return None
     if joint.column >= 0:
@@ -192,7 +199,7 @@ def _limits(joint: BodyJoint | None, tree: BodyTree) -> Array | None:
 
 
 def _ends(root: Element, loop: Loop, tree: BodyTree) -> None:
-    """Two links that coincide where a leg is closed, with the joint's own hinges before them."""
+    """Add the two links that coincide where a leg closes, after the loop joint's own hinges."""
     at = pose(np.eye(3), loop.end)
     last = loop.tip.name
     how = ", axes as well" if loop.hinges else " in their origins: a ball"
@@ -213,7 +220,7 @@ def _ends(root: Element, loop: Loop, tree: BodyTree) -> None:
 
 
 def _visual(link: Element, shape: RoundBar) -> None:
-    """What is drawn of a link; cylinders lie along their own z."""
+    """Add a link's shape; cylinders are along their own z."""
     if shape.flat:
         return
     out = SubElement(link, "visual")
@@ -230,6 +237,7 @@ def _visual(link: Element, shape: RoundBar) -> None:
 
 
 def _loops(tree: BodyTree, source: MachineSource) -> str:
+    """Text of the loops, the readings, and the joints' values at home."""
     home = tree.home
     following = {coupling.follower for coupling in tree.couplings}
     joints = [joint for body in tree.bodies for _, joint, _ in _steps(body) if joint is not None]

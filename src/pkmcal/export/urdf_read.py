@@ -1,5 +1,6 @@
-"""A URDF read again, as its documentation tells links and joints, as far as
-:mod:`pkmcal.export.urdf` uses them; loops by the text beside it.
+"""Reader of URDF, as far as :mod:`pkmcal.export.urdf` uses it, with its file of loops.
+
+Links and joints have the meaning of URDF's documentation.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "sl
 
 
 def read_urdf(text: str, loops: str) -> ReadModel:
-    """The model of a URDF and of the text that tells its loops."""
+    """Model of a URDF text and its file of loops."""
     root, beside = fromstring(text), yaml.safe_load(loops)
-    results = {node.attrib["name"]: node for node in root.findall("link")}
-    above = {_link(node, "child"): node for node in root.findall("joint")}
+    links = {node.attrib["name"]: node for node in root.findall("link")}
+    joint_above = {_link(node, "child"): node for node in root.findall("joint")}
     bodies: list[ReadBody] = []
     numbers: dict[str, int] = {}
     joints: dict[str, ReadJoint] = {}
 
     def put(link: str) -> int:
-        """The number of a link's body, which comes after its parent's."""
+        """Index of a link's body, added after its parent's if necessary."""
         if link in numbers:
             return numbers[link]
-        node = above.get(link)
+        node = joint_above.get(link)
         if node is None:  # the root
             bodies.append(ReadBody(link, 0, np.eye(4), ()))
         else:
@@ -39,12 +40,13 @@ def read_urdf(text: str, loops: str) -> ReadModel:
                 name, kind = node.attrib["name"], URDF_JOINT_KINDS[node.attrib["type"]]
                 joints[name] = ReadJoint(name, kind, axis, len(joints), 0.0)
                 own = (joints[name],)
-            bodies.append(ReadBody(link, parent, _place(node), own))
+            bodies.append(ReadBody(link, parent, _origin_pose(node), own))
         numbers[link] = len(bodies) - 1
         return numbers[link]
 
-    for link in results:
+    for link in links:
         put(link)
+    # joints that follow others, and the state at home
     couplings: list[ReadCoupling] = []
     for node in root.findall("joint"):
         if (mimic := node.find("mimic")) is not None:
@@ -56,6 +58,7 @@ def read_urdf(text: str, loops: str) -> ReadModel:
         key[joints[name].dof] = value
     for c in couplings:
         key[c.follower] = c.ratio * key[c.leader] + c.offset
+    # named links: each leg's base, and the two ends of each loop
     legs = [loop["name"] for loop in beside["loops"]]
     ends = {f"{leg}_base": numbers[f"{leg}_rod"] for leg in legs}
     ends |= {name: numbers[name] for loop in beside["loops"] for name in loop["frames"]}
@@ -86,11 +89,13 @@ def read_urdf(text: str, loops: str) -> ReadModel:
 
 
 def _link(joint: Element, which: str) -> str:
+    """Name of a joint's parent or child link."""
     node = joint.find(which)
     return "" if node is None else node.attrib["link"]
 
 
-def _place(node: Element) -> Array:
+def _origin_pose(node: Element) -> Array:
+    """Pose (4, 4) of a joint's origin."""
     origin = node.find("origin")
     return pose(
         from_roll_pitch_yaw(_vector(origin, "rpy", "0 0 0")), _vector(origin, "xyz", "0 0 0")
@@ -98,5 +103,6 @@ def _place(node: Element) -> Array:
 
 
 def _vector(node: Element | None, key: str, default: str) -> Array:
+    """Numbers of an attribute, or of the default."""
     text = default if node is None else node.get(key, default)
     return np.array([float(v) for v in text.split()])

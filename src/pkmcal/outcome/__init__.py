@@ -1,8 +1,8 @@
-"""What a command found: one kind of thing for all of them.
+"""Result of a command, in one type for all commands.
 
-A command's work ends in an :class:`Outcome`. One finisher writes it, tells it and sets the exit
-code; one page shows it; programs read its ``document``. Terminal, page and JSON show the same
-tables and figures.
+Every command ends in an :class:`Outcome`. One finisher writes it, prints it and sets the exit
+code; one page template shows it; other programs read its ``document``. Terminal, page and JSON
+hold the same tables and figures.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ FigureSource = Literal["paper", "prototype", "ours"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a person should know first.
+    """Judgement of a result: usable or not, and why.
 
-    usable : whether the result may be loaded into a controller. headline : one sentence.
-    findings : reasons against the result, warnings, and advice, by their level.
+    usable : whether the result may be loaded into a controller.
+    headline : one sentence.
+    findings : reasons against the result (WRONG), warnings (DOUBTFUL) and advice (NOTE).
     """
 
     usable: bool
@@ -29,32 +30,32 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why not usable, in sentences."""
+        """Sentences of the findings that make the result unusable."""
         return self._texts(Level.WRONG)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to look at, in sentences."""
+        """Sentences of the warnings."""
         return self._texts(Level.DOUBTFUL)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What would make it better, in sentences."""
+        """Sentences on how to improve the result."""
         return self._texts(Level.NOTE)
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """Of the findings."""
+        """Codes of the findings, in their order."""
         return tuple(one.code for one in self.findings)
 
     def of(self, code: str) -> tuple[Finding, ...]:
-        """The findings of a code, or of an area as ``readings``."""
+        """Findings with a code, or with any code of an area such as ``readings``."""
         return tuple(
             one for one in self.findings if one.code == code or one.code.startswith(f"{code}.")
         )
 
     def document(self) -> dict[str, Any]:
-        """For programs: sentences, and the findings with their codes and facts."""
+        """Verdict as plain data: its sentences, and the findings with their codes and facts."""
         return {
             "usable": self.usable,
             "headline": self.headline,
@@ -65,16 +66,21 @@ class Verdict:
         }
 
     def _texts(self, level: Level) -> tuple[str, ...]:
+        """Sentences of the findings with a level."""
         return tuple(one.text for one in self.findings if one.level is level)
 
 
 Mark = Literal["good"] | Level
-"""What to think of something: that all is well, or how bad it is."""
+"""Sign before a row or a verdict: good, or the level of a finding."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A card: one number that answers a question; ``values`` are (number, unit) pairs."""
+    """Card with the number that answers one question.
+
+    values : (number, unit) pairs as text.
+    note : small print under the number.
+    """
 
     question: str
     values: tuple[tuple[str, str], ...]
@@ -83,9 +89,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: its name, its cells in text, and whose figures they are.
+    """Row of a table.
 
-    mark : what to think of it, as a sign before its name.
+    cells : text of each column after the first.
+    source : origin of the row's figures.
+    mark : sign before the row's name; None for no sign.
     """
 
     name: str
@@ -96,12 +104,17 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """``columns`` has one name more than a row has cells: the first is of the rows' names.
+    """Table for the page and the terminal.
 
-    note : under it on the page. brief : short enough for a terminal. folded : shown on the page
-    when asked for. first : columns that a terminal shows, the rows' names among them; None for
-    all. words : places of columns that hold words, which stand to the left. legend : lines under
-    it on a terminal.
+    columns : headings; the first is that of the rows' names, so there is one more than a row has
+        cells.
+    note : text under the table on the page.
+    brief : short enough for a terminal.
+    folded : collapsed on the page until it is opened.
+    first : number of leading columns that a terminal prints, the rows' names included; None for
+        all.
+    words : indices of the columns that hold text and are aligned to the left.
+    legend : lines under the table on a terminal.
     """
 
     title: str
@@ -117,13 +130,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A Plotly figure (data, layout, config): plain data, drawn by the page's script.
+    """Plotly figure (data, layout, config and frames) as plain data; the page's script draws it.
 
-    Its colours are names of the page's CSS variables; the script puts in the values of the light
-    or the dark theme.
+    Colours are names of the page's CSS variables, which the script replaces by their values in the
+    light or the dark theme.
 
-    width : px below which it is scrolled sideways. alt : what it shows, for who cannot see it.
-    frames : of an animation.
+    alt : description for readers who cannot see the plot.
+    width : px below which the plot scrolls sideways.
+    frames : frames of an animation.
     """
 
     name: str
@@ -138,7 +152,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Check:
-    """One expectation that a reproduction has of itself."""
+    """Comparison of a reproduced value with the expected one."""
 
     what: str
     found: str
@@ -147,17 +161,19 @@ class Check:
 
     @property
     def sentence(self) -> str:
-        """As one line."""
+        """The comparison in one line."""
         return f"{self.what}: {self.found}, expected {self.expected}"
 
 
 @dataclass(frozen=True)
 class Part:
-    """A section of the page, in this order: what follows ``title``, one after the other.
+    """Section of the page; its contents follow the title in the order of the fields.
 
-    text : paragraphs. terminal_text : sentences that the terminal tells, too. html : made by a
-    template of :mod:`report`, which escapes what it shows: photographs, charts. notes : small
-    print. menu : its name in the page's navigation, where that is shorter.
+    text : paragraphs.
+    terminal_text : sentences that the terminal prints as well.
+    html : filled template (images, charts), in which all values are escaped.
+    notes : small print.
+    menu : shorter name for the page's navigation.
     """
 
     name: str
@@ -174,18 +190,25 @@ class Part:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command found, for people and for programs.
+    """Result of a command, for readers and for programs.
 
-    command : its name. title : of the page. kicker : above the title, such as a session's name.
-    subject : what was looked at, in a sentence. origin : what tells the data from others, such as
-    a session's digest; on the page. notes : the user's own words. verdict : may the result be used.
-    stamp : the verdict in a word or three. level : how bad it is if the result may not be used.
-    partial : it may be used, but not all of it holds.
-    figures : cards at the page's top; a terminal shows them where no part has a brief table.
-    parts : sections of the page. findings : what to look at besides the verdict's warnings.
-    closing : a terminal's last words before the files. document : everything as plain data, m
-    and rad. summary : what ``--json`` prints instead, where that is less. texts : further files
-    by their names.
+    command : name of the command.
+    title : title of the page.
+    kicker : line above the title, such as a session's name.
+    subject : sentence on what was examined.
+    origin : identification of the data, such as a session's digest; shown on the page.
+    notes : the user's own text.
+    verdict : whether the result may be used.
+    stamp : the verdict in one to three words.
+    level : severity of an unusable result.
+    partial : usable, but some of the result does not hold.
+    figures : cards at the top of the page; a terminal prints them if no part has a brief table.
+    parts : sections of the page.
+    findings : warnings and notes besides those of the verdict.
+    closing : last lines on a terminal before the list of files.
+    document : all of the result as plain data, m and rad.
+    summary : shorter document for ``--json``; None to print ``document``.
+    texts : contents of further files by file name.
     """
 
     command: str
@@ -208,14 +231,14 @@ class Outcome:
 
     @property
     def mark(self) -> Mark:
-        """The sign of the verdict."""
+        """Sign of the verdict."""
         if self.verdict.usable:
             return Level.DOUBTFUL if self.partial else "good"
         return self.level
 
     @property
     def exit_code(self) -> int:
-        """0 done; 1 it ran, but the result should not be used; 2 the input is wrong."""
+        """0 usable; 1 finished, but the result must not be used; 2 wrong input."""
         if any(finding.level is Level.WRONG for finding in self.findings):
             return 2
         return 0 if self.verdict.usable else 1

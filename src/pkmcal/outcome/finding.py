@@ -1,29 +1,29 @@
-"""Findings: what a command reports, as a code with facts, and its sentence.
+"""Findings: messages of checks, each a code with facts, and the sentence made from them.
 
-A finding is raised where it is computed, as code, level, subject and facts in SI units. Its
-sentence is a template of ``sentences/AREA.toml``, AREA the code's first part; programs, tests and
-benchmarks read codes and facts. A template has fields as :meth:`str.format` knows them, with these
-formats besides:
+A finding is made where its fact is computed: code, level, subject and facts in SI units. The
+sentence is a template in ``sentences/AREA.toml``, AREA being the first part of the code; programs,
+tests and benchmarks read codes and facts. Templates have the fields of :meth:`str.format` and
+these formats in addition:
 
 =======================  =====================================================================
 ``{x:.2g mm}``           a number in m or rad, in another unit
 ``{x:amount m}``         the magnitude of a number in m or rad, two digits, in mm or degrees
-``{x+unit:amount}``      the same of a number and its unit
+``{x+unit:amount}``      the same for a number with its unit
 ``{x+s:ratio}``          the magnitude of a ratio and its standard deviation, in per cent
-``{x+units:either .2g}`` a noise of readings that are lengths (m), turns (rad) or both
-``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` where the second number is None
-``{x:size .1%}``         the magnitude of a number, by the format that follows
+``{x+units:either .2g}`` noise of readings that are lengths (m), angles (rad) or both
+``{x:range}``            ``0.5 to 2``, or ``more than 0.5`` if the second number is None
+``{x:size .1%}``         the magnitude of a number, in the format that follows
 ``{x:count edge}``       ``1 edge``, ``12 edges``
 ``{x:listed 4}``         names, of many the first; ``joined``: all of them
-``{x:one is|are}``       the first for 1, or for a list of one
-``{x:sign more|less}``   the first for a positive number
+``{x:one is|are}``       the first word for 1, or for a list of one
+``{x:sign more|less}``   the first word for a positive number
 ``{x:case a=this|b=}``   by the value of a text
 ``{x:often}``            a probability, as ``once in 30 times``
 ``{x:capital}``          the beginning of a sentence
 =======================  =====================================================================
 
-A part in ``[[ ]]`` is left out where one of its facts is missing or None; what follows ``||`` in it
-then stands in its place.
+A part in ``[[ ]]`` is left out if one of its facts is missing or None; text after ``||`` in the
+part then takes its place.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _UNITS = {name: scale for scale, name in DISPLAY_UNITS.values()}
 
 
 class Level(StrEnum):
-    """Severity of a finding: a reason against the result, a warning, or a note or advice."""
+    """Severity of a finding: reason against the result, warning, or note (advice)."""
 
     WRONG = "wrong"
     DOUBTFUL = "doubtful"
@@ -65,13 +65,16 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a command reports.
+    """Message of a check: a code with its facts.
 
-    code : ``area.what``, such as readings.scale. facts : numbers in SI units, texts, and lists of
-    these by name; where they exist, value and sigma, log_odds, and tool_shift (m) with
-    tool_shift_sigmas. subject : the file, leg, column, station or configuration that it is about.
-    error : of which it is made. saved_text, saved_next_step : of a finding that was read back, as
-    the pkmcal that made it worded them.
+    code : ``area.what``, such as readings.scale.
+    level : severity.
+    facts : numbers in SI units, texts, and lists of these, by name. Common names: value, sigma,
+        log_odds, tool_shift (m) and tool_shift_sigmas.
+    subject : file, leg, column, station or configuration concerned.
+    error : the error that the finding reports, if any.
+    saved_text, saved_next_step : sentences of a finding that was read from a file, in the wording
+        of the version that wrote it.
     """
 
     code: str
@@ -84,21 +87,21 @@ class Finding:
 
     @cached_property
     def text(self) -> str:
-        """The sentence, and what to do next."""
+        """Sentence with the next step."""
         return self.saved_text or " ".join(part for part in self._parts if part)
 
     @property
     def next_step(self) -> str:
-        """What to do next, a sentence; empty where nothing is to be done."""
+        """Sentence on what to do next; empty if nothing is to be done."""
         return self._parts[1]
 
     @property
     def station(self) -> str | None:
-        """The station that it is about."""
+        """Name of the station concerned, None for none."""
         return self.facts.get("station")
 
     def document(self) -> dict[str, Any]:
-        """For programs; of an error with its parts."""
+        """Finding as plain data; for an error also the error's parts."""
         parts = {
             "code": self.code,
             "level": self.level.value,
@@ -112,6 +115,7 @@ class Finding:
 
     @cached_property
     def _parts(self) -> tuple[str, str]:
+        """Sentence and next step, of which :attr:`text` is made."""
         if self.error is not None:
             return str(self.error), ""
         if self.saved_text:
@@ -122,45 +126,45 @@ class Finding:
 
 
 def finding(code: str, level: Level, subject: str = "", **facts: Any) -> Finding:
-    """A finding with its facts by name."""
+    """Finding with its facts as keyword arguments."""
     return Finding(code, level, facts, subject)
 
 
 def wrong(code: str, subject: str = "", **facts: Any) -> Finding:
-    """A reason against the result."""
+    """Finding that makes the result unusable."""
     return Finding(code, Level.WRONG, facts, subject)
 
 
 def doubtful(code: str, subject: str = "", **facts: Any) -> Finding:
-    """A warning: what costs accuracy or should be looked at."""
+    """Warning: a finding that costs accuracy or needs attention."""
     return Finding(code, Level.DOUBTFUL, facts, subject)
 
 
 def note(code: str, subject: str = "", **facts: Any) -> Finding:
-    """A note, or advice."""
+    """Note or advice."""
     return Finding(code, Level.NOTE, facts, subject)
 
 
 def of_error(error: PkmcalError, level: Level = Level.WRONG, station: str | None = None) -> Finding:
-    """An error as a finding, under the error's code."""
+    """Finding that reports an error, under the error's code."""
     facts = {} if station is None else {"station": station}
     return Finding(error.code, level, facts, error.where or "", error)
 
 
 def first_error(findings: Sequence[Finding]) -> dict[str, Any]:
-    """The parts of the first error among findings, for a command's JSON; empty without one."""
+    """Parts of the first error among findings, for a command's JSON; empty without an error."""
     errors = (one.error for one in findings if one.error is not None)
     return next((_parts_of(error) for error in errors), {})
 
 
 def _parts_of(error: PkmcalError) -> dict[str, Any]:
-    """All but the exit code, which is the command's."""
+    """Parts of an error without the exit code, which is the command's."""
     return {name: value for name, value in error.as_dict().items() if name != "exit_code"}
 
 
 @cache
 def templates(area: str) -> dict[str, dict[str, str]]:
-    """Templates of an area's codes, each with its text and perhaps a next step."""
+    """Templates of an area by code, each with its text and, if it has one, its next step."""
     file = files("pkmcal.outcome") / "sentences" / f"{area}.toml"
     if not file.is_file():
         return {}
@@ -172,7 +176,7 @@ def templates(area: str) -> dict[str, dict[str, str]]:
 
 
 def fields_of(template: str) -> tuple[set[str], set[str]]:
-    """Facts that a template needs, and those that it uses where they are given."""
+    """Facts that a template requires, and facts that it uses if they are given."""
     optional = set[str]()
     for part in _OPTIONAL_PART.findall(template):
         optional |= _names(part)
@@ -180,12 +184,13 @@ def fields_of(template: str) -> tuple[set[str], set[str]]:
 
 
 def _names(template: str) -> set[str]:
+    """Names of the facts in a template; ``x+unit`` counts as two."""
     fields = [name for _, name, _, _ in Formatter().parse(template) if name]
     return {name for joint in fields for name in joint.split("+")}
 
 
 def filled(template: str, facts: Mapping[str, Any]) -> str:
-    """A template with its facts."""
+    """Template with the values of its facts, optional parts dropped where a fact is missing."""
 
     def part(match: re.Match[str]) -> str:
         given, _, otherwise = match[1].partition("||")
@@ -196,22 +201,25 @@ def filled(template: str, facts: Mapping[str, Any]) -> str:
 
 
 def _number(value: Any) -> float:
-    """A number; the length of a list."""
+    """The number itself, or the length of a list."""
     return value if isinstance(value, int | float) else len(value)
 
 
 def _choice(first: bool, rest: str) -> str:
+    """One of two alternatives that ``|`` separates."""
     one, _, other = rest.partition("|")
     return one if first else other
 
 
 def _either(noise: tuple[float, Sequence[str]], spec: str) -> str:
+    """Noise of readings in the unit of each kind of reading that has it."""
     size, units = noise
     display = [DISPLAY_UNITS[unit] for unit in ("m", "rad") if unit in units]
     return " or ".join(with_unit(format(size * scale, spec), name) for scale, name in display)
 
 
 def _range(ends: tuple[float, float | None], _rest: str) -> str:
+    """Interval with two digits; open upwards if the second end is None."""
     low, high = ends
     return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
 
@@ -234,16 +242,16 @@ _FORMATS: dict[str, Callable[[Any, str], str]] = {
 
 
 class _Fields(Formatter):
-    """Fields with the formats of the module's table."""
+    """Formatter with the formats of the module's table."""
 
     def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-        """A fact, or several of them as a tuple."""
+        """Value of a fact, or a tuple of the facts that ``+`` joins."""
         del args
         several = tuple(kwargs[name] for name in field_name.split("+"))
         return (several if len(several) > 1 else several[0]), field_name
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """One value as text."""
+        """Value as text."""
         first, _, rest = format_spec.partition(" ")
         if first in _FORMATS:
             return _FORMATS[first](value, rest)

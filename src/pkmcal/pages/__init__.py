@@ -1,1 +1,1 @@
-"""What pages are made of: the page of all commands, charts, plots, photographs drawn over."""
+"""Components of HTML pages: the page template of all commands, charts, plots, image overlays."""

@@ -1,4 +1,4 @@
-"""Small charts as frozen views; the template ``charts.html.j2`` only draws them as SVG.
+"""Small charts as frozen views, which the template ``charts.html.j2`` renders as SVG.
 
 Coordinates are SVG units in a box ``CHART_WIDTH`` wide, so that text keeps its size on a phone.
 """
@@ -22,20 +22,23 @@ if TYPE_CHECKING:
 CHART_WIDTH = 360.0
 CHART_ROW_HEIGHT = 18.0
 LABEL_LETTER_WIDTH = 6.0
-"""Width of a letter of a row's label, about; ``LONGEST_ROW_LABEL`` letters are shown."""
+"""Approximate width of a letter of a row's label."""
 LONGEST_ROW_LABEL = 22
+"""Letters of a row's label that are shown."""
 CUT_OFF_LENGTH_FACTOR = 3.0
-"""Lines more than so many times as long as the middle one are cut off."""
+"""Length of the longest whisker that a chart shows in full, in median lengths."""
 NORMAL_90 = 1.6449
-"""Nine tenths of a normal distribution lie within this many standard deviations."""
+"""90 % of a normal distribution lie within this many standard deviations."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """One row: the middle half as a bar, nine tenths as a line, the median as a mark.
+    """Row of a box plot: middle half as a bar, central 90 % as a line, median as a mark.
 
-    leg : number from 1 for its colour, None for none. quantiles : 5, 25, 50, 75, 95 %. lead : a
-    link to what it is of.
+    tip : tooltip.
+    leg : number from 1, which gives the colour; None for no leg.
+    quantiles : at 5, 25, 50, 75 and 95 %.
+    lead : link to the data of the row.
     """
 
     label: str
@@ -46,7 +49,7 @@ class Spread:
 
     @property
     def name(self) -> str:
-        """The label as far as there is room for it."""
+        """Label, shortened to the space that it has."""
         return (
             self.label
             if len(self.label) <= LONGEST_ROW_LABEL
@@ -56,9 +59,11 @@ class Spread:
 
 @dataclass(frozen=True)
 class RowChart:
-    """Boxes one under the other on one scale; ``band``: where nine tenths are expected.
+    """Box plots below each other on a common scale.
 
-    note : small words beside the title.
+    alt : description for readers who cannot see the chart.
+    band : half-width of the expected central 90 %, None for none.
+    note : small print beside the title.
     """
 
     width: ClassVar[float] = CHART_WIDTH
@@ -76,26 +81,29 @@ class RowChart:
 
     @property
     def left(self) -> float:
-        """Where the frame begins, behind the longest label."""
+        """Left edge of the frame, beside the longest label."""
         return 12 + LABEL_LETTER_WIDTH * min(
             max(len(b.label) for b in self.boxes), LONGEST_ROW_LABEL
         )
 
     @property
     def height(self) -> float:
-        """Of the whole drawing: rows, ticks and the unit under them."""
+        """Height of the chart with ticks and unit."""
         return CHART_ROW_HEIGHT * len(self.boxes) + 40
 
     def x(self, value: float) -> float:
-        """Place of a value, kept inside the frame."""
+        """Horizontal position of a value, clipped to the frame."""
         share = (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
         return self.left + share * (CHART_WIDTH - self.left - 12)
 
 
 @dataclass(frozen=True)
 class UprightBar:
-    """One upright bar; ``expected`` is the range to compare it with, where there is one. lead : a
-    link to what it is of.
+    """Bar of a bar chart.
+
+    tip : tooltip.
+    expected : interval to compare the value with, None for none.
+    lead : link to the data of the bar.
     """
 
     label: str
@@ -108,9 +116,12 @@ class UprightBar:
 
 @dataclass(frozen=True)
 class BarChart:
-    """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value.
+    """Vertical bars that start at zero.
 
-    unit : what stands side by side, and what upwards. note : small words beside the title.
+    unit : text that names both axes.
+    labels : positions, in bars, with their text.
+    curve : points (position in bars, value) of a line to compare the bars with.
+    note : small print beside the title.
     """
 
     width: ClassVar[float] = CHART_WIDTH
@@ -128,7 +139,7 @@ class BarChart:
 
     @property
     def left(self) -> float:
-        """Where the bars begin: beside the longest number of the scale."""
+        """Left edge of the bars, beside the longest tick label."""
         return 12 + 6.5 * max([4, *(len(text) for _, text in self.ticks)])
 
     @property
@@ -137,23 +148,26 @@ class BarChart:
         return (CHART_WIDTH - self.left - 8) / max(len(self.bars), 1)
 
     def x(self, bar: float) -> float:
-        """Place of a bar's left side, counted from 0."""
+        """Position of the left side of a bar, counted from 0."""
         return self.left + bar * self.step
 
     def y(self, value: float) -> float:
-        """Place of a value, kept inside the frame."""
+        """Vertical position of a value, clipped to the frame."""
         share = min(max(value, 0.0), self.high) / self.high
         return self.height - 36 - share * (self.height - 46)
 
     @property
     def path(self) -> str:
-        """The curve as SVG path data."""
+        """Curve as SVG path data."""
         points = [f"{self.x(b):.1f},{self.y(v):.1f}" for b, v in self.curve]
         return "M" + "L".join(points) if points else ""
 
 
 def enlargement(lengths: Array, wanted: float) -> float:
-    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
+    """Round magnification for lengths (n,): 1, 2 or 5 times a power of ten, at least 1.
+
+    The 90 % quantile comes as near ``wanted`` as it can from below.
+    """
     large = float(np.quantile(lengths, 0.9)) if lengths.size else wanted
     ratio = max(wanted / max(large, 1e-9), 1.0)
     power = 10.0 ** math.floor(math.log10(ratio))
@@ -161,7 +175,7 @@ def enlargement(lengths: Array, wanted: float) -> float:
 
 
 def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float, str], ...]:
-    """Round values from low to high with their text."""
+    """Round values between two limits, with their text."""
     rough = (high - low) / about
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)
@@ -174,7 +188,7 @@ def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float,
 def box(
     label: str, values: Array, unit: str, places: int, leg: int | None = None, lead: str = ""
 ) -> Spread | None:
-    """A box of the finite ones of the values, None without any; its tooltip says what it shows."""
+    """Box plot row of the finite values, None without any; the tooltip lists its quantiles."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None
@@ -197,18 +211,19 @@ def row_chart(
     alt: str,
     note: str = "",
 ) -> RowChart | None:
-    """A chart symmetric about zero that holds the boxes and the band; None without boxes.
+    """Chart symmetric about zero that holds the boxes and the band; None without boxes.
 
-    Lines far longer than the usual one end at the border: one bad group should not flatten all.
+    Whiskers much longer than the median one end at the border, so that a single bad group does not
+    flatten all others.
     """
-    there = tuple(box for box in boxes if box)
-    if not there:
+    rows = tuple(box for box in boxes if box)
+    if not rows:
         return None
-    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in there]
+    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in rows]
     reach = min(max(reaches), CUT_OFF_LENGTH_FACTOR * float(np.median(reaches)))
     high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
     ticks = ticks_between(-high, high)
-    return RowChart(title, unit, alt, there, -high, high, ticks, band, note)
+    return RowChart(title, unit, alt, rows, -high, high, ticks, band, note)
 
 
 def bar_chart(
@@ -220,7 +235,7 @@ def bar_chart(
     curve: tuple[tuple[float, float], ...] = (),
     note: str = "",
 ) -> BarChart | None:
-    """Bars on a scale that holds them, their expected ranges and the curve; None without bars."""
+    """Bars on a scale that holds them, their expected intervals and the curve; None for no bars."""
     if not bars:
         return None
     tops = [bar.value for bar in bars] + [v for _, v in curve]
@@ -231,18 +246,20 @@ def bar_chart(
 
 
 def six_labels(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
-    """Labels of at most six bars, evenly apart, each under its own."""
+    """Labels of at most six bars at equal distances."""
     every = max(1, -(-len(bars) // 6))
     return tuple((k + 0.5, bars[k].label) for k in range(0, len(bars), every))
 
 
 def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
-    """Labels of the first, the middle and the last bar, each under its own."""
+    """Labels of the first, the middle and the last bar."""
     last = len(bars) - 1
     return tuple((k + 0.5, bars[k].label) for k in sorted({0, last // 2, last}) if bars)
 
 
 def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
-    """Charts beside each other, under what is remarkable in them; nothing without any."""
-    there = [chart for chart in charts if chart]
-    return page.filled_template("panels.html.j2", charts=there, remarks=remarks) if there else ""
+    """Charts beside each other below their remarks, as HTML; empty without charts."""
+    present = [chart for chart in charts if chart]
+    return (
+        page.filled_template("panels.html.j2", charts=present, remarks=remarks) if present else ""
+    )

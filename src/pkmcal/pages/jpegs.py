@@ -1,4 +1,4 @@
-"""Photographs as small JPEG files: in a page base64, in grey, within a number of bytes."""
+"""Images as small greyscale JPEG files, base64-encoded within a budget of characters for a page."""
 
 from __future__ import annotations
 
@@ -13,37 +13,47 @@ from pkmcal.errors import InputError
 from pkmcal.observe.images import Pictures
 
 LARGE_JPEG_WIDTH, SMALL_JPEG_WIDTH = 640, 256
-"""Widths, px: to look at one, and to look over all."""
+"""Widths, px, of the image shown alone and of its thumbnail."""
 PAGE_JPEG_QUALITY = 70
+""""""
 JPEGS_DECODED_AT_ONCE = 32
-"""Photographs that are decoded before it is asked whether there is room for more."""
+"""Images decoded before the remaining budget is checked again."""
 
 
 def jpeg(path: Path | None, size: tuple[int, int]) -> str:
-    """A photograph, ``LARGE_JPEG_WIDTH`` or as wide as it is; empty where it is not there any
-    more.
+    """Base64 JPEG of an image file, at most ``LARGE_JPEG_WIDTH`` wide.
+
+    Empty if the file cannot be read.
     """
-    return _packed(Pictures([path], size, [path.name]), 0, (LARGE_JPEG_WIDTH,))[0] if path else ""
+    return (
+        _base64_jpegs(Pictures([path], size, [path.name]), 0, (LARGE_JPEG_WIDTH,))[0]
+        if path
+        else ""
+    )
 
 
 def small_and_large(
     photographs: Sequence[tuple[Sequence[Integers], int]], room: int
 ) -> Iterator[tuple[str, str]]:
-    """Each photograph small, and large as long as there is room for ``room`` characters of both;
-    empty where its file cannot be read. Ends where there is no room for small ones either.
+    """Base64 JPEGs of each image, small and large, within ``room`` characters in all.
 
-    photographs : each as a station's, and its number among them.
+    The large one is empty where the budget does not suffice, both where the file cannot be read.
+    Iteration ends where the budget does not hold even a small one.
+
+    photographs : a station's images, and the index of one of them, for each image.
     """
     remainder, waiting = room, len(photographs)
     with ThreadPoolExecutor(THREADS) as pool:
         for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
             some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
             for small, large in pool.map(
-                lambda one: _packed(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)), some
+                lambda one: _base64_jpegs(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)),
+                some,
             ):
                 if len(small) > remainder:
                     return
-                # that of this one and those that follow come before a large one
+                # reserve room for the small versions of this image and all that follow before a
+                # large one
                 fits = len(small) * waiting + len(large) <= remainder
                 remainder, waiting = (
                     remainder - len(small) - (len(large) if fits else 0),
@@ -52,13 +62,17 @@ def small_and_large(
                 yield small, large if fits else ""
 
 
-def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
-    """A photograph in several widths, none more than its own."""
+def _base64_jpegs(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
+    """Base64 JPEGs of an image in several widths.
+
+    Never enlarged; empty texts if the image cannot be read.
+    """
     try:
         image = images[number]
     except InputError:
         return [""] * len(widths)
     out: dict[int, str] = {}
+    # from large to small, each scaled from the previous one
     for width in sorted(widths, reverse=True):
         image = narrowed(image, width)
         out[width] = base64.b64encode(coded(image, PAGE_JPEG_QUALITY)).decode("ascii")
@@ -66,19 +80,19 @@ def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> l
 
 
 def narrowed(image: Any, width: int) -> Any:
-    """A picture (h, w), no wider than ``width`` px."""
+    """Image (h, w) scaled down to a width of at most ``width`` px."""
     import cv2
 
     if image.shape[1] <= width:
         return image
     height = max(1, round(image.shape[0] * width / image.shape[1]))
-    # between neighbours, at an eighth of the price, as long as these leave none out
+    # linear interpolation costs an eighth, and skips no pixels up to a factor of two
     how = cv2.INTER_LINEAR if image.shape[1] <= 2 * width else cv2.INTER_AREA
     return cv2.resize(image, (width, height), interpolation=how)
 
 
 def coded(image: Any, quality: int) -> bytes:
-    """A picture as a JPEG file."""
+    """Image as the bytes of a JPEG file."""
     import cv2
 
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -1,4 +1,4 @@
-"""What is drawn over a photograph: silhouettes of legs and joint centres, in pixels."""
+"""Overlays on images: silhouettes of legs and joint centres, in pixels."""
 
 from __future__ import annotations
 
@@ -26,23 +26,29 @@ from pkmcal.observe.predict import (
 from pkmcal.wording import number
 
 EDGE_CURVE_POINTS = 13
-"""Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+"""Points of an edge's curve; a mirror bends an edge by less than a pixel between two of them."""
 EDGE_SIDE_NAMES = ("right", "left")
-"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
+"""Names of sides 0 and 1 of a leg in an image, looking along the leg from A to B."""
 EDGE_CURVE_FRACTIONS = np.linspace(0, 1, EDGE_CURVE_POINTS)
 STRAIGHT_CURVE_DEVIATION = 0.1
-"""Curves that stay within this many pixels of their chord are written as two points."""
+"""Largest deviation from the chord, px, of a curve that is reduced to its two ends."""
 FINE_EDGE_CURVE_POINTS = 65
-"""Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
+"""Points of a predicted curve, so that occlusion by other legs is resolved to 1/64 of a leg."""
 LEG_NUMBER_WIDTH = 0.04
-"""Width of a leg's number with its joint, in picture widths."""
+"""Width of a leg's number and its joint mark, in image widths."""
 INLIER_WEIGHT = 0.5
-"""Robust weight below which an edge counts as put aside; pictures draw it dashed."""
+"""Robust weight below which an edge counts as rejected; overlays draw it dashed."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A fitted edge as a polyline in pixels, (n, 2) in ``points``."""
+    """Edge as a polyline in pixels.
+
+    leg : from 1.
+    points : n pairs (x, y).
+    quiet : drawn dashed.
+    tip : tooltip.
+    """
 
     leg: int
     points: tuple[tuple[float, float], ...]
@@ -56,12 +62,15 @@ class Drawn:
 
 
 def edge_name(leg: int, tube: int, side: int) -> str:
-    """One edge of a leg's tube in words; all count from 0 here."""
+    """Name of an edge of a leg's tube; leg, tube and side count from 0."""
     return f"leg {leg + 1}, tube {tube + 1}, {EDGE_SIDE_NAMES[side]} edge"
 
 
 def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str) -> Drawn | None:
-    """What is drawn through points that are seen, of :func:`straightened`; leg : from 0."""
+    """Polyline through the points of :func:`straightened`; None for fewer than two.
+
+    leg : from 0.
+    """
     if len(points) < 2:
         return None
     return Drawn(leg + 1, tuple((x, y) for x, y in points), quiet, tip)
@@ -69,7 +78,14 @@ def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str)
 
 @dataclass(frozen=True)
 class Spot:
-    """A joint centre in pixels: where the calibrated model sees it, and where the drawing does."""
+    """Joint centre in pixels, of the calibrated and of the nominal model.
+
+    leg : from 1.
+    end : base or platform.
+    calibrated : pixel by the model of the overlay.
+    drawing : pixel by the nominal model, None without comparison.
+    labelled : whether the leg's number stands here.
+    """
 
     leg: int
     end: str
@@ -79,7 +95,7 @@ class Spot:
 
     @property
     def tip(self) -> str:
-        """What it is, and how far the two are apart."""
+        """Tooltip: name of the joint, and distance between the two models."""
         if self.drawing is None:
             return f"Leg {self.leg}, {self.end} joint"
         away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
@@ -88,8 +104,12 @@ class Spot:
 
 @dataclass(frozen=True)
 class Arrow:
-    """From a place in a picture, px, as far as it is drawn: from a board's corner, where it was
-    found, to where it is expected, or a cell's mean residual. lead : a link to what it is of.
+    """Displacement in an image, px, as drawn: of a board's corner, or the mean residual of a cell.
+
+    A corner's arrow leads from the detected to the predicted pixel.
+
+    x, y : start. dx, dy : components.
+    lead : link to the data of the arrow.
     """
 
     x: float
@@ -103,10 +123,15 @@ class Arrow:
 
 @dataclass(frozen=True)
 class Picture:
-    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
-    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
-    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
-    the page.
+    """Image with its overlays.
+
+    jpeg, large : base64; empty if the file cannot be read, large also if there was no room.
+    edges, spots, corners : overlays.
+    why : reason for showing the image.
+    caption : contents of the image.
+    kind : measured or predicted edges.
+    anchor : id on the page.
+    missed : edges that were searched and rejected.
     """
 
     station: str
@@ -132,23 +157,28 @@ def machine_laid_over(
     joints: Array,
     T_base_platform: Array,
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
-    """Silhouettes of a machine's tubes in a photograph, where no other leg hides them, and its
-    joint centres.
+    """Visible silhouettes of a machine's tubes in an image, and its joint centres.
 
-    joints : (m,) readings. T_base_platform : (4, 4).
+    Parts of a silhouette that another leg occludes are left out.
+
+    joints : (m,) readings.
+    T_base_platform : (4, 4).
     """
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, T_camera_base, T_base_platform[None], joints[None])
     points = edge_points(machine, camera, legs, tubes, FINE_EDGE_CURVE_POINTS)
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
     edges: list[Drawn] = []
+    # each visible stretch is a polyline of its own
     for e, (curve, visible) in enumerate(zip(points.pixel[0], clear, strict=True)):
         leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        parts = (straightened(curve[None, start:stop])[0] for start, stop in _runs(visible))
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]])))
+        runs = [(a, b) for a, b in pairwise(ends.tolist()) if visible[a] and b - a > 1]
+        parts = (straightened(curve[None, start:stop])[0] for start, stop in runs)
         lines = (polyline(leg, part, False, tip) for part in parts)
         edges += [line for line in lines if line]
-    ends = machine.ends_at(joints, T_base_platform)
-    both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
+    joint_ends = machine.ends_at(joints, T_base_platform)
+    both = camera.project(apply(T_camera_base, np.stack([joint_ends.a, joint_ends.b])))
     return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
 
 
@@ -160,12 +190,15 @@ def measured_curves(
     edges: EdgeSet,
     fraction: Array = EDGE_CURVE_FRACTIONS,
 ) -> Array:
-    """Curves (n, m, 2) px of measured edges in photographs of one station, at fractions (m,) of
-    their span.
+    """Curves (n, m, 2) px of measured edges in images of one station.
 
-    legs : (K, L, 3) in each photograph. photograph : (n,) the edges' among them. The predicted
-    contour's rays, each turned into the measured plane: r - (r . n) n.
+    The rays of the predicted contour, each projected into the measured plane: r - (r . n) n.
+
+    legs : (K, L, 3) axes in each image, camera frame.
+    photograph : (n,) index of each edge's image.
+    fraction : (m,) positions along the edges' spans.
     """
+    # rays to the contour, moved from the axis to the measured side
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
     radius = machine.radii_of(edges.leg, edges.tube)
     at = photograph, edges.leg
@@ -179,7 +212,7 @@ def measured_curves(
 def own_edges(
     machine: Machine, legs: LegsInCamera, photograph: Integers, edges: EdgeSet
 ) -> EdgeSet:
-    """The edges as the machine itself would show them, as for :func:`measured_curves`."""
+    """Edges with the normals that the machine predicts; arguments as :func:`measured_curves`."""
     radius = machine.layout.radius_of(edges.leg, edges.tube)
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
@@ -189,7 +222,10 @@ def own_edges(
 
 
 def offsets_across_curves(expected: Array, measured: Array) -> tuple[Array, Array]:
-    """Unit normals (n, m, 2) of curves (n, m, 2), px, and how far (n, m) others lie along them."""
+    """Normals of predicted curves and offsets of measured curves along them.
+
+    expected, measured : (n, m, 2) px. Returns unit normals (n, m, 2) and offsets (n, m), px.
+    """
     tangent = np.gradient(expected, axis=1)
     normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -197,7 +233,7 @@ def offsets_across_curves(expected: Array, measured: Array) -> tuple[Array, Arra
 
 
 def residual_words(shift: float, tilt: float, weight: float) -> str:
-    """An edge's residual, in standard deviations, and its robust weight."""
+    """Residual of an edge, in standard deviations, and its robust weight, in words."""
     return (
         f"residual {number(shift, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
         f" weight {number(weight, 2)}"
@@ -205,15 +241,15 @@ def residual_words(shift: float, tilt: float, weight: float) -> str:
 
 
 def straightened(curves: Array) -> list[list[list[float]]]:
-    """Of each curve (n, m, 2) the points that are seen, which are finite; both ends alone of one
-    that is straight between them.
-    """
+    """Finite points of each curve (n, m, 2); of a curve that is straight only its two ends."""
     finite: Booleans = np.asarray(np.isfinite(curves).all(axis=-1))
     row = np.arange(len(curves))
     curves = np.where(finite[..., None], curves, np.nan)
     first = curves[row, np.argmax(finite, axis=1)]
     last = curves[row, -1 - np.argmax(finite[:, ::-1], axis=1)]
+    # straight: no point is farther from the chord than the limit
     chord, off = last - first, curves - first[:, None]
+    # twice the area with the chord: the distance from it, times its length
     area = np.abs(chord[:, :1] * off[..., 1] - chord[:, 1:] * off[..., 0])
     most = np.max(area, axis=1, where=finite, initial=0.0)
     straight = (most <= STRAIGHT_CURVE_DEVIATION * np.hypot(*chord.T)) & (finite.sum(axis=1) > 2)
@@ -222,14 +258,15 @@ def straightened(curves: Array) -> list[list[list[float]]]:
 
 
 def _spots(pixel: Array, visible: Booleans, width: int) -> tuple[Spot, ...]:
-    """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
-    another number.
+    """Joint centres in an image, from pixels (2, L, 2) on base and platform.
+
+    Each leg's number stands at its joint with more room to other numbers.
     """
     room, labels, spots = width * LEG_NUMBER_WIDTH, list[Array](), list[Spot]()
     for j in range(pixel.shape[1]):
         free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
         at = [end for end in (0, 1) if visible[end, j]]
-        # at the base, where there is room
+        # at the base, if both have room
         best = max(at, key=lambda end: (min(free[end], room), -end), default=None)
         for end in at:
             x, y = pixel[end, j]
@@ -238,9 +275,3 @@ def _spots(pixel: Array, visible: Booleans, width: int) -> tuple[Spot, ...]:
         if best is not None:
             labels.append(pixel[best, j])
     return tuple(spots)
-
-
-def _runs(visible: Booleans) -> list[tuple[int, int]]:
-    """Stretches (n,) of True that are longer than a point, first and one after the last."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]])))
-    return [(a, b) for a, b in pairwise(ends.tolist()) if visible[a] and b - a > 1]

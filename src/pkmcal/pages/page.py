@@ -1,4 +1,4 @@
-"""The one page of all commands: an outcome as HTML that needs no network and no other file."""
+"""HTML page of all commands: an outcome in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from pkmcal.outcome import Outcome
 
 N_COLOURS = 8
-"""Leg colours in the style sheet; machines with more legs use them again."""
+"""Leg colours in the style sheet; machines with more legs repeat them."""
 
 
 def page_html(outcome: Outcome, made: datetime | None = None) -> str:
-    """The page: verdict, what to look at, cards, then the parts, each with its navigation.
+    """Page with verdict, warnings, cards and parts, and the navigation.
 
-    made : when, for its head.
+    made : time for the head of the page.
     """
     plots = [plot for part in outcome.parts for plot in part.plots]
     warnings = [finding.text for finding in outcome.findings if finding.level != "note"]
@@ -47,7 +47,7 @@ def page_html(outcome: Outcome, made: datetime | None = None) -> str:
 
 
 def filled_template(template: str, **views: Any) -> Markup:
-    """A template filled; every value in it is escaped, so that the whole is safe in another one."""
+    """Filled template; all values are escaped, so that the result can be inserted into another."""
     from markupsafe import Markup
 
     return Markup(environment().get_template(template).render(**views))
@@ -55,12 +55,12 @@ def filled_template(template: str, **views: Any) -> Markup:
 
 @cache
 def environment() -> jinja2.Environment:
-    """Templates of this package, each compiled once a machine."""
+    """Jinja environment of this package's templates; their bytecode is cached on disk."""
     import jinja2
     from markupsafe import Markup
 
     class Compiled(jinja2.BytecodeCache):
-        """Templates' code between runs; Jinja checks that it is the template's."""
+        """Cache of compiled templates between runs; Jinja checks that the source is the same."""
 
         def load_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
             code = remembered(f"legible-template-{bucket.key}")
@@ -75,6 +75,7 @@ def environment() -> jinja2.Environment:
         bytecode_cache=Compiled(),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        # control characters in any printed text become visible
         finalize=lambda value: (
             legible(value, keep="\n\t")
             if isinstance(value, str) and not isinstance(value, Markup)
@@ -91,11 +92,12 @@ def environment() -> jinja2.Environment:
 
 
 def _as_json(value: Any, **options: Any) -> str:
-    """What a page's scripts read: browsers stop at NaN, and would then draw no plot at all."""
+    """JSON for a page's scripts: without NaN, at which browsers stop and show no plot at all."""
     return json.dumps(_legible_texts(json_value(value)), allow_nan=False, **options)
 
 
 def _legible_texts(value: Any) -> Any:
+    """Value with control characters of all its texts made visible."""
     if isinstance(value, str):
         return legible(value, keep="\n\t")
     if isinstance(value, dict):
@@ -107,7 +109,7 @@ def _legible_texts(value: Any) -> Any:
 
 @cache
 def plotly_script() -> str:
-    """Plotly's script, compressed (gzip, base64): a fifth of the page's size without it."""
+    """Plotly's script, gzip and base64: a fifth of the size of a page without compression."""
     import base64
     import gzip
     from importlib import metadata, resources
@@ -122,5 +124,5 @@ def plotly_script() -> str:
 
 
 def _colour_class(leg: int | None) -> str:
-    """The style sheet's name of a leg's colour; legs from 1, none for a chart without legs."""
+    """Style class of a leg's colour; leg : from 1, None for data without a leg."""
     return f"leg-{(leg - 1) % N_COLOURS + 1}" if leg else "no-leg"

@@ -1,6 +1,4 @@
-"""Plots in the plane and in space, as the page's Plotly draws them: their looks, and what stands in
-space, where lengths are millimetres.
-"""
+"""Plotly traces and layouts in the plane and in space; coordinates in space are drawn in mm."""
 
 from __future__ import annotations
 
@@ -21,34 +19,36 @@ COMMON_PLOT_LAYOUT: dict[str, Any] = {
     "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
     "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
 }
-"""What the layouts of all plots have in common."""
+"""Layout entries common to all plots."""
 COMMON_AXIS_LAYOUT: dict[str, Any] = {
     "color": "--muted",
     "gridcolor": "--rule",
     "zerolinecolor": "--rule",
     "linecolor": "--rule",
 }
-"""And their axes."""
+"""Layout entries common to all axes."""
 EYE_BESIDE_CAMERA = 1.2
-"""rad that the eye stands beside a camera at most, so that a single one looks across."""
+"""Largest angle between eye and camera, rad, so that a single camera is seen from the side."""
 EYE_AT_CORNER = {"x": 1.45, "y": -1.45, "z": 0.8}
 PLOTLY_VIEW_ANGLE = np.pi / 4
-"""From below to above in a picture in space, rad: Plotly's."""
+"""Plotly's vertical field of view in space, rad."""
 MAGNITUDE_COLOUR_SCALE = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
-"""Of magnitudes, the least first."""
+"""Colours of magnitudes, the smallest first."""
 WIDE_SPACE_PICTURE, NARROW_SPACE_PICTURE = (1.5, 0.76), (1.0, 0.66)
-"""Widths of pictures in space, in heights, and the part of each that what is drawn may take: names
-and numbers stand beside it, of the same size in a small picture."""
+"""Aspect ratio (width by height) of a plot in space, and the share of it for the data.
+
+Names and numbers stand beside the data, in the same size in a small plot.
+"""
 FRUSTUM_POINTS_A_SIDE = 6
-"""Points of each side of a picture's border that a frustum is drawn through."""
+"""Points on each side of the image border in a drawn frustum."""
 
 
 def plane(x: str, y: str) -> dict[str, Any]:
-    """Layout of a plot of y against x, which are named by the axes' titles; the legend above."""
+    """Layout of a plot of y against x, with the axes' titles; the legend is above."""
     return {
         **COMMON_PLOT_LAYOUT,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        # see-through, for the highest tick's number stands half behind it
+        # transparent: half of the highest tick's number lies behind it
         "legend": {
             "orientation": "h",
             "x": 0,
@@ -69,15 +69,16 @@ def trace(
     mode: str = "lines+markers",
     **more: Any,
 ) -> dict[str, Any]:
-    """A line, marks or both in the plane, with gaps where a value is none; more : of Plotly's
-    trace, over what stands here.
+    """Line, markers or both in the plane, with gaps at values that are not finite.
+
+    more : further entries of Plotly's trace, which take precedence.
     """
     return {
         "type": "scatter",
         "mode": mode,
         "name": name,
-        "x": _drawn(x),
-        "y": _drawn(y),
+        "x": _plot_values(x),
+        "y": _plot_values(y),
         "line": {"color": colour, "width": 1.5},
         "marker": {"color": colour, "size": 8},
         **more,
@@ -85,19 +86,22 @@ def trace(
 
 
 def bars(name: str, x: Iterable[Any], y: Iterable[float], **marker: Any) -> dict[str, Any]:
-    """A trace of bars that look like marker."""
+    """Trace of bars.
+
+    marker : entries of Plotly's marker.
+    """
     return {
         "type": "bar",
         "name": name,
-        "x": _drawn(x),
-        "y": _drawn(y),
+        "x": _plot_values(x),
+        "y": _plot_values(y),
         "marker": marker,
         "hovertemplate": "%{x}: %{y:.3g}",
     }
 
 
-def _drawn(values: Iterable[Any]) -> list[Any]:
-    """Names, or numbers with five digits and None for those that are not finite."""
+def _plot_values(values: Iterable[Any]) -> list[Any]:
+    """Names unchanged; numbers with five digits, None for those that are not finite."""
     return [
         value if isinstance(value, str) else float(f"{value:.5g}") if math.isfinite(value) else None
         for value in values
@@ -107,7 +111,7 @@ def _drawn(values: Iterable[Any]) -> list[Any]:
 def line(
     name: str, colour: str, width: float, segments: Sequence[Array], **more: Any
 ) -> dict[str, Any]:
-    """A trace of lines in space, each (n, 3), m."""
+    """Trace of lines in space, each (n, 3), m."""
     return {
         "type": "scatter3d",
         "mode": "lines",
@@ -121,7 +125,7 @@ def line(
 
 
 def coordinates(segments: Sequence[Array]) -> dict[str, list[float | None]]:
-    """Coordinates (mm) of lines (n, 3), a gap after each."""
+    """Coordinates in mm of lines (n, 3), m, with a gap after each."""
     out: dict[str, list[float | None]] = {"x": [], "y": [], "z": []}
     for points in segments:
         for axis, name in enumerate("xyz"):
@@ -130,7 +134,7 @@ def coordinates(segments: Sequence[Array]) -> dict[str, list[float | None]]:
 
 
 def markers(name: str, points: Array, marker: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """A trace of marks at points (n, 3), m."""
+    """Trace of markers at points (n, 3), m."""
     at = np.round(points * 1e3, 2)
     return {
         "type": "scatter3d",
@@ -143,7 +147,7 @@ def markers(name: str, points: Array, marker: dict[str, Any], **more: Any) -> di
 
 
 def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) -> dict[str, Any]:
-    """A trace of marks at points (n, 3), m, in the colours of values (n,), with their scale."""
+    """Trace of markers at points (n, 3), m, coloured by values (n,), with a colour bar."""
     style = {
         "size": 4,
         "color": [float(f"{x:.3g}") for x in values.tolist()],
@@ -161,7 +165,7 @@ def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) ->
 
 
 def ring(points: Array) -> Array:
-    """A body's joints (L, 3) in the order that goes around their middle, closed (L + 1, 3)."""
+    """Joints (L, 3) of a body in their order around the middle, closed: (L + 1, 3)."""
     centred = points - points.mean(axis=0)
     across = np.linalg.svd(centred, full_matrices=False)[2][:2]
     around = np.argsort(np.arctan2(*(centred @ across.T).T))
@@ -169,7 +173,10 @@ def ring(points: Array) -> Array:
 
 
 def space_layout(eye: dict[str, float] = EYE_AT_CORNER) -> dict[str, Any]:
-    """The layout of a figure in space, seen from ``eye``, a corner unless told."""
+    """Layout of a figure in space.
+
+    eye : Plotly's camera position; from a corner by default.
+    """
     axis = {**COMMON_AXIS_LAYOUT, "showbackground": False, "tickfont": {"size": 10}, "nticks": 6}
     return {
         **COMMON_PLOT_LAYOUT,
@@ -188,8 +195,11 @@ def space_layout(eye: dict[str, float] = EYE_AT_CORNER) -> dict[str, Any]:
 
 
 def path_between_cameras(cameras: Array) -> Array:
-    """The way (3,) from which a machine and its cameras, at (S, 3) m from its middle, are looked
-    at: between two cameras, so that none stands before it.
+    """View direction (3,) from the middle of a machine between two of its cameras.
+
+    No camera then stands in front of the machine.
+
+    cameras : (S, 3) m from the middle.
     """
     around = np.sort(np.arctan2(cameras[:, 1], cameras[:, 0])) if len(cameras) else [-np.pi / 4]
     gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
@@ -198,11 +208,12 @@ def path_between_cameras(cameras: Array) -> Array:
 
 
 def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
-    """The layout of a figure in space that is seen with all of ``data`` in the picture.
+    """Layout of a figure in space, with the view at which all of ``data`` fits.
 
-    direction : (3,) from what is drawn towards the eye. In ``meta`` stands how
-    ``NARROW_SPACE_PICTURE`` pictures are looked at; the page takes it where they are narrower than
-    ``WIDE_SPACE_PICTURE``.
+    direction : (3,) from the data towards the eye.
+
+    ``meta`` holds the view for ``NARROW_SPACE_PICTURE``, which the page uses for plots narrower
+    than ``WIDE_SPACE_PICTURE``.
     """
     least, most = (
         np.array([f([v for t in data for v in t[axis] if v is not None]) for axis in "xyz"])
@@ -216,13 +227,14 @@ def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
     axes = np.stack([right, np.cross(direction, right)], axis=1)
 
     def camera(width: float, inside: float) -> dict[str, dict[str, float]]:
-        # a corner at depth d before the eye is inside where it lies within slope d of the middle,
-        # so on each axis the corners on either side decide how far away, and what the middle is
+        # a corner at depth d in front of the eye is in view if it lies within slope * d of the
+        # axis; on each axis the extreme corner of either side fixes the distance and the centre
+        """Plotly camera for an aspect ratio and the share of the plot that holds the data."""
         slope = inside * np.tan(PLOTLY_VIEW_ANGLE / 2) * np.array([width, 1.0])
         near, across = (corners @ direction)[:, None], corners @ axes / slope
-        one, other = (near + across).max(axis=0), (near - across).max(axis=0)
-        middle = axes @ (slope * (one - other) / 2)
-        eye = middle + (one + other).max() / 2 * direction
+        positive, negative = (near + across).max(axis=0), (near - across).max(axis=0)
+        middle = axes @ (slope * (positive - negative) / 2)
+        eye = middle + (positive + negative).max() / 2 * direction
         return {
             name: dict(zip("xyz", point.round(3).tolist(), strict=True))
             for name, point in (("eye", eye), ("center", middle))
@@ -236,14 +248,16 @@ def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
 
 
 def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
-    """Lines (n, 3), m, base frame: the picture's border at some depth, and the rays to its corners.
+    """Lines (n, 3), m, base frame: border of the image at a depth, and rays to its four corners.
 
-    Where the lens or mirror sees nothing at the border, its field's, as far as it goes; of a field
-    that is wider than a plane can hold, at a distance instead of a depth.
+    Where the lens or mirror has no ray at the border, the limit of its field along the line to the
+    image's centre. For fields too wide for a plane at that depth, ``depth`` is the distance along
+    the rays.
     """
     right, bottom = camera.image_size[0] - 0.5, camera.image_size[1] - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
     at = np.arange(4 * FRUSTUM_POINTS_A_SIDE + 1) / FRUSTUM_POINTS_A_SIDE
+    # along each ray from the border to the centre take the first that the camera model has
     border = np.stack([np.interp(at, np.arange(5), corners[:, c]) for c in (0, 1)], axis=-1)
     centre = (border.max(axis=0) + border.min(axis=0)) / 2
     share = np.linspace(1, 0, 41)[:, None, None]
@@ -254,6 +268,9 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
         return []
     deep = rays[:, 2].min()
     points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
-    in_view = apply(T_base_camera, points)
+    border_points = apply(T_base_camera, points)
     eye = T_base_camera[:3, 3]
-    return [in_view, *(np.stack([eye, in_view[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4))]
+    return [
+        border_points,
+        *(np.stack([eye, border_points[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4)),
+    ]

@@ -1,1 +1,1 @@
-"""Delta printers: sessions made of what their firmware already holds."""
+"""Calibration sessions of delta printers, made from the data that their firmware holds."""

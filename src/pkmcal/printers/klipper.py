@@ -1,18 +1,17 @@
-"""Klipper's printer.cfg: the delta's values, and the bed as DELTA_CALIBRATE felt it.
+"""Klipper's printer.cfg: geometry of the delta, and bed points of DELTA_CALIBRATE.
 
-Meaning: Klipper's configuration reference, klippy/kinematics/delta.py and
-klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``; of what
-stands above as well, that above counts; where one line below SAVE_CONFIG's header is without that
-mark, or one with it stands above the header, nothing that was saved counts (klippy/configfile.py,
-_find_autosave_data). ``heightN_pos`` are steps of the three motors since their end switches,
-``heightN`` the height of the nozzle above the bed there.
+Semantics: Klipper's configuration reference, klippy/kinematics/delta.py and
+klippy/extras/delta_calibrate.py. SAVE_CONFIG writes lines that begin with ``#*#``. A value that
+also occurs above SAVE_CONFIG's block is taken from above. If a line below SAVE_CONFIG's header
+lacks the mark, or a marked line precedes the header, Klipper ignores the whole saved block
+(klippy/configfile.py, _find_autosave_data). ``heightN_pos`` are steps of the three motors from
+their end switches, ``heightN`` is the height of the nozzle above the bed there.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from configparser import ConfigParser
 from functools import partial
 from itertools import count, takewhile
@@ -34,14 +33,14 @@ from pkmcal.printers.printer import CARRIAGE_STEP, LARGEST_PRINTER_VALUE, Printe
 SAVED_LINE_MARK = "#*#"
 _HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 FULL_STEPS = 200.0
-"""Steps a turn of a motor whose section says nothing else, as in Klipper."""
+"""Default full steps per motor revolution, as in Klipper."""
 MOST_CARRIAGE_STEPS = 1e9
-"""From an end switch: kilometres of a carriage's way."""
+"""Bound on steps from an end switch; more would be kilometres of carriage travel."""
 _SECTION = re.compile(r"\[([^\]]+)\]")
 _ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=](.*)")
 
 Sections = dict[str, dict[str, tuple[str, str]]]
-"""Entries by section and name: their text, and where it stands."""
+"""Entries by section and name: the text of each, and its place in the file."""
 
 
 def is_one(text: str) -> bool:
@@ -50,10 +49,14 @@ def is_one(text: str) -> bool:
 
 
 def printer(text: str, label: str) -> Printer:
-    """The printer of a printer.cfg, checked field by field."""
+    """Printer of a printer.cfg.
+
+    Raises InputError for kinematics other than delta, for missing or impossible values, and for a
+    saved block that Klipper would ignore.
+    """
     _check_saved(text, label)
-    result = sections(text, label)
-    kinematics = result["printer"].get("kinematics", ("", f"{label}, [printer]"))
+    entries = sections(text, label)
+    kinematics = entries["printer"].get("kinematics", ("", f"{label}, [printer]"))
     if kinematics[0] != "delta":
         raise InputError(
             "heights of a bed are read of linear deltas",
@@ -61,48 +64,55 @@ def printer(text: str, label: str) -> Printer:
             found=quoted(kinematics[0]),
             expected="kinematics: delta",
         )
-    radius = _positive(result, label, "printer", "delta_radius")
-    each = {
-        name: [_of_tower(result, label, k, name, value) for k in range(3)]
+    # checked values: one radius, and rod, end switch and direction of each tower; rods and end
+    # switches of the second and the third tower default to the first's
+    radius = _positive(entries, label, "printer", "delta_radius")
+    by_tower = {
+        name: [
+            value(entries, label, f"stepper_{s}", name, value(entries, label, "stepper_a", name))
+            for s in KLIPPER_STEPPERS
+        ]
         for name, value in (("arm_length", _positive), ("position_endstop", _number))
     }
-    each["angle"] = [
-        _number(result, label, f"stepper_{s}", "angle", default)
+    by_tower["angle"] = [
+        _number(entries, label, f"stepper_{s}", "angle", default)
         for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
     ]
+    # the export's formulas read a ConfigParser; values are text there
     config = ConfigParser()
     config.read_dict(
         {
             "printer": {"kinematics": "delta", "delta_radius": repr(radius)},
             **{
-                f"stepper_{s}": {name: repr(values[k]) for name, values in each.items()}
+                f"stepper_{s}": {name: repr(values[k]) for name, values in by_tower.items()}
                 for k, s in enumerate(KLIPPER_STEPPERS)
             },
         }
     )
-    stepped = {"rotation_distance", "microsteps"} <= result.get("stepper_a", {}).keys()
+    # without the settings of its motors a printer has the usual carriage step
+    steps_stated = {"rotation_distance", "microsteps"} <= entries.get("stepper_a", {}).keys()
     with np.errstate(invalid="ignore"):
-        ends = homed(config)
+        homed_heights = homed(config)
     return Printer(
         program="Klipper",
         label=label,
         motors=("stepper_a", "stepper_b", "stepper_c"),
         radius=radius,
-        angle=np.array(each["angle"]),
-        rod=np.array(each["arm_length"]),
-        homed=ends,
-        reach=_positive(result, label, "printer", "print_radius", radius),
+        angle=np.array(by_tower["angle"]),
+        rod=np.array(by_tower["arm_length"]),
+        homed=homed_heights,
+        reach=_positive(entries, label, "printer", "print_radius", radius),
         carriages=partial(klipper_carriage_heights, config),
-        offset=_probe(result, label),
-        touches=_touches(result, label, ends),
-        step=max(_step(result, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
-        if stepped
+        offset=_probe_offset(entries, label),
+        touches=_touches(entries, label, homed_heights),
+        step=max(_mm_a_step(entries, label, f"stepper_{s}") for s in KLIPPER_STEPPERS)
+        if steps_stated
         else CARRIAGE_STEP,
     )
 
 
 def _check_saved(text: str, label: str) -> None:
-    """Raises InputError where Klipper would take nothing of what SAVE_CONFIG wrote."""
+    """Raise InputError if Klipper would ignore the block that SAVE_CONFIG wrote."""
     lines = [line.rstrip("\r") for line in text.rstrip().splitlines()]
     header = next((n for n, line in enumerate(lines) if _HEADER.match(line)), len(lines))
     for n, line in enumerate(lines):
@@ -126,7 +136,7 @@ def _check_saved(text: str, label: str) -> None:
 
 
 def sections(text: str, label: str) -> Sections:
-    """What a configuration says; where SAVE_CONFIG wrote what stands above as well, that above."""
+    """Entries of a configuration; the user's own lines take precedence over SAVE_CONFIG's."""
     lines = [(n, line.rstrip()) for n, line in enumerate(text.splitlines(), 1)]
     own = [(n, line) for n, line in lines if not line.startswith(SAVED_LINE_MARK)]
     saved = [
@@ -136,6 +146,7 @@ def sections(text: str, label: str) -> Sections:
     ]
     out: Sections = {}
     section = ""
+    # SAVE_CONFIG's lines first, so that the user's own override them
     for n, line in (*saved, *own):
         plain = re.split(r"(?:^|\s)[#;]", line)[0].rstrip()
         if head := _SECTION.fullmatch(plain.strip()):
@@ -146,18 +157,13 @@ def sections(text: str, label: str) -> Sections:
     return out
 
 
-def _of_tower(
-    config: Sections, label: str, k: int, name: str, value: Callable[..., float]
-) -> float:
-    """A tower's value; the second and the third have the first's unless they say otherwise."""
-    first = value(config, label, "stepper_a", name)
-    return value(config, label, f"stepper_{KLIPPER_STEPPERS[k]}", name, first)
-
-
 def _number(
     config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
-    """A value of a section; raises InputError where it is no number, or absent without default."""
+    """Number in a section.
+
+    Raises InputError if it is not a number within bounds, or missing without a default.
+    """
     if name not in config.get(section, {}):
         if default is not None:
             return default
@@ -185,7 +191,7 @@ def _number(
 def _positive(
     config: Sections, label: str, section: str, name: str, default: float | None = None
 ) -> float:
-    """A value of a section that is above zero on every machine."""
+    """Number in a section that must be positive. Raises InputError otherwise."""
     value = _number(config, label, section, name, default)
     if value <= 0:
         text, where = config[section][name]
@@ -198,8 +204,8 @@ def _positive(
     return value
 
 
-def _probe(config: Sections, label: str) -> tuple[float, float, float]:
-    """Where a probe is from the nozzle, mm; nowhere else where there is none."""
+def _probe_offset(config: Sections, label: str) -> tuple[float, float, float]:
+    """Offset (x, y, z) of the probe from the nozzle, mm; zeros without a probe."""
     for section, entries in config.items():
         if "z_offset" in entries:
             x, y = (_number(config, label, section, f"{c}_offset", 0.0) for c in "xy")
@@ -208,7 +214,7 @@ def _probe(config: Sections, label: str) -> tuple[float, float, float]:
 
 
 def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
-    """The points that DELTA_CALIBRATE kept, and those entered by hand."""
+    """Bed points that DELTA_CALIBRATE saved, and those entered by hand; None without any."""
     section = "delta_calibrate"
     entries = config.get(section, {})
     names = [
@@ -218,15 +224,16 @@ def _touches(config: Sections, label: str, ends: Array) -> Touches | None:
     ]
     if not names:
         return None
-    direction = np.array([_step(config, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
+    mm_a_step = np.array([_mm_a_step(config, label, f"stepper_{s}") for s in KLIPPER_STEPPERS])
     heights = [_number(config, label, section, name) for name in names]
-    steps = [_three(entries, label, f"{name}_pos") for name in names]
+    steps = [_motor_steps(entries, label, f"{name}_pos") for name in names]
     origin = f"{label}, [{section}]"
-    return Touches(ends - np.array(steps) * direction, np.array(heights), origin)
+    return Touches(ends - np.array(steps) * mm_a_step, np.array(heights), origin)
 
 
-def _step(config: Sections, label: str, section: str) -> float:
-    """Mm of a carriage for a step of its motor."""
+def _mm_a_step(config: Sections, label: str, section: str) -> float:
+    """Carriage travel per motor step, mm."""
+    # the second and the third stepper default to the first
     own = {**config.get("stepper_a", {}), **config.get(section, {})}
     both = {section: own}
     turn = _positive(both, label, section, "rotation_distance")
@@ -244,8 +251,8 @@ def _step(config: Sections, label: str, section: str) -> float:
     return turn / (full * micro * prod(a / b for a, b in pairs))
 
 
-def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
-    """Three numbers with commas between them."""
+def _motor_steps(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
+    """Three comma-separated motor positions, in steps. Raises InputError for anything else."""
     text, where = entries.get(name, ("", f"{label}, [delta_calibrate]"))
     try:
         values = [float(x) for x in text.split(",")]
@@ -253,7 +260,7 @@ def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[f
         values = list[float]()
     if len(values) != 3 or not all(abs(x) <= MOST_CARRIAGE_STEPS for x in values):
         raise InputError(
-            f"{name} does not tell where the three motors were",
+            f"{name} does not give the three motors' positions",
             where=where,
             found=quoted(text),
             expected="three numbers, as SAVE_CONFIG wrote them",

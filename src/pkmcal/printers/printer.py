@@ -1,4 +1,4 @@
-"""A delta printer as its firmware's own files describe it, and points at which it felt its bed."""
+"""Delta printer as its firmware's files describe it, and the points at which it probed its bed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,21 @@ from dataclasses import dataclass
 from pkmcal.arrays import Array, short_repr
 
 CARRIAGE_STEP = 1 / 80
-"""mm of a carriage a step: 200 full steps of 16, belts of 2 mm on 20 teeth, as on most printers."""
+"""Default carriage travel per step, mm.
+
+200 full steps of 16 microsteps, belts of 2 mm pitch on 20 teeth, as on most printers.
+"""
 LARGEST_PRINTER_VALUE = 1e6
-"""mm, or degrees: what is larger is no printer's, and would overflow where it is squared."""
+"""Bound on lengths (mm) and angles (degrees); larger values would overflow when squared."""
 
 
 @dataclass(frozen=True)
 class Touches:
-    """Where a tool felt the bed: carriages (n, 3) mm, and heights (n,) mm of the tool's tip there
-    above the bed. origin : where they were read, for people.
+    """Probed points of the bed.
+
+    carriages : (n, 3) mm, positions of the carriages at contact.
+    heights : (n,) mm, height of the tool's tip above the bed at these positions.
+    origin : the file they were read from, for messages.
     """
 
     carriages: Array
@@ -28,13 +34,20 @@ class Touches:
 
 @dataclass(frozen=True)
 class Printer:
-    """What a firmware holds of a linear delta, mm and degrees.
+    """Geometry of a linear delta in its firmware's own numbers, mm and degrees.
 
-    program : the firmware. motors : their names. radius : of the towers' circle less the tool's.
-    angle, rod : (3,). homed : (3,) carriages at their end switches. reach : radius of the bed.
-    carriages : points (n, 3) mm of the tool to carriages (n, 3) mm, by the firmware's formulas.
-    offset : (x, y, z) mm of a probe from the nozzle. touches : saved in the same file. step : of a
-    carriage, mm.
+    program : name of the firmware.
+    label : name of the file, for messages.
+    motors : names of the motors.
+    radius : radius of the towers' circle less that of the effector.
+    angle : (3,) directions of the towers.
+    rod : (3,) lengths of the rods.
+    homed : (3,) heights of the carriages at their end switches.
+    reach : print radius.
+    carriages : map from tool points (n, 3) to carriage heights (n, 3), by the firmware's formulas.
+    offset : (x, y, z) of the probe from the nozzle.
+    touches : probed points in the same file, None for none.
+    step : carriage travel per motor step.
     """
 
     program: str

@@ -1,4 +1,4 @@
-"""Which firmware a printer's configuration is of, and whether a delta can be built of it."""
+"""Firmware of a printer's configuration file, and whether its delta can be built."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pkmcal.printers.printer import Printer
 
 
 def buildable_delta(printer: Printer) -> Printer:
-    """The printer; raises InputError where no such delta can be built."""
+    """The printer, unchanged. Raises InputError if no delta with these values can be built."""
     if not 0 < printer.radius < printer.rod.min():
         raise InputError(
             "a rod has to be longer than the delta radius",
@@ -21,6 +21,7 @@ def buildable_delta(printer: Printer) -> Printer:
             found=f"rods of {printer.rod.min():g} mm, a radius of {printer.radius:g} mm",
             expected="both in mm, as the firmware has them",
         )
+    # towers closer than half of their regular spacing of 120 degrees
     apart = np.sort(np.mod(printer.angle, 360))
     gaps = np.diff(np.append(apart, apart[0] + 360))
     if gaps.min() < 60:
@@ -34,9 +35,9 @@ def buildable_delta(printer: Printer) -> Printer:
 
 
 def read_printer(path: Path) -> Printer:
-    """A printer of its printer.cfg (Klipper), or config.g or config-override.g (RepRapFirmware).
+    """Read a printer from printer.cfg (Klipper), or config.g or config-override.g (RepRapFirmware).
 
-    Raises InputError for another file, and for a printer that is no linear delta.
+    Raises InputError for any other file, and for a printer that is not a linear delta.
     """
     label = path.name
     text = read_text(path, largest=LARGEST_WRITTEN_FILE)

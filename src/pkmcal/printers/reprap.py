@@ -1,6 +1,6 @@
-"""RepRapFirmware's M665 and M666, of config.g or of config-override.g, which M500 writes.
+"""RepRapFirmware's M665 and M666, in config.g or in config-override.g, which M500 writes.
 
-Meaning: as told in :mod:`pkmcal.export.reprap`.
+Semantics: see :mod:`pkmcal.export.reprap`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,11 @@ def is_one(text: str) -> bool:
 
 
 def printer(text: str, label: str) -> Printer:
-    """The printer of a file with M665 and M666; what stands later counts."""
-    words, places = _numbers(text, label)
+    """Printer of a file with M665 and M666; of repeated values the last counts.
+
+    Raises InputError for missing, malformed or impossible values.
+    """
+    words, places = _checked_words(text, label)
     rod, radius, height, reach = (
         _words(words, label, "665" + letter, size)
         for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
@@ -45,14 +48,15 @@ def printer(text: str, label: str) -> Printer:
                 found=f"{values.min():g}",
                 expected="a number above zero",
             )
-    filled = dict(words)
-    filled["665L"] = rod
+    # complete command: corrections and adjustments default to 0
+    command = dict(words)
+    command["665L"] = rod
     for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
-        filled.setdefault(name, np.zeros(1))
-    filled["665R"], filled["665H"] = radius[:1], height[:1]
+        command.setdefault(name, np.zeros(1))
+    command["665R"], command["665H"] = radius[:1], height[:1]
     with np.errstate(invalid="ignore"):
-        ends = homed_carriages(filled)
-    corrections = np.array([filled[f"665{letter}"][0] for letter in "XYZ"])
+        ends = homed_carriages(command)
+    corrections = np.array([command[f"665{letter}"][0] for letter in "XYZ"])
     return Printer(
         program="RepRapFirmware",
         label=label,
@@ -62,12 +66,15 @@ def printer(text: str, label: str) -> Printer:
         rod=rod,
         homed=ends,
         reach=float(reach[0]),
-        carriages=partial(reprap_carriage_heights, filled),
+        carriages=partial(reprap_carriage_heights, command),
     )
 
 
-def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
-    """Values by command and letter, of M665 and M666 alone, and where each stands."""
+def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
+    """Values by command and letter, of M665 and M666 only, and the line of each.
+
+    Raises InputError for a line that holds no numbers within bounds.
+    """
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
     words: dict[str, Array] = {}
     places: dict[str, str] = {}
@@ -76,6 +83,7 @@ def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
             value = read_words(line)
         except ValueError:
             value = {"": np.array([np.inf])}
+        # NaN and infinity fail this comparison as well
         if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in value.values()):
             raise InputError(
                 "a value of this line is no number that a printer can have",
@@ -89,7 +97,10 @@ def _numbers(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
 
 
 def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
-    """A command's values (size,), of which one may stand for all."""
+    """Values (size,) of a word; a single one stands for all.
+
+    Raises InputError for any other number of values.
+    """
     values = words.get(name, np.zeros(0))
     if len(values) not in (1, size):
         raise InputError(

@@ -1,14 +1,12 @@
-"""The session of a delta printer: its drawing by the firmware, and its heights or a board."""
+"""Session of a delta printer: nominal model from its firmware, with bed heights or a board."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
 from pkmcal.mechanisms import MechanismDocument, checked_machine
@@ -25,7 +23,10 @@ from pkmcal.session.starter import (
 from pkmcal.wording import count
 
 CARRIAGE_MARGIN_BELOW = 5.0
-"""mm that carriages may go below what the bed's edge needs: for beds that hang lower than said."""
+"""Margin below the lowest carriage position that the bed's edge needs, mm.
+
+The bed may hang lower than the firmware's values place it.
+"""
 PRINTER_DRAWING_TEXT = """\
 # {name}, a linear delta, by the values in {label}. A firmware knows only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
@@ -39,7 +40,7 @@ home: {{position: [0, 0, {home} mm]}}
 workspace_radius: {reach} mm
 # Standard deviations of the firmware's values: of radius and towers (a radius that was measured
 # from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured
-# to 0.1 mm, hole to hole, tell the more of sizes along x and y.
+# to 0.1 mm, hole to hole, determine sizes along x and y better.
 tolerance: {{center: 2 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
 """
 PRINTER_LEG_TEXT = """\
@@ -77,8 +78,8 @@ joints:
 
 """
 WHERE_CARRIAGES_STAND = {
-    "Klipper": "what Klipper's\n#                          GET_POSITION tells behind stepper:",
-    "RepRapFirmware": "what M114\n#                          tells behind Count, divided by M92",
+    "Klipper": "what Klipper's\n#                          GET_POSITION prints behind stepper:",
+    "RepRapFirmware": "what M114\n#                          prints behind Count, divided by M92",
 }
 FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that go as far as it says.
@@ -101,12 +102,12 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY tells it. A bed that is not flat
-      # to that counts as well: what is found is told.
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY prints it. A bed that is not flat
+      # to that counts as well, and is reported.
       noise: {{position: 0.02 mm}}
       level: true             # the firmware's Z is counted from the bed
 
-# Heights do not tell how large a part comes out. Distances between marks that the tool made do: the
+# Heights do not determine how large a part comes out. Distances between marks of the tool do: the
 # carriages at each mark as further rows of joints.csv, and a table from,to,distance [mm].
 # distances:
 #   file: distances.csv
@@ -121,29 +122,33 @@ def write_printer_session(
     in_view: Literal["board"] | None = None,
     places: int = 1,
 ) -> tuple[str, ...]:
-    """Write a printer's session into a new or empty folder; returns its files.
+    """Write a printer's session into a new or empty folder and return the names of its files.
 
-    printer : its configuration. probed : points of its bed; without them those that its
-    configuration keeps. in_view : None of heights, or ``board``, then from so many places. Raises
-    InputError for files that do not tell what is needed.
+    printer : its configuration file.
+    probed : file with bed points; None for the points in the configuration file.
+    in_view : ``board`` for a session with a board on the tool; None for a session of heights.
+    places : number of stations of a session with a board.
+
+    Raises InputError for files that lack necessary values.
     """
-    value = read_printer(printer)
+    delta = read_printer(printer)
     if in_view is None:
-        touches = value.touches if probed is None else read_touches(probed, value)
-        texts = heights_texts(value, _enough(value, touches))
+        touches = delta.touches if probed is None else read_touches(probed, delta)
+        texts = heights_texts(delta, _checked_touches(delta, touches))
     else:
-        texts = carried_texts(value, places)
+        texts = carried_texts(delta, places)
     return write_texts(folder, texts)
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
-    """The files of a session with a board on the tool, to fill in."""
+    """Files by name of a session with a board on the tool, to be filled in by the user."""
     texts = session_texts("linear-delta", "board", places)
-    drawing = drawing_text(printer) + PLATFORM_FIXED_TEXT
-    document = parse_yaml(drawing, Path("mechanism.yaml"))
+    nominal = drawing_text(printer) + PLATFORM_FIXED_TEXT
+    document = parse_yaml(nominal, Path("mechanism.yaml"))
     machine = checked_machine(validated_document(document, MechanismDocument), document)
     heads = [f"{motor} [mm]" for motor in printer.motors]
-    # corners stay within the print radius where the tool goes half as far: room is beside no tower
+    # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
+    # only there no tower is in the way
     square = int(printer.reach / np.hypot(7, 5))
     head = CARRIED_BOARD_SESSION_TEXT.format(
         where=WHERE_CARRIAGES_STAND[printer.program],
@@ -152,7 +157,7 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     )
     session = texts["session.yaml"]
     texts["session.yaml"] = head + session[session.index("# One entry") :]
-    texts["mechanism.yaml"] = drawing
+    texts["mechanism.yaml"] = nominal
     texts["joints.csv"] = example_readings(machine, heads)
     texts["board.yaml"] = board_text(
         min(max(square, STARTER_SQUARE_CHOICES[0]), STARTER_SQUARE_CHOICES[-1])
@@ -161,7 +166,7 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
 
 
 def _resolution(printer: Printer) -> dict[str, str]:
-    """How well a carriage is known, in words: no finer than motors hold their steps."""
+    """Standard deviation and step of the carriages, in words: at least that of a motor step."""
     step = max(printer.step, CARRIAGE_STEP)
     return {
         "noise": f"{step / np.sqrt(12):.1g}",
@@ -169,15 +174,18 @@ def _resolution(printer: Printer) -> dict[str, str]:
     }
 
 
-def _enough(printer: Printer, touches: Touches | None) -> Touches:
-    """Raises InputError where too little of the bed was felt."""
+def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
+    """The points, unchanged.
+
+    Raises InputError for too few points, and for points that contradict the printer's values.
+    """
     if touches is None:
         raise InputError(
-            "nothing tells where the bed is",
+            "no point of the bed is known",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
             " DELTA_CALIBRATE and SAVE_CONFIG write",
-            next_step="Name what the printer's console said while it probed with --probed FILE; or"
+            next_step="Name the printer's console output of a probing with --probed FILE; or"
             " --board, for a session with a camera",
         )
     if len(touches.heights) < FEWEST_BED_POINTS:
@@ -196,7 +204,8 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
             found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
             expected=f"points that belong to the values in {printer.label}",
         )
-    # a rod that touches the bed has its upper end above it; a bed may hang, by less than a rod
+    # the upper end of a rod is above the bed when the lower one touches it; a bed may hang lower
+    # than the origin, but by less than a rod
     below = -(touches.carriages / printer.rod).min(axis=0) - 1
     if below.max() > 0:
         motor = int(np.argmax(below))
@@ -210,7 +219,7 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
 
 
 def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
-    """The files of a session of heights."""
+    """Files by name of a session of bed heights."""
     names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
     to = "klipper" if printer.program == "Klipper" else "reprap"
     heads = [f"{motor} [mm]" for motor in printer.motors]
@@ -225,12 +234,19 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
 
 
 def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
-    """The printer's drawing, without what it holds fixed."""
+    """Nominal model of the printer as a mechanism file, without its key ``fixed``.
+
+    touches : probed points that the ranges of the carriages have to include.
+    """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
     edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    # lowest carriages at the bed's edge, towards the towers and away from them, and at the touches
     with np.errstate(invalid="ignore"):
-        lowest = _lowest([printer.carriages(s * edge) for s in (-1.0, 1.0)], touches)
+        carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
+    carriages += [] if touches is None else [touches.carriages]
+    lowest = float(np.nanmin(np.concatenate(carriages))) - CARRIAGE_MARGIN_BELOW
+    # tool height at which the first carriage reaches its end switch, on the axis
     top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())
     legs = [
         PRINTER_LEG_TEXT.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))
@@ -245,12 +261,6 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
     )
 
 
-def _lowest(at_edge: Sequence[Array], touches: Touches | None) -> float:
-    """Where carriages go down to, mm: for the bed's edge, and for what was felt."""
-    reached = [*at_edge] if touches is None else [*at_edge, touches.carriages]
-    return float(np.nanmin(np.concatenate(reached))) - CARRIAGE_MARGIN_BELOW
-
-
 def _mm(value: float) -> str:
-    """A length in mm, to a tenth of a micrometre."""
+    """Length in mm with four decimals, trailing zeros dropped."""
     return f"{value:.4f}".rstrip("0").rstrip(".")

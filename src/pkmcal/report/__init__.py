@@ -1,1 +1,1 @@
-"""What commands found, as outcomes: sentences, figures, tables, and the parts of their pages."""
+"""Results of commands as outcomes: sentences, figures, tables, and the parts of their pages."""

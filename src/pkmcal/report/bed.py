@@ -1,4 +1,4 @@
-"""The bed in the report: how uneven it is, where heights were felt."""
+"""Report section on the bed: its deviation from a plane at the probed points."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pkmcal.pages.plots import plane
 from pkmcal.session.load import Session
 
 SURFACE_COLOUR_SCALE = [[0.0, "--calibrated"], [0.5, "--band"], [1.0, "--drawing"]]
-"""Below the middle, the middle, above."""
+"""Colours below the mean, at the mean, and above it."""
 
 
 def section(session: Session, errors: tuple[ModelError, ...]) -> Part | None:
-    """The bed's map; None where the data do not surely show an uneven bed."""
+    """Section with the bed's map; None unless the data show an uneven bed with certainty."""
     for error in errors:
         if error.sure and error.surface is not None:
             plot = surface_plot(session, error.surface)
@@ -23,7 +23,7 @@ def section(session: Session, errors: tuple[ModelError, ...]) -> Part | None:
 
 
 def surface_plot(session: Session, surface: BedSurface) -> Plot:
-    """A map of the bed: a mark at each point that was probed, in the colour of its height."""
+    """Map of the bed: a marker at each probed point, coloured by its height."""
     x, y, height, sigma = (
         np.round(1e3 * values, 4).tolist()
         for values in (surface.x, surface.y, surface.height, surface.sigma)
@@ -59,7 +59,7 @@ def surface_plot(session: Session, surface: BedSurface) -> Plot:
         "surface",
         "How uneven the bed is",
         "Heights of the points that were probed above their mean, as smooth as the data show them"
-        " to be. What the machine bends as well is not told apart from the bed; that is in the"
+        " to be. A bending of the machine is not distinguished from the bed's; that is in the"
         " standard deviations. Point at a mark for its number.",
         "A map of the bed, coloured by height.",
         {"data": [trace], "layout": layout, "config": {}},

@@ -1,4 +1,4 @@
-"""What a calibration found, as an outcome: its verdict, main numbers, and the report's parts."""
+"""Calibration as an outcome: its verdict, main numbers, and the parts of the report."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ if TYPE_CHECKING:
 
 
 def outcome_of(calibration: Calibration) -> Outcome:
-    """Everything that `pkmcal calibrate` tells and writes."""
+    """Outcome of `pkmcal calibrate`, with the texts of its files."""
     c, held_out, over = calibration, _held_out(calibration), _tool_map(calibration)
-    in_view = digests(c.session)
-    report = report_of(c, held_out, over, session_digest(c.session, in_view))
+    file_digests = digests(c.session)
+    report = report_of(c, held_out, over, session_digest(c.session, file_digests))
     open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         report,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, calibration_document(c, open_, predicted, over, in_view)),
+        texts=texts_of(c, calibration_document(c, open_, predicted, over, file_digests)),
         summary={
             "verdict": c.verdict.document(),
             **(report.summary or {}),
@@ -78,8 +78,8 @@ def outcome_of(calibration: Calibration) -> Outcome:
 
 
 def _held_out(calibration: Calibration) -> HoldOut | None:
-    """What the estimate predicts of what was held out, where that was asked for."""
-    if calibration.holdout is None:  # as a rule, and what judges others' data takes a while to load
+    """Comparison of the estimate with the holdout, None without one."""
+    if calibration.holdout is None:  # the usual case; the import below is slow
         return None
     from pkmcal.judge.holdouts import holdout_of
 
@@ -87,7 +87,7 @@ def _held_out(calibration: Calibration) -> HoldOut | None:
 
 
 def _tool_map(calibration: Calibration) -> ToolMap | str:
-    """The tool over the workspace, or the sentence that says why there is no map."""
+    """Tool error over the workspace, or the sentence on why there is no map."""
     try:
         return toolmap.of_calibration(calibration)
     except PkmcalError as error:
@@ -95,16 +95,16 @@ def _tool_map(calibration: Calibration) -> ToolMap | str:
 
 
 def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -> Path | None:
-    """Write a calibration's three files into `folder`, whole or not at all.
+    """Write a calibration's three files into ``folder``, all or none.
 
-    An earlier result in it is kept beside it, under its date, in the folder that is returned;
-    ``force`` replaces it. Raises InputError where the folder holds anything else.
+    An earlier result there is moved beside it, into a folder with its date, which is returned;
+    ``force`` replaces it. Raises InputError if the folder holds anything else.
     """
     folder = Path(folder)
     check_output(folder, force=force)
     outcome = outcome_of(calibration)
     texts = {CALIBRATION_REPORT_FILE: page.page_html(outcome, datetime.now()), **outcome.texts}
-    with output_lock(folder):  # another process may have written there meanwhile
+    with output_lock(folder):  # another process may have written into it since the first check
         over = check_output(folder, force=force)
         archive_folder = None if force else keep_earlier(folder, outcome.texts)
         write_folder(folder, texts, over)
@@ -117,10 +117,11 @@ def report_of(
     over: ToolMap | str | None = None,
     digest: str = "",
 ) -> Outcome:
-    """The verdict, cards and parts.
+    """Outcome with verdict, cards and parts.
 
-    holdout : what the estimate predicts of configurations that it did not see. over : the tool over
-    the workspace, or why there is no map of it. digest : of the session.
+    holdout : prediction of configurations that the estimate did not use; None for none.
+    over : tool error over the workspace, or the reason why there is no map; None for no section.
+    digest : digest of the session.
     """
     c, session, observation = calibration, calibration.session, calibration.observation
     estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
@@ -174,9 +175,11 @@ def report_of(
 def calibration_cards(
     calibration: Calibration, centres: tuple[Centres, ...], tool: ToolError
 ) -> tuple[Figure, ...]:
-    """The cards in their order; those that have nothing to tell are left out."""
+    """Cards in their order; those without data are left out."""
     session, observation = calibration.session, calibration.observation
-    estimate, flatness = calibration.estimate, calibration.findings.bed  # of heights alone
+    # the flatness exists for sessions of heights only
+    estimate, flatness = calibration.estimate, calibration.findings.bed
+    # joint centres: standard deviation, and distance from the nominal model, mm
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(
@@ -193,8 +196,8 @@ def calibration_cards(
         "mean distance of the joint centres, drawing and result laid over each other; largest "
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
-    value = (
-        _flat(flatness, tool) if flatness else None,
+    cards = (
+        _flatness(flatness, tool) if flatness else None,
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
         shifted,
@@ -202,13 +205,16 @@ def calibration_cards(
         _data(session, observation, estimate, _links(calibration)),
         _fit(session, estimate),
     )
-    return tuple(card for card in value if card)
+    return tuple(card for card in cards if card)
 
 
 def calibration_numbers(
     observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolError
 ) -> dict[str, Any]:
-    """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
+    """Main numbers in m and rad, for the summary of ``--json``.
+
+    Means over joint centres and configurations; sigma is that of one coordinate.
+    """
     statistics, table = estimate.statistics, estimate.machine.parameters
     offsets = np.sqrt(np.diag(estimate.covariance)[table.of_kind("offset")])
     sigma = np.concatenate([side.sigma for side in centres])
@@ -230,13 +236,13 @@ def calibration_numbers(
 
 
 def _mean(values: Array) -> float | None:
-    """Of the finite ones."""
+    """Mean of the finite values, None without any."""
     values = values[np.isfinite(values)]
     return float(values.mean()) if values.size else None
 
 
 def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
-    """Uncertainty of the platform's pose from that of the geometry."""
+    """Card on the standard deviation of the platform's pose that follows from the geometry's."""
     if not tool.position.size:
         return None
     used = np.flatnonzero(estimate.configurations)
@@ -246,15 +252,19 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
         _pose_values(tool.position.mean(), tool.orientation.mean()),
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
         f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
-        f"{_turned(float(tool.orientation.max()))}",
+        f"{_turn_text(float(tool.orientation.max()))}",
     )
 
 
-def _flat(bed: Bed, tool: ToolError) -> Figure:
-    """What heights are good for, and how the drawing bent the bed."""
-    there = tool.T_base_platform[:, :2, 3]
+def _flatness(bed: Bed, tool: ToolError) -> Figure:
+    """Card on the flatness of a probed bed.
+
+    The expected sigma of the tool's height, and how the nominal model bent the bed.
+    """
+    xy = tool.T_base_platform[:, :2, 3]
     finite = np.isfinite(tool.off_position)
-    plane = np.column_stack([np.ones(int(finite.sum())), there[finite]])
+    # error of the nominal model in z, without the plane that only tilts and lifts the bed
+    plane = np.column_stack([np.ones(int(finite.sum())), xy[finite]])
     off = tool.off[finite, 5]
     bent = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
     return Figure(
@@ -268,7 +278,7 @@ def _flat(bed: Bed, tool: ToolError) -> Figure:
 
 
 def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
-    """What the drawing's errors did to the platform's pose."""
+    """Card on the errors that the nominal model caused in the platform's pose."""
     good = np.isfinite(tool.off_position)
     if not good.any():
         return None
@@ -279,20 +289,21 @@ def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figur
         "What did the drawing do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),
         "mean error of the drawing's pose at the same readings; worst "
-        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turned(float(turn.max()))}",
+        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turn_text(float(turn.max()))}",
     )
 
 
 def _links(calibration: Calibration) -> tuple[LinkSet, ...]:
-    """What links configurations in the estimate, by kind."""
+    """Links between configurations in the estimate, by kind."""
     return calibration.measurements.links if calibration.session.links else ()
 
 
 def _data(
     session: Session, observation: Observation, estimate: Estimate, links: Sequence[LinkSet]
 ) -> Figure:
-    """Photographs and edges, used and not; of a session without any, the trackers' poses, or the
-    readings alone.
+    """Card on the data: images and edges, used and unused.
+
+    Without images the trackers' poses and links; without these the readings alone.
     """
     taken = session.images_taken
     if not session.station_names and not session.links:
@@ -303,6 +314,7 @@ def _data(
             f"{session.machine.redundancy} more than the machine has freedoms; nothing else was"
             " measured",
         )
+    # without images: poses and links
     if not taken:
         weights = np.concatenate([estimate.pose_weights, estimate.link_weights])
         quiet, n = int(np.sum(weights < INLIER_WEIGHT)), len(weights)
@@ -315,7 +327,7 @@ def _data(
         )
     used = sum(provenance.used_photographs(session, observation, estimate))
     coarse = int(observation.edges.coarse.sum())
-    beside = f" and {coarse} told by silhouettes" if coarse else ""
+    beside = f" and {coarse} from silhouettes" if coarse else ""
     parts = [
         f"{count(n, thing)} measured{more}, {int(np.sum(weights < INLIER_WEIGHT))} of"
         " them given less than half their weight"
@@ -336,7 +348,7 @@ def _data(
 
 
 def _fit(session: Session, estimate: Estimate) -> Figure:
-    """Chi-square per degree of freedom, of the noise as stated."""
+    """Card on chi-square per degree of freedom, by the noise as stated."""
     s = estimate.statistics
     scaled = [
         f"the {what}' stated noise was multiplied by {number(scale, 2)}"
@@ -352,7 +364,7 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
         return Figure(
             "Does the model explain the data?",
             (("–", "χ² per degree of freedom"),),
-            "as many unknowns as measurements: nothing is left over that could tell",
+            "as many unknowns as measurements: nothing is left over for a test",
         )
     value = s.chi2 / s.dof
     return Figure(
@@ -364,16 +376,20 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
 
 
 def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
+    """Position, and orientation unless the platform does not turn, with units."""
     turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > NO_TURN else ()
     return ((brief(position * 1e3), "mm"), *turn)
 
 
-def _turned(orientation: float) -> str:
-    """A turn (rad) as a further part; nothing of a platform that only shifts."""
+def _turn_text(orientation: float) -> str:
+    """Orientation (rad) as the rest of a sentence; empty for a platform that does not turn."""
     return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
 
 
 def _centre_name(centres: tuple[Centres, ...], position: int) -> str:
-    """``leg 3, platform`` of a position in the list of all base, then all platform centres."""
+    """Name, as ``leg 3, platform``, of an index into the centres.
+
+    All base centres come first, then all platform centres.
+    """
     legs = len(centres[0].calibrated)
     return f"leg {position % legs + 1}, {centres[position // legs].side}"

@@ -1,4 +1,4 @@
-"""What a camera's calibration found, as an outcome: intrinsics, corners over photographs, field."""
+"""Camera calibration as an outcome: intrinsics, corners in the images, residuals over the field."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
-"""Length of a large residual's arrow as a share of the picture's width."""
+"""Length of a large residual's arrow, in image widths."""
 ANGLE_STEP = 5.0
-"""degrees of the angle from the axis that one bar of the histogram holds."""
+"""Width of a bar in the histogram of angles from the axis, degrees."""
 FIELD_CELLS = (16, 12)
 INTRINSIC_UNITS = {"focal": "px", "center": "px"}
 INTRINSIC_WORDS = {
@@ -38,11 +38,11 @@ CAMERA_MODELS_TEXT = (
     " parameters among equals."
 )
 CAMERA_SIGMA_TEXT = (
-    "The standard deviations say how much the intrinsics would scatter if other photographs of this"
-    " kind were taken. They hold the noise of the corners and the views' disagreement beyond it."
-    " They know nothing of what all photographs share: a board whose squares are not as long as its"
-    " file says leaves the intrinsics alone and scales every distance; a focus that moves"
-    " afterwards makes it another camera."
+    "The standard deviations are those with which the intrinsics would scatter if other"
+    " photographs of this kind were taken. They hold the noise of the corners and the views'"
+    " disagreement beyond it. They do not contain what all photographs share: a board whose"
+    " squares are not as long as its file says leaves the intrinsics alone and scales every"
+    " distance; a focus that moves afterwards makes it another camera."
 )
 
 
@@ -51,17 +51,17 @@ def outcome_of(
     paths: Sequence[Path | str] = (),
     others: Sequence[tuple[str, str]] = (),
 ) -> Outcome:
-    """Everything that `pkmcal camera` tells and writes.
+    """Outcome of `pkmcal camera`.
 
-    paths : the photographs, to show them; by name. others : other programs' camera files, names
-    and forms.
+    paths : image files to be shown; matched by name.
+    others : names and formats of camera files for other programs.
     """
     c = calibration
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
     factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
-    hardly = f"Hardly told apart, and so to be used together only: {together}."
-    # with its covariance, so that `calibrate --refine-camera` knows how far to move it
+    hardly = f"Hardly distinguished, and so to be used together only: {together}."
+    # with its covariance, which is the prior of `calibrate --refine-camera`
     measured = replace(c.camera, covariance=c.covariance)
     return Outcome(
         command="camera",
@@ -92,7 +92,7 @@ def outcome_of(
                 "Photographs",
                 html=page.filled_template(
                     "corners.html.j2",
-                    pictures=_photographs(c, [Path(path) for path in paths], factor),
+                    pictures=_images(c, [Path(path) for path in paths], factor),
                     factor=factor,
                     missed=[d for d in c.detections if not d.success],
                 ),
@@ -108,7 +108,7 @@ def outcome_of(
 
 
 def camera_headline(c: CameraCalibration) -> str:
-    """The result in one sentence."""
+    """Result in one sentence."""
     focal, sigma = c.camera.parameters[:2].mean(), c.sigma[:2].mean()
     kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
     return (
@@ -118,7 +118,7 @@ def camera_headline(c: CameraCalibration) -> str:
 
 
 def _intrinsics(c: CameraCalibration) -> Table:
-    """The intrinsics with two digits of their sigma."""
+    """Table of the intrinsics, with two digits of their sigma."""
     rows: list[Row] = []
     values = zip(
         c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
@@ -126,16 +126,17 @@ def _intrinsics(c: CameraCalibration) -> Table:
     for name, value, sigma in values:
         unit = INTRINSIC_UNITS.get(name.partition(".")[0], "")
         places = decimals(sigma)
-        display = (
+        cells = (
             (number(value, places), number(sigma, places))
             if sigma > 0
             else (f"{value:g}", "not estimated")
         )
-        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*display, unit)))
+        rows.append(Row(INTRINSIC_WORDS.get(name, name), (*cells, unit)))
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
 
 
 def _compared(c: CameraCalibration) -> Table:
+    """Table of the compared models."""
     rows = [
         Row(
             one.model,
@@ -154,6 +155,7 @@ def _compared(c: CameraCalibration) -> Table:
 
 
 def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
+    """Main numbers."""
     share = float(np.max(c.sigma[:2] / c.camera.parameters[:2])) * 100
     tilt = tilts(c.T_camera_board, c.board.points)
     covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
@@ -184,15 +186,15 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
-            f"{count(finite, 'corner')}, {finite - int(c.inliers.sum())} of them put aside",
+            f"{count(finite, 'corner')}, {finite - int(c.inliers.sum())} of them rejected",
         ),
         Figure(
             "How different are the views?",
             ((f"{tilt.min():.0f} to {tilt.max():.0f}", "°"),),
-            "tilt of the board from facing the camera; 20 to 45° to all sides tell most",
+            "tilt of the board from facing the camera; 20 to 45° to all sides are best",
         ),
         Figure(
-            "How much of the picture was tested?",
+            "How much of the image was tested?",
             ((f"{covered:.0f}", "%"),),
             f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners;"
             " elsewhere the lens is extrapolated",
@@ -200,17 +202,17 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
-    """All views, each by its file's name."""
+def _images(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
+    """All views with their images, found by file name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
         jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
-        return tuple(_photograph(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+        return tuple(_image(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
 
-def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
-    """One view with the corners found in it."""
+def _image(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
+    """One view with its detected corners."""
     finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
     corners: list[Arrow] = []
     for i in finite.tolist():
@@ -223,9 +225,7 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
         dx, dy = (off * factor).tolist()
         corners.append(Arrow(x, y, dx, dy, not c.inliers[v, i], tip))
     n_rejected = sum(corner.quiet for corner in corners)
-    caption = f"{count(len(finite), 'corner')}" + (
-        f", {n_rejected} put aside" if n_rejected else ""
-    )
+    caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     caption += "" if jpeg else "; the photograph is not at hand"
     width, height = c.camera.image_size
@@ -241,13 +241,15 @@ def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Pictu
 
 
 def _field(c: CameraCalibration) -> Markup:
-    """Corners a cell, and the mean residual of cells with three or more, enlarged by a factor of
-    their own: they are smaller than single corners' residuals.
+    """Number of corners in each cell, and mean residuals of cells with three or more.
+
+    The means have an enlargement of their own, as they are smaller than single residuals.
     """
     width, height = c.camera.image_size
     columns, rows = FIELD_CELLS
     pixels, off = c.pixels[c.inliers], c.residuals[c.inliers]
     dx, dy = width / columns, height / rows
+    # cell of each corner, and number of corners in each cell
     column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
     row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
     flat = row * columns + column
@@ -258,20 +260,21 @@ def _field(c: CameraCalibration) -> Markup:
         for k, n in enumerate(counts.tolist())
         if n
     ]
+    # mean residual of cells with three or more corners, at the corners' mean
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     factor = charts.enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
-    drawn = ImageField(
+    field = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
         tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
-    return page.filled_template("field.html.j2", field=drawn, cells=cells, factor=factor)
+    return page.filled_template("field.html.j2", field=field, cells=cells, factor=factor)
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """Held-out error a view; the fit's own beside it in the tooltip."""
+    """Held-out error of each view; the fit's own error is in the tooltip."""
     squares = np.where(c.inliers, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
     fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.inliers.sum(axis=1), 1))
     middle = float(np.median(c.held_out.by_view))
@@ -291,7 +294,7 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
 
 
 def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """How far from the axis the corners lie."""
+    """Histogram of the corners' angles from the optical axis."""
     rays = c.camera.ray(c.pixels[c.inliers])
     angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
     angle = angle[np.isfinite(angle)]

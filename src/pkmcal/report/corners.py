@@ -1,4 +1,4 @@
-"""Corners of a board in photographs: found, and as the calibrated machine expects them."""
+"""Corners of a board in images: detected pixels, and those that the calibrated machine predicts."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ from pkmcal.session.load import Session
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """N corners. station, configuration : (N,). photograph : (N,) its number in the station.
-    name : (N,) number on the board. pixel : (N, 2) where found. off : (N, 2) px, found less
-    expected. used : (N,) False where the photograph's pose is not used.
+    """Corners (N of them).
+
+    station, configuration : (N,).
+    photograph : (N,) index of the image in its station.
+    name : (N,) number on the board.
+    pixel : (N, 2) detected.
+    off : (N, 2) px, detected minus predicted.
+    used : (N,) False where the board's pose in this image is not used.
     """
 
     station: Integers
@@ -34,13 +39,14 @@ class BoardCorners:
         return len(self.station)
 
     def select(self, keep: Booleans) -> BoardCorners:
-        """Those of a mask."""
+        """Corners of a mask."""
         return BoardCorners(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def board_corners(session: Session, boards: Boards, estimate: Estimate) -> BoardCorners:
-    """The corners in photographs whose platform's pose was estimated and whose board can be
-    expected in the picture.
+    """Corners of all images in which the platform's pose was estimated.
+
+    Corners without a predicted pixel are left out.
     """
     none = np.zeros(0, dtype=int)
     parts = [
@@ -56,6 +62,7 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Board
         ):
             if not item.success or not estimate.configurations[k]:
                 continue
+            # board in the camera's frame, by the estimate
             body = state.T_base_platform[k] if moves else np.eye(4)
             T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[ONLY_BOARD_MOUNT]
             points = apply(T_camera_board, size * views.board.points[item.ids])

@@ -1,4 +1,4 @@
-"""What differs between two machines, as an outcome: tables, and pictures of joints and tool."""
+"""Difference of two machines as an outcome: tables, and plots of joints and tool."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pkmcal.report.workspace import middle_and_worst
 from pkmcal.wording import DISPLAY_UNITS, brief, count, decimals, number
 
 CHANGES_ON_TERMINAL = 8
-"""Changes that a terminal shows."""
+"""Changes that a terminal lists."""
 
 
 def outcome_of(d: MachineDifference) -> Outcome:
-    """Everything that ``pkmcal diff`` tells and writes."""
+    """Outcome of ``pkmcal diff``."""
     tool = () if isinstance(d.tool, str) else (_space(d.tool),)
     text = (d.tool,) if isinstance(d.tool, str) else ()
     parts = (
@@ -42,7 +42,7 @@ def outcome_of(d: MachineDifference) -> Outcome:
         kicker=f"{d.a.name} → {d.b.name}",
         subject=f"A: {d.a.name}, a {d.a.kind}; B: {d.b.name}, a {d.b.kind}",
         verdict=d.verdict,
-        stamp="Changed" if d.changed else "Cannot be told" if refused else "No change",
+        stamp="Changed" if d.changed else "Undecided" if refused else "No change",
         level=Level.WRONG if d.changed else Level.DOUBTFUL,
         figures=_cards(d),
         parts=parts,
@@ -51,7 +51,7 @@ def outcome_of(d: MachineDifference) -> Outcome:
 
 
 def _cards(d: MachineDifference) -> tuple[Figure, ...]:
-    """The main numbers."""
+    """Main numbers."""
     out: list[Figure] = []
     if not isinstance(d.tool, str):
         off, sigma = _changes(d.tool)
@@ -87,14 +87,14 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
 
 
 def _changes(tool_map: ToolMap) -> tuple[Array, Array]:
-    """Changes and standard deviations of the tool at the evenly spread poses, mm."""
+    """Changes of the tool and their standard deviations at the evenly spread poses, mm."""
     _, after = tool_map.evenly
     finite = np.isfinite(after.off_position)
     return after.off_position[finite] * 1e3, after.position[finite] * 1e3
 
 
 def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
-    """Medians and largest of the tool's change."""
+    """Table of the median and the largest change of the tool."""
     if isinstance(d.tool, str):
         return ()
     _, after = d.tool.evenly
@@ -117,7 +117,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
 
 
 def _legs(d: MachineDifference) -> Table:
-    """How far each leg's joints moved."""
+    """Table of the distances that each leg's joints moved."""
     rows: list[Row] = []
     sides = [(np.linalg.norm(x.change, axis=-1) * 1e3, x.sigma * 1e3) for x in d.centres]
     by_chance = bool(d.change.dof)
@@ -138,7 +138,7 @@ def _legs(d: MachineDifference) -> Table:
 
 
 def _parameters(d: MachineDifference) -> tuple[Table, ...]:
-    """What changed beyond chance, for a terminal too, and all numbers."""
+    """Significant changes, short enough for a terminal, and a folded table of all parameters."""
     columns = ("Parameter", "A", "B", "change", "1σ", "chance")
     out: list[Table] = []
     if d.significant:
@@ -159,6 +159,7 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
 
 
 def _row(d: MachineDifference, k: int) -> Row:
+    """Row of a parameter."""
     table = d.a.machine.parameters
     factor, unit = DISPLAY_UNITS.get(table.units[k], (1.0, ""))
     value = float(table.unit_axes(d.a.machine.values)[k]) * factor
@@ -180,11 +181,11 @@ def _row(d: MachineDifference, k: int) -> Row:
     )
 
 
-# ------------------------------------------------------------------ pictures
+# ------------------------------------------------------------------ plots
 
 
 def _joints(d: MachineDifference) -> Plot:
-    """How far each joint moved, with the deviation of that by chance."""
+    """Bars of the distance that each joint moved, with its standard deviation."""
     legs = [f"leg {leg + 1}" for leg in range(d.a.machine.n_legs)]
     data: list[dict[str, Any]] = []
     for side, colour in zip(d.centres, ("--drawing", "--calibrated"), strict=True):
@@ -228,7 +229,7 @@ def _joints(d: MachineDifference) -> Plot:
 
 
 def _space(tool_map: ToolMap) -> Plot:
-    """The evenly spread poses, coloured by how far the tool moved there."""
+    """Plot of the evenly spread poses, coloured by the tool's change."""
     _, after = tool_map.evenly
     off, sigma = _changes(tool_map)
     hover = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]

@@ -1,13 +1,12 @@
-"""Residuals against their place in the picture: what a wrong lens leaves there has an order.
+"""Residuals over the image: a wrong camera model leaves a systematic pattern there.
 
-An edge tells nothing along itself, so a cell's mean shift is the one (least squares) that its edges
-and corners, each across its own direction, agree on best.
+An edge constrains only the direction across itself, so a cell's mean shift is the least-squares
+solution of the offsets of its edges and corners along their own directions.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,18 +32,20 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
 FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
-"""Places on an edge, in parts of its span: an edge crosses several cells."""
+"""Positions on an edge, as fractions of its span: an edge crosses several cells."""
 FIELD_CELLS_ACROSS = 14
-"""Cells across the picture."""
+"""Cells across the image."""
 FEWEST_IN_A_CELL = 5
-"""Edges and corners' coordinates from which a cell is shown."""
+"""Fewest edges and corner coordinates in a cell that is shown."""
 LEAST_WEIGHT_ACROSS = np.sin(np.deg2rad(15.0)) ** 2
-"""Part of a cell's weight that must lie across a direction for it to be shown: of edges within 15
-degrees of one another, what is left along them is their noise, enlarged four times."""
+"""Least share of a cell's information in a direction in which the shift is shown.
+
+Edges within 15 degrees of one another have no more along themselves: noise, enlarged fourfold.
+"""
 CELL_BY_CHANCE_SHARE = 0.01
-"""Share of cells that stand out by chance alone, where edges err independently."""
+"""Share of cells that are significant by chance, if edges err independently."""
 FIELD_ARROW_LENGTH = 0.06
-"""Length of a large mean shift as drawn, in picture widths."""
+"""Length of a large mean shift as drawn, in image widths."""
 FIELD_READING_TEXT = (
     "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
     " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
@@ -56,8 +57,9 @@ FIELD_READING_TEXT = (
 
 @dataclass(frozen=True)
 class ImageField:
-    """The mean residuals over one camera's picture, those within chance quiet. middle : its centre,
-    px.
+    """Mean residuals over the image of a camera; insignificant ones are quiet.
+
+    middle : principal point, px.
     """
 
     title: str
@@ -69,8 +71,13 @@ class ImageField:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Residuals in pictures: (n,) px along unit directions (n, 2) at pixels (n, 2), with what they
-    are of: station, configuration, and a number for each edge or corner, (n,).
+    """Residuals in images, (n,) each.
+
+    station, configuration : indices.
+    thing : number of the edge or corner.
+    pixel : (n, 2) position.
+    direction : (n, 2) unit vectors.
+    value : px along the direction.
     """
 
     station: Integers
@@ -81,7 +88,7 @@ class Offsets:
     value: Array
 
     def select(self, keep: Booleans) -> Offsets:
-        """Those of a mask."""
+        """Offsets of a mask."""
         return Offsets(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
 
@@ -92,24 +99,25 @@ def section(
     corners: BoardCorners,
     links: Links,
 ) -> Part | None:
-    """The section; None without anything seen."""
-    value = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
-    if not value:
+    """Section of the report; None without residuals."""
+    result = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
+    if not result:
         return None
-    display, factor, longest = value
+    image_fields, factor, longest = result
     text = (
         f"{FIELD_READING_TEXT} Drawn {factor:g} times as long as they are; the longest is"
         f" {brief(longest)} px."
     )
-    html = page.filled_template("fields.html.j2", fields=display)
+    html = page.filled_template("fields.html.j2", fields=image_fields)
     return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
 
 
 def field_offsets(
     session: Session, edges: EdgeSet, estimate: Estimate, corners: BoardCorners
 ) -> Offsets:
-    """Of the edges in use, at several places of each, the camera's constant shift taken out, and of
-    the corners in use, in x and y.
+    """Offsets of the inlying edges, at several places of each, and of the used corners in x and y.
+
+    The camera's estimated edge shift is subtracted.
     """
     parts = [
         _of_edges(session, edges, estimate, s)
@@ -127,19 +135,20 @@ def field_offsets(
         )
         for axis in (0, 1)
     ]
-    values = Offsets(
+    offsets = Offsets(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Offsets))
     )
-    finite = np.isfinite(values.value) & np.isfinite(values.pixel).all(axis=-1)
-    return values.select(np.asarray(finite))
+    finite = np.isfinite(offsets.value) & np.isfinite(offsets.pixel).all(axis=-1)
+    return offsets.select(np.asarray(finite))
 
 
 def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
-    """Of one station's edges."""
+    """Offsets of one station's edges."""
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
     mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
     rows, photograph = np.unique(some.configuration, return_inverse=True)
+    # predicted edges with the estimated edge shift, from which measured ones are offset
     legs = legs_in_camera(
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
@@ -167,8 +176,9 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
 def fields(
     session: Session, value: Offsets, links: Links
 ) -> tuple[tuple[ImageField, ...], float, float] | None:
-    """A field for each station, hand-held photographs of one camera together; the factor by which
-    all arrows are enlarged, and the longest of them, px. None without any cell.
+    """Field of each station, with the arrows' enlargement and the longest arrow, px.
+
+    Hand-held images of one camera share a field. None without a cell.
     """
     entries = [station.entry or station.name for station in session.stations]
     arrows: list[tuple[str, int, list[Arrow]]] = []
@@ -184,42 +194,33 @@ def fields(
     lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in arrows for cell in cells])
     width = max(session.stations[s].camera.image_size[0] for _, s, _ in arrows)
     factor = enlargement(lengths, FIELD_ARROW_LENGTH * width)
-    return (
-        tuple(_field(session, entry, s, cells, factor) for entry, s, cells in arrows),
-        factor,
-        float(lengths.max()),
-    )
-
-
-def _field(
-    session: Session, entry: str, s: int, cells: Sequence[Arrow], factor: float
-) -> ImageField:
-    camera = session.stations[s].camera
-    values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
-    return ImageField(
-        entry,
-        *camera.image_size,
-        (values["center.x"], values["center.y"]),
-        tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells),
-    )
+    out: list[ImageField] = []
+    for entry, s, cells in arrows:
+        camera = session.stations[s].camera
+        intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+        middle = intrinsics["center.x"], intrinsics["center.y"]
+        enlarged = tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells)
+        out.append(ImageField(entry, *camera.image_size, middle, enlarged))
+    return tuple(out), factor, float(lengths.max())
 
 
 def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
-    """The mean shifts of the cells of one picture that hold enough, px."""
+    """Mean shifts, px, of the image's cells with enough data."""
     from scipy.special import fdtrc
 
     side = size[0] / FIELD_CELLS_ACROSS
     inside = np.all((result.pixel > -0.5) & (result.pixel < np.array(size) - 0.5), axis=1)
     some = result.select(np.asarray(inside))
+    # cell of each offset
     at = np.floor((some.pixel + 0.5) / side).astype(int)
-    # an edge counts once in a cell: its places there are one measurement; a corner twice
+    # places of one edge in a cell are one measurement, corners are two
     steep = np.abs(some.direction).argmax(axis=1)
     keys = np.column_stack([at[:, 1] * FIELD_CELLS_ACROSS + at[:, 0], some.thing, steep])
-    each, first, one = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    one, direction = one.reshape(-1), some.direction[first]
-    same = np.sign(dot(some.direction, direction[one]))
-    value = np.bincount(one, same * some.value) / np.bincount(one)
-    cells, number_of = np.unique(each[:, 0], return_inverse=True)
+    distinct, first, measurement = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    measurement, direction = measurement.reshape(-1), some.direction[first]
+    sign = np.sign(dot(some.direction, direction[measurement]))
+    value = np.bincount(measurement, sign * some.value) / np.bincount(measurement)
+    cells, number_of = np.unique(distinct[:, 0], return_inverse=True)
     n = np.bincount(number_of)
 
     def total(values: Array) -> Array:
@@ -227,6 +228,8 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
         np.add.at(out, number_of, values)
         return out
 
+    # per cell: least squares for the shift s in sum (d d^T) s = sum d value, restricted to
+    # well-determined directions
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
     above_limit = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
@@ -238,7 +241,10 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     rank = above_limit.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
     residual = np.maximum(total(value**2) - explained, 1e-300)
-    loud = fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
+    # F-test of the shift against the scatter about it
+    significant = (
+        fdtrc(rank, freedom, explained / rank / (residual / freedom)) < CELL_BY_CHANCE_SHARE
+    )
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5
@@ -253,5 +259,5 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
         )
         size_of = np.abs(value[number_of == c])
         lead = links.to_largest(some.station[here], some.configuration[here], size_of)
-        out.append(Arrow(x, y, right, down, not loud[c], tip, lead))
+        out.append(Arrow(x, y, right, down, not significant[c], tip, lead))
     return out

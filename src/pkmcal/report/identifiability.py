@@ -1,4 +1,4 @@
-"""What the data can tell of the machine: the rank, its words, and the paper's counts."""
+"""Report section on what the data determine: rank and unidentifiable directions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
 
 LEAST_BAR_INFORMATION = 1e-3
-"""Information below which a bar is a stub only: the drawing knows a thousand times more."""
+"""Information below which a bar is only a stub: the nominal model knows a thousand times more."""
 STUB_BAR_HEIGHT = 0.06
-"""Height of such a bar, in decades: seen, and not mistaken for a value."""
+"""Height of a stub, in decades: visible, but not to be read as a value."""
 MOST_NAMES_LISTED = 6
 
 
 def section(findings: Findings, table: ParameterTable) -> Part:
-    """The section of the findings of a machine with these parameters."""
+    """Section on the findings of a machine with these parameters."""
     html = page.filled_template(
         "identifiability.html.j2",
         headline=directions_headline(findings),
@@ -31,11 +31,11 @@ def section(findings: Findings, table: ParameterTable) -> Part:
         tied=tied(table),
         spectrum=spectrum(findings),
     )
-    return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
+    return Part("identifiability", "What the data determine", html=html, menu="Identifiability")
 
 
 def directions_headline(findings: Findings) -> str:
-    """How many of the directions that exist the data fix."""
+    """Number of directions that the data determine, in sentences."""
     ranks = findings.identifiability
     possible = ranks.n_parameters - ranks.n_frames
     frames = f"{ranks.n_parameters} free values less {ranks.n_frames} that only place the frames"
@@ -52,31 +52,29 @@ def directions_headline(findings: Findings) -> str:
 
 
 def spectrum(findings: Findings) -> BarChart | None:
-    """Bars of all directions, best known first, on a logarithmic scale from
-    ``LEAST_BAR_INFORMATION``.
-    """
-    values = np.asarray(findings.identifiability.singular_values, dtype=float)
-    if values.size == 0:
+    """Bars of the information in all directions, best known first, on a logarithmic scale."""
+    information = np.asarray(findings.identifiability.singular_values, dtype=float)
+    if information.size == 0:
         return None
     decades = math.log10(1 / LEAST_BAR_INFORMATION)
     heights = np.maximum(
-        np.log10(np.maximum(values, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
+        np.log10(np.maximum(information, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
     )
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
         UprightBar(
             str(k + 1),
-            f"Direction {k + 1}: {reference_values}",
+            f"Direction {k + 1}: {words}",
             float(height),
-            quiet=bool(value >= 1),
+            quiet=bool(ratio >= 1),
         )
-        for k, (value, height) in enumerate(zip(values, heights, strict=True))
-        for reference_values in [
-            "the data say nothing"
+        for k, (ratio, height) in enumerate(zip(information, heights, strict=True))
+        for words in [
+            "the data do not determine it"
             if k >= findings.identifiability.rank
-            else f"the drawing knows it {brief(1 / value)} times better"
-            if value < 1
-            else f"the data know it {brief(value)} times better than the drawing"
+            else f"the drawing knows it {brief(1 / ratio)} times better"
+            if ratio < 1
+            else f"the data know it {brief(ratio)} times better than the drawing"
         ]
     )
     tops = range(math.floor(high) + 1)
@@ -96,14 +94,14 @@ def spectrum(findings: Findings) -> BarChart | None:
 
 
 def _power(exponent: int) -> str:
-    """``1``, ``10``, ``1000``, ``10⁻²``: plain numbers as far as they are short."""
+    """Power of ten: ``1``, ``10``, ``1000`` in full, others as ``10⁻²``."""
     if 0 <= exponent <= 3:
         return str(10**exponent)
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def held_text(findings: Findings, table: ParameterTable) -> str:
-    """What the mechanism file holds, in a sentence; empty where it holds nothing."""
+    """Sentences on the parameters that the mechanism file fixes; empty without any."""
     if not table.fixed:
         return ""
     names = [name for name in table.fixed if name in findings.conventional]
@@ -113,7 +111,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
             f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
             " under fixed, so the drawing's value counts as exact and no direction belongs to it."
         )
-    # some of what is held only chooses frames, or repeats what is free
+    # some fixed parameters only choose frames, or repeat free ones
     others = [name for name in table.fixed if name not in names]
     parts: list[str] = []
     if names:
@@ -144,8 +142,8 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
 
 
 def tied(table: ParameterTable) -> str:
-    """What changes together, in a sentence; empty where nothing does."""
-    groups = [names for names in _together(table) if not names & set(table.fixed)]
+    """Sentence on tied parameters; empty without any."""
+    groups = [names for names in _tie_groups(table) if not names & set(table.fixed)]
     if not groups:
         return ""
     against = {name for names in table.opposed for name in names}
@@ -158,8 +156,8 @@ def tied(table: ParameterTable) -> str:
     return f"Changes together, as one value: {'; '.join(text)}{more}."
 
 
-def _together(table: ParameterTable) -> list[set[str]]:
-    """Ties, where those that share a name are one."""
+def _tie_groups(table: ParameterTable) -> list[set[str]]:
+    """Groups of tied parameters; ties that share a name are merged."""
     out: list[set[str]] = []
     for names in table.tied:
         touching = [group for group in out if group & set(names)]
@@ -169,6 +167,7 @@ def _together(table: ParameterTable) -> list[set[str]]:
 
 
 def _listed(table: ParameterTable, names: tuple[str, ...]) -> str:
+    """Names in words, at most ``MOST_NAMES_LISTED`` of them."""
     groups = grouped(table, names)
     words = groups[:MOST_NAMES_LISTED]
     if len(groups) > MOST_NAMES_LISTED:

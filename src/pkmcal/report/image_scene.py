@@ -1,7 +1,7 @@
-"""The calibrated machine as it was photographed, in space: cameras, tubes, and a slider of poses.
+"""Calibrated machine in space with its cameras, tubes, and a slider through the measured poses.
 
-A Plotly figure, true to scale, whose lengths are millimetres. What moves with the pose comes first,
-so that the animation's frames name it by its place.
+A Plotly figure, true to scale, in millimetres. Moving traces come first, so that the animation's
+frames refer to them by index.
 """
 
 from __future__ import annotations
@@ -24,17 +24,21 @@ from pkmcal.wording import count
 MOST_SLIDER_POSES = 90
 """Poses of the slider; more would make the page large and the slider too fine for a finger."""
 TUBE_RING_CORNERS = 10
-"""Corners of a tube's cross-section as drawn."""
+"""Corners of a drawn tube's cross-section."""
 FRUSTUM_DEPTH_SHARE, LEAST_FRUSTUM_DEPTH = 0.18, 0.1
-"""Depth of a camera's frustum, in distances of the camera from the machine's middle, and at least,
-in sizes of the machine."""
+"""Depth of a camera's frustum, in distances between camera and machine, and least depth.
+
+The least depth is in sizes of the machine.
+"""
 MOST_CAMERAS_NAMED = 12
-"""Cameras up to which each has its name beside it."""
+"""Most cameras that have their names beside them."""
 
 
 class PosedLimbs(NamedTuple):
-    """All legs in K poses: ends a, b (K, L, 3) on base and platform, and what carries a, L arrays
-    (K, k, 3); m, base frame.
+    """Legs in K poses, base frame, m.
+
+    a, b : (K, L, 3) ends on base and platform.
+    arms : arrays (K, k, 3), points from the carrier to each leg's end a.
     """
 
     a: Array
@@ -43,7 +47,7 @@ class PosedLimbs(NamedTuple):
 
 
 def posed_limbs(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLimbs:
-    """At readings (K, m) and poses (K, 4, 4)."""
+    """Legs at readings (K, m) and poses (K, 4, 4)."""
     ends = machine.ends_at(joints, T_base_platform)
     arms, shape = machine.arms_at(joints), (len(joints), machine.n_legs, 3)
     a, b = (np.broadcast_to(x, shape) for x in (ends.a, ends.b))
@@ -53,12 +57,14 @@ def posed_limbs(machine: Machine, joints: Array, T_base_platform: Array) -> Pose
 def plot(
     session: Session, estimate: Estimate, links: Links, places: tuple[Array, Integers]
 ) -> Plot | None:
-    """The figure; None where no pose was estimated. places : of measured targets (N, 3), base
-    frame, and their configurations.
+    """Figure; None if no pose was estimated.
+
+    places : measured targets (N, 3), base frame, m, and their configurations (N,).
     """
     used = np.flatnonzero(estimate.configurations)
     if not len(used):
         return None
+    # poses of the slider, evenly chosen
     some = used[
         np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST_SLIDER_POSES)).astype(int))
     ]
@@ -67,8 +73,8 @@ def plot(
     names = [session.configurations[k] for k in some]
     cameras = np.array([inverse(T)[:3, 3] for T in state.T_camera_base[: len(session.stations)]])
     frames = _frames(machine, limbs, names)
-    still = _still(session, estimate, limbs, links, places)
-    data = [*_moving(machine, frames[0]["data"]), *still]
+    still = _static_traces(session, estimate, limbs, links, places)
+    data = [*_moving_traces(machine, frames[0]["data"]), *still]
     layout = _layout(limbs, cameras.reshape(-1, 3), data, names)
     fewer = f" of {len(used)}, evenly chosen" if len(some) < len(used) else ""
     return Plot(
@@ -84,11 +90,11 @@ def plot(
     )
 
 
-# ------------------------------------------------------------------ what moves
+# ------------------------------------------------------------------ moving traces
 
 
 def _frames(machine: Machine, limbs: PosedLimbs, names: list[str]) -> tuple[dict[str, Any], ...]:
-    """One a pose: the legs' tubes, their axes, their arms, and the platform."""
+    """Frame of each pose: the legs' tubes, their axes, their arms, and the platform."""
     tubes = [_cylinders(machine, limbs, j) for j in range(machine.n_legs)]
     out: list[dict[str, Any]] = []
     for k, name in enumerate(names):
@@ -101,8 +107,8 @@ def _frames(machine: Machine, limbs: PosedLimbs, names: list[str]) -> tuple[dict
     return tuple(out)
 
 
-def _moving(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The same at first, with their looks."""
+def _moving_traces(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Traces of the first frame, with their styles."""
     out: list[dict[str, Any]] = []
     lines = (("axes of the legs", "--muted", 3), ("arms", "--ink", 7), ("platform", "--ink", 5))
     for n, trace in enumerate(first):
@@ -123,19 +129,21 @@ def _moving(machine: Machine, first: list[dict[str, Any]]) -> list[dict[str, Any
             )
         else:
             name, colour, width = lines[n - machine.n_legs]
-            passes = line(name, colour, width, (), showlegend=False)
-            out.append({**passes, **trace})
+            style = line(name, colour, width, (), showlegend=False)
+            out.append({**style, **trace})
     return out
 
 
 def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
-    """Rings of a leg's tubes in all poses, (K, 2 n TUBE_RING_CORNERS, 3) m; those beyond the leg's
-    end have no length.
+    """Rings of a leg's tubes in all poses, (K, 2 n TUBE_RING_CORNERS, 3) m.
+
+    Tubes beyond the leg's end have length 0.
     """
     a, b = limbs.a[:, leg], limbs.b[:, leg]
     length = np.linalg.norm(b - a, axis=-1)
     u = (b - a) / length[:, None]
     other = np.eye(3)[np.argmin(np.abs(u), axis=-1)]
+    # v and w span the cross-section
     v = np.cross(u, other)
     v /= np.linalg.norm(v, axis=-1, keepdims=True)
     w = np.cross(u, v)
@@ -153,28 +161,28 @@ def _cylinders(machine: Machine, limbs: PosedLimbs, leg: int) -> Array:
 
 def _faces(tubes: int) -> Integers:
     """Triangles (n, 3) between the two rings of each tube."""
-    here = np.arange(TUBE_RING_CORNERS)
-    there = (here + 1) % TUBE_RING_CORNERS
-    one = np.concatenate(
+    corner = np.arange(TUBE_RING_CORNERS)
+    following = (corner + 1) % TUBE_RING_CORNERS
+    sides = np.concatenate(
         [
-            np.column_stack([here, there, here + TUBE_RING_CORNERS]),
-            np.column_stack([there, there + TUBE_RING_CORNERS, here + TUBE_RING_CORNERS]),
+            np.column_stack([corner, following, corner + TUBE_RING_CORNERS]),
+            np.column_stack([following, following + TUBE_RING_CORNERS, corner + TUBE_RING_CORNERS]),
         ]
     )
-    return (one + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
+    return (sides + 2 * TUBE_RING_CORNERS * np.arange(tubes)[:, None, None]).reshape(-1, 3)
 
 
-# ------------------------------------------------------------------ what stands still
+# ------------------------------------------------------------------ static traces
 
 
-def _still(
+def _static_traces(
     session: Session,
     estimate: Estimate,
     limbs: PosedLimbs,
     links: Links,
     places: tuple[Array, Integers],
 ) -> list[dict[str, Any]]:
-    """The base, the cameras, the poses, and what trackers or boards measured."""
+    """Traces of base, cameras, poses, and targets measured by trackers or boards."""
     carried = np.stack([arm[0, 0] for arm in limbs.arms])
     out = [line("base", "--muted", 4, [ring(carried)], showlegend=False)]
     ends = np.concatenate([limbs.a[0], limbs.b[0]])
@@ -223,7 +231,7 @@ def _poses(
     session: Session,
     links: Links,
 ) -> dict[str, Any]:
-    """Points (N, 3), each of which leads to its configuration's photograph."""
+    """Markers at points (N, 3), each linked to its configuration's image."""
     return markers(
         name,
         points,
@@ -234,13 +242,13 @@ def _poses(
     )
 
 
-# ------------------------------------------------------------------ how it is shown
+# ------------------------------------------------------------------ layout
 
 
 def _layout(
     limbs: PosedLimbs, cameras: Array, data: list[dict[str, Any]], names: list[str]
 ) -> dict[str, Any]:
-    """Seen from between the cameras (S, 3), m, with all that is drawn in the picture."""
+    """Layout seen from between the cameras (S, 3), m, with all data in view."""
     middle = np.concatenate([limbs.a[0], limbs.b[0]]).mean(axis=0)
     layout = uncropped(data, path_between_cameras(cameras - middle))
     layout["legend"] = {"orientation": "h", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
@@ -251,7 +259,7 @@ def _layout(
 
 
 def _slider(names: list[str]) -> dict[str, Any]:
-    """A step a pose."""
+    """Slider with a step for each pose."""
     still = {"mode": "immediate", "frame": {"duration": 0, "redraw": True},
              "transition": {"duration": 0}}  # fmt: skip
     return {
@@ -273,12 +281,12 @@ def _slider(names: list[str]) -> dict[str, Any]:
 
 
 def _gapped(segments: list[Array]) -> Array:
-    """Lines (n, 3) one after the other, NaN between them, (m, 3)."""
+    """Lines (n, 3) in one array (m, 3), separated by NaN."""
     gap = np.full((1, 3), np.nan)
     return np.concatenate([np.zeros((0, 3)), *(x for s in segments for x in (s, gap))])
 
 
 def _axes(points: Array) -> dict[str, Array]:
-    """Coordinates of points (n, 3) m, mm, to a tenth."""
+    """Coordinates of points (n, 3), m, in mm with one decimal."""
     rounded = np.round(points * 1e3, 1)
     return {axis: rounded[:, c] for c, axis in enumerate("xyz")}

@@ -1,4 +1,4 @@
-"""What links two configurations in the report: a section for each kind, a row for each link."""
+"""Report sections on links between two configurations, one for each kind of link."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from pkmcal.wording import brief, capital, count, decimals, number
 
 
 def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> tuple[Part, ...]:
-    """A section for each kind. every : the links of the estimate."""
+    """Section for each kind of link.
+
+    every : links of the estimate, one set for each kind.
+    """
     out: list[Part] = []
     first = 0
     for links in every:
@@ -50,7 +53,7 @@ def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> 
 
 
 def weights(every: Sequence[LinkSet], estimate: Estimate) -> list[tuple[str, Array]]:
-    """Of each kind what one of them is called, and the weights."""
+    """For each kind the name of one link, and the weights of all."""
     out: list[tuple[str, Array]] = []
     first = 0
     for links in every:
@@ -61,7 +64,7 @@ def weights(every: Sequence[LinkSet], estimate: Estimate) -> list[tuple[str, Arr
 
 
 def _rms(values: Array) -> float:
-    """Root mean square, NaN of none."""
+    """Root mean square; NaN of an empty array."""
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
@@ -70,11 +73,11 @@ def _table(
     links: LinkSet,
     off: Array,
     white: Array,
-    retained: Booleans,
+    inliers: Booleans,
     unit: str,
     factor: float,
 ) -> Table:
-    """One row a link, those that are farthest off first."""
+    """Table of the links, largest whitened residual first."""
     rows: list[Row] = []
     for k in np.argsort(-np.abs(white), kind="stable").tolist():
         first, second = (session.configurations[c] for c in links.configuration[k])
@@ -85,7 +88,7 @@ def _table(
             number(float(links.value[k] + off[k]) * factor, digits),
             number(float(off[k]) * factor, digits),
             number(float(white[k]), 1),
-            "used" if retained[k] else "rejected",
+            "used" if inliers[k] else "rejected",
         )
         rows.append(Row(first, cells))
     values = (f"Measured, {unit}", f"Calibrated, {unit}", f"Off, {unit}")

@@ -1,4 +1,4 @@
-"""Where charts lead to: the photographs that are on the page."""
+"""Links from charts to the images on the page."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 
 Place = tuple[int, int]
-"""A photograph by the numbers of its station and configuration."""
+"""Image by the indices of its station and configuration."""
 
 
 @dataclass(frozen=True)
 class Links:
-    """Links to photographs, empty for those that are not on the page.
+    """Links to images; empty texts for images that are not on the page.
 
-    anchors : their names on the page, in its order. by_configuration : the first of each.
+    anchors : ids on the page, in its order.
+    by_configuration : id of each configuration's first image.
     """
 
     anchors: dict[Place, str] = field(default_factory=dict[Place, str])
@@ -25,16 +26,19 @@ class Links:
 
     @classmethod
     def of(cls, places: Iterable[Place]) -> Links:
-        """To photographs in the page's order."""
+        """Links to images in the page's order."""
         anchors = {(s, k): f"photograph-{s + 1}-{k + 1}" for s, k in places}
         return cls(anchors, {k: name for (_, k), name in reversed([*anchors.items()])})
 
     def to_configuration(self, k: int) -> str:
-        """The link to a configuration's first photograph."""
+        """Link to a configuration's first image."""
         return f"#{self.by_configuration[k]}" if k in self.by_configuration else ""
 
     def to_largest(self, station: Integers, configuration: Integers, size: Array) -> str:
-        """The link to the photograph of the largest of some things (n,), NaN left out."""
+        """Link to the image of the largest value.
+
+        station, configuration, size : (n,); NaN counts least.
+        """
         order = np.argsort(-np.nan_to_num(size, nan=-np.inf), kind="stable")
         places = zip(station[order].tolist(), configuration[order].tolist(), strict=True)
         return next((f"#{self.anchors[place]}" for place in places if place in self.anchors), "")

@@ -1,4 +1,4 @@
-"""The parameters: their table, what is known of them together, and in words what is open."""
+"""Report sections on the parameters: their table, their correlations, and unidentified ones."""
 
 from __future__ import annotations
 
@@ -37,22 +37,25 @@ from pkmcal.wording import (
 )
 
 TIGHT_CORRELATION = 0.95
-"""Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
+"""Correlation of two parameters above which a sentence reports it.
+
+At this value their combination is known 3.2 times better than each alone.
+"""
 MOST_TIGHT_PAIRS = 6
 MOST_CORRELATIONS = 250
-"""Parameters up to which they are shown: of more, a cell would be less than three pixels."""
+"""Most parameters in the plot of correlations; with more a cell would be below three pixels."""
 RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
 HOW_TOGETHER = (
-    "Orange: when one is larger than told, so is the other; blue: the other is smaller. Only their"
-    " sum, or difference, is as sure as the small deviations of other values suggest. In the"
-    " frames that the parameters are told in; what a frame or the file holds is left out, and of"
+    "Orange: when one is larger than stated, so is the other; blue: the other is smaller. Only"
+    " their sum, or difference, is as sure as the small deviations of other values suggest. In the"
+    " frames that the parameters refer to; what a frame or the file holds is left out, and of"
     " values that are tied one stands for all."
 )
 LATEX_SIGNS = {
     "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
     "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
 }  # fmt: skip
-"""Signs that LaTeX reads as something else, or not."""
+"""Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
     "data": "the photographs decide",
     "drawing": "the drawing decides more than the photographs",
@@ -63,10 +66,12 @@ PARAMETER_SOURCES = {
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
+    """Parameter as the table shows it; texts have meaningful digits, numbers are for sorting.
 
-    leg : from 1, None for a parameter of no leg. source : a key of ``PARAMETER_SOURCES``. share :
-    of what is known, from the data; NaN where that means nothing. note : ties, for people.
+    leg : from 1, None for parameters of no leg.
+    source : key of ``PARAMETER_SOURCES``.
+    share : share of the information that comes from the data; NaN where it is not defined.
+    note : ties, in words.
     """
 
     name: str
@@ -84,37 +89,37 @@ class ParameterRow:
 
     @property
     def source_text(self) -> str:
-        """The source in words."""
+        """Source in words."""
         return PARAMETER_SOURCES[self.source]
 
     @property
     def share_text(self) -> str:
-        """The share in percent, empty where it means nothing."""
+        """Share in percent, empty where it is not defined."""
         return percent(self.share) if np.isfinite(self.share) else ""
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """The rows of one leg (None: of the machine)."""
+    """Rows of one leg, or of the machine for leg None."""
 
     leg: int | None
     rows: tuple[ParameterRow, ...]
 
 
-def section(drawing: Machine, estimate: Estimate) -> Part:
-    """The table."""
+def section(nominal: Machine, estimate: Estimate) -> Part:
+    """Section with the table of parameters."""
     visible = estimate.edge_weights.size or estimate.pose_weights.size
     estimates = parameter_estimates(
-        drawing.values, estimate.machine, estimate.covariance, estimate.data_share
+        nominal.values, estimate.machine, estimate.covariance, estimate.data_share
     )
     groups = parameter_groups(estimates)
     html = page.filled_template(
         "parameters.html.j2",
         groups=groups,
         downloads={
-            "parameters.csv": _as_link("text/csv", parameters_csv(estimates)),
-            "parameters.tex": _as_link("application/x-tex", parameters_tex(groups)),
-            "parameters.json": _as_link(
+            "parameters.csv": _data_url("text/csv", parameters_csv(estimates)),
+            "parameters.tex": _data_url("application/x-tex", parameters_tex(groups)),
+            "parameters.json": _data_url(
                 "application/json", json_text({"parameters": estimates.records()})
             ),
         },
@@ -125,7 +130,7 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
 
 
 def parameters_csv(estimates: ParameterEstimates) -> str:
-    """The table for a spreadsheet: SI, all digits."""
+    """CSV table in SI units with all digits."""
     stream, rows = io.StringIO(), estimates.records()
     writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -134,37 +139,33 @@ def parameters_csv(estimates: ParameterEstimates) -> str:
 
 
 def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
-    """The table for a paper, as a tabular: rounded as on the page."""
+    """LaTeX tabular, rounded as on the page."""
+    signs = str.maketrans(LATEX_SIGNS)
     lines = [
         r"\begin{tabular}{rlrrrl}",
         r"Leg & Parameter & Drawing & Calibrated & $\sigma$ & Unit \\ \hline",
     ]
     for row in (row for group in groups for row in group.rows):
         cells = (str(row.leg or ""), row.label, row.drawing, row.calibrated, row.sigma, row.unit)
-        lines.append(" & ".join(map(_for_tex, cells)) + r" \\")
+        lines.append(" & ".join(cell.translate(signs) for cell in cells) + r" \\")
     return "\n".join([*lines, r"\end{tabular}"]) + "\n"
 
 
-def _for_tex(text: str) -> str:
-    for sign, command in LATEX_SIGNS.items():
-        text = text.replace(sign, command)
-    return text
-
-
-def _as_link(kind: str, text: str) -> str:
-    """Text as an address that holds it."""
+def _data_url(kind: str, text: str) -> str:
+    """Data URL of a text."""
     packed = base64.b64encode(text.encode("utf-8")).decode("ascii")
     return f"data:{kind};charset=utf-8;base64,{packed}"
 
 
 def parameter_groups(estimates: ParameterEstimates) -> tuple[ParameterGroup, ...]:
-    """All parameters, grouped by leg in the order of the file."""
+    """All parameters, grouped by leg, in the order of the file."""
     rows = [_row(estimates.table, k, one) for k, one in enumerate(estimates)]
     legs = list(dict.fromkeys(row.leg for row in rows))
     return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
 def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
+    """Row of a parameter."""
     factor, unit = DISPLAY_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
     sigma = one.sigma if one.sigma > ROUNDING_SIGMA else 0.0
     numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
@@ -187,41 +188,41 @@ def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
 
 
 def unidentified(estimate: Estimate, findings: Findings) -> tuple[str, ...]:
-    """Sentences: what the data leave open, then pairs that can hardly be told apart."""
+    """Sentences on unidentifiable and weakly determined directions, then on correlated pairs."""
     out = (f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak))
     return (*out, *bound_together(estimate, findings))
 
 
 def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
-    """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
+    """Sentences on tightly correlated pairs.
+
+    Pairs that a finding already names together are left out.
+    """
     table = estimate.machine.parameters
     names = table.names
-    results = () if findings is None else findings.unidentified
-    text = [{_whole_axis(name) for name in s.parameters} for s in results]
+    unidentified_directions = () if findings is None else findings.unidentified
+    named_together = [{_whole_axis(name) for name in s.parameters} for s in unidentified_directions]
     pairs = [
         (names[i], names[j], rho)
         for i, j, rho in tight_pairs(estimate)
-        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in text)
+        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in named_together)
     ]
-    return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_TIGHT_PAIRS])
+    return tuple(
+        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
+        f"{number(rho, 3)}): their {'difference' if rho > 0 else 'sum'} is known far better than"
+        " each alone."
+        for first, second, rho in pairs[:MOST_TIGHT_PAIRS]
+    )
 
 
 def _whole_axis(name: str) -> str:
-    """The axis that a parameter is a component of, elsewhere the parameter itself."""
+    """Axis of which a parameter is a component; other parameters unchanged."""
     whole = name.rpartition(".")[0]
     return whole if whole.endswith("axis") else name
 
 
-def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
-    what = "difference" if rho > 0 else "sum"
-    return (
-        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
-        f"{number(rho, 3)}): their {what} is known far better than each alone."
-    )
-
-
 def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
-    """Names in words, one entry for what three legs or more have: ``hinge y of legs 1 to 4``."""
+    """Names in words, with a common entry for three or more legs: ``hinge y of legs 1 to 4``."""
     legs: dict[str, list[int]] = {}
     for name in names:
         leg, path = split_name(name)
@@ -239,15 +240,15 @@ def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
 
 
 def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
-    """Parameters (n,) that have a deviation of their own, their correlations (n, n), and which
-    pairs (n, n) say something: each once, i < j.
+    """Free parameters (n,), their correlations (n, n), and a mask (n, n) of the pairs that matter.
 
-    Of a tie, which is one parameter under several names, the first stands for all; that an axis has
-    unit length says nothing of what its components are bound to.
+    The mask has each pair once, i < j. Of tied parameters the first stands for all; correlations
+    among the components of one axis are excluded, since its unit length implies them.
     """
     table, sigma = estimate.machine.parameters, np.sqrt(np.diag(estimate.covariance).clip(0))
     again = {name for group in table.tied for name in group[1:]}
     own = np.array([name not in again for name in table.names], dtype=bool)
+    # parameters with a standard deviation, the first of each tie
     free = np.flatnonzero((sigma > ROUNDING_SIGMA) & own)
     rho = estimate.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     whole = np.array([_whole_axis(table.names[k]) for k in free])
@@ -255,7 +256,7 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
 
 
 def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
-    """Pairs of parameters (i, j, correlation) beyond ``TIGHT_CORRELATION``, the tightest first."""
+    """Pairs of parameters (i, j, correlation) above ``TIGHT_CORRELATION``, the tightest first."""
     free, rho, pairs = correlations(estimate)
     i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT_CORRELATION))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
@@ -263,25 +264,25 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
 
 
 def correlations_part(estimate: Estimate) -> Part | None:
-    """What is known together; None where nothing was estimated, or too much to be drawn."""
+    """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
     table = estimate.machine.parameters
-    display, rho, pairs = correlations(estimate)
-    if not 1 < len(display) <= MOST_CORRELATIONS:
+    free, rho, pairs = correlations(estimate)
+    if not 1 < len(free) <= MOST_CORRELATIONS:
         return None
-    names = [table.in_words(table.names[k]) for k in display]
+    names = [table.in_words(table.names[k]) for k in free]
     off = np.abs(rho) * pairs
     a, b = np.unravel_index(np.argmax(off), off.shape)
     text = (
         f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
         f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
     ).replace("-", "−")
-    if np.count_nonzero(pairs) < len(display) * (len(display) - 1) // 2:
+    if np.count_nonzero(pairs) < len(free) * (len(free) - 1) // 2:
         text += " Components of one axis, which its length binds, are not counted."
     plot = Plot(
         "correlations",
         "Correlations of the parameters",
         "Point at a cell for its two parameters.",
-        f"A square of {len(display)} by {len(display)} cells, coloured by the correlation of two"
+        f"A square of {len(free)} by {len(free)} cells, coloured by the correlation of two"
         " parameters each.",
         _heat_map(rho, names),
         height=600,
@@ -297,8 +298,7 @@ def correlations_part(estimate: Estimate) -> Part | None:
 
 
 def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
-    """The heat map."""
-    # where the first of a leg's, or of a kind, stands
+    """Heat map of correlations."""
     common = {
         **COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "ticks": "",
         "tickfont": {"size": 9}, "automargin": True, "constrain": "domain",

@@ -1,4 +1,4 @@
-"""Photographs with what was found in them drawn over, [B] Figs. 6 and 8."""
+"""Images with the measured edges and corners drawn over them, as in [B] Figs. 6 and 8."""
 
 from __future__ import annotations
 
@@ -43,18 +43,21 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
 MOST_PAGE_IMAGES = 400
-"""Photographs on a page: browsers take a second to lay out as many."""
+"""Images on a page: browsers take a second to lay out as many."""
 JPEG_CHARACTERS_A_PAGE = 8_000_000
-"""Characters of all their JPEGs."""
+"""Characters of all JPEGs on a page."""
 CORNER_ARROW_LENGTH = 0.03
-"""Length of a large corner's residual as drawn, in picture widths."""
+"""Length of a large corner residual as drawn, in image widths."""
 
 
 @dataclass(frozen=True)
 class Album:
-    """The photographs on the page. rejected : those that do not show where they were taken from.
-    total : how many others there are. factor : enlarges the corners' residuals. corners : of the
-    board, in all photographs.
+    """Images on the page.
+
+    rejected : images that could not be localized.
+    total : number of all other images.
+    factor : enlargement of the corners' residuals.
+    corners : corners of the board in all images.
     """
 
     pictures: tuple[Picture, ...]
@@ -66,7 +69,7 @@ class Album:
 
 
 def section(session: Session, display: Album) -> Part:
-    """The section."""
+    """Section of the report."""
     html = page.filled_template(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
@@ -80,45 +83,51 @@ def section(session: Session, display: Album) -> Part:
 
 
 def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...]) -> Album:
-    """The photographs, those in which nothing is in use first, then by their residuals, the largest
-    first, as many as there is room for. shifts : (N,) px of the edges, for tooltips.
+    """Images with their overlays, as many as there is room for.
+
+    Images without data in use come first, then those with the largest residuals.
+
+    shifts : (N,) px of the edges, for tooltips.
     """
     session, level = calibration.session, levels(calibration.observation, calibration.estimate)
+    # the first image of each configuration at each station
     every = [
         (s, photo)
         for s, station in enumerate(session.stations)
         for photo in {p.configuration: p for p in reversed(station.photographs)}.values()
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
-    images = {s: _images(session, s) for s in range(len(session.stations))} | {
+    images = {s: _decoded(station) for s, station in enumerate(session.stations)} | {
         **calibration.photographs
     }
     files = [
         (images[s], session.stations[s].photographs.index(photo))
         for s, photo in ordered[:MOST_PAGE_IMAGES]
     ]
+    # JPEGs until the budget is spent; overlays for the images that have one
     shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
-    count = _ImageOverlays(calibration, shifts, centres, chosen)
+    overlays = _ImageOverlays(calibration, shifts, centres, chosen)
     room = JPEG_CHARACTERS_A_PAGE - sum(len(small) + len(large) for small, large in shots)
     return Album(
         tuple(
-            count.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
+            overlays.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
             for place in [(s, photo.configuration)]
         ),
         tuple(_rejected(session, room)),
         len(every),
-        count.factor,
+        overlays.factor,
         links,
-        count.corners,
+        overlays.corners,
     )
 
 
 def _rejected(session: Session, room: int) -> Iterator[Picture]:
-    """Photographs without a place, each with the reason, in ``room`` characters of their JPEGs;
-    what there is no room for is named all the same.
+    """Images that could not be localized, each with the reason, in ``room`` characters of JPEGs.
+
+    Images without room are listed without their JPEG.
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.photographs]
     files = [
@@ -141,38 +150,34 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
         )
 
 
-def _images(session: Session, s: int) -> Pictures:
-    """A station's photographs, decoded when they are looked at."""
-    return _decoded(session.stations[s])
-
-
 def _decoded(station: Station) -> Pictures:
-    """The same of a station that is not in the session any more."""
+    """Images of a station that need not be in the session any more, decoded on access."""
     paths = [photo.path for photo in station.photographs]
     return Pictures(paths, station.camera.image_size, [path.name for path in paths])
 
 
 def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
-    """Root mean square of each photograph's residuals, in σ: of edges and of the board's pose.
+    """Root mean square residual of each image, in standard deviations, over edges and board poses.
 
-    By all of them alike: edges that were put aside are what a reader wants to see.
+    Unweighted: images with rejected edges are those that a reader has to see.
     """
     edges, poses = observation.edges, observation.poses
+    # mean square residual by station and configuration
     squares = np.concatenate(
         [np.sum(estimate.edge_residuals**2, axis=1), np.sum(estimate.pose_residuals**2, axis=1)]
     )
     numbers = np.concatenate([np.full(len(edges), 2.0), poses.rows])
     places = np.concatenate([np.column_stack([x.station, x.configuration]) for x in (edges, poses)])
-    each, which = np.unique(places, axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    mean = np.bincount(which, squares) / np.bincount(which, numbers)
+    each, group = np.unique(places, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    mean = np.bincount(group, squares) / np.bincount(group, numbers)
     return {(s, k): float(m) ** 0.5 for (s, k), m in zip(each.tolist(), mean, strict=True)}
 
 
 class _ImageOverlays:
-    """What is drawn over the chosen photographs, worked out for all of a station at once.
+    """Overlays of the chosen images, computed for all images of a station at once.
 
-    factor : enlarges the corners' residuals.
+    factor : enlargement of the corners' residuals.
     """
 
     def __init__(
@@ -212,19 +217,21 @@ class _ImageOverlays:
     def picture(
         self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
     ) -> Picture:
-        """One photograph with what was found in it."""
+        """Image with its overlays."""
         session = self.calibration.session
         k, station = photo.configuration, session.stations[s]
         p, c = station.photographs.index(photo), self.corners
         mine = c.select((c.station == s) & (c.photograph == p))
         width, height = station.camera.image_size
         edges, missed = self.edges[s, k], self.missed[s, k]
+        n_rejected = sum(edge.quiet for edge in edges)
+        rms = float(np.sqrt(np.mean(np.sum(mine.off**2, axis=1)))) if len(mine) else 0.0
         captions = [
-            count(len(edges), "edge") + _rejected_words(sum(e.quiet for e in edges))
+            count(len(edges), "edge") + (f", {n_rejected} of them rejected" if n_rejected else "")
             if edges
             else "",
             f"{len(missed)} not used" if missed else "",
-            f"{count(len(mine), 'corner')}, {_size(mine)}" if len(mine) else "",
+            f"{count(len(mine), 'corner')}, {brief(rms)} px off" if len(mine) else "",
             f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
             *self.reasons[s, k],
             "" if shot[0] else "the file could not be read",
@@ -245,6 +252,7 @@ class _ImageOverlays:
         )
 
     def _corner(self, corners: BoardCorners, n: int) -> Arrow:
+        """Arrow from a detected corner to its prediction."""
         (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
         tip = (
             f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
@@ -253,7 +261,7 @@ class _ImageOverlays:
         return Arrow(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
 
     def _edges(self, shifts: Array, s: int, configurations: Integers) -> None:
-        """The fitted edges of a station."""
+        """Collect the measured edges of a station."""
         edges, estimate = self.calibration.observation.edges, self.calibration.estimate
         mine = np.flatnonzero((edges.station == s) & np.isin(edges.configuration, configurations))
         curves = straightened(edge_curves(self.calibration, mine, s))
@@ -272,7 +280,7 @@ class _ImageOverlays:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
     def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
-        """Where edges should have been that were left out, each with why."""
+        """Collect predictions of rejected edges, each with the reason."""
         machine, camera = self.calibration.machine, self.calibration.session.stations[s].camera
         row = {int(k): n for n, k in enumerate(configurations)}
         some = [one for one in rejected if one.leg >= 0 and one.configuration in row]
@@ -294,52 +302,44 @@ class _ImageOverlays:
                     self.missed[s, one.configuration].append(drawn)
 
     def _spots(self, centres: tuple[Centres, ...], s: int, configurations: Integers) -> None:
-        """Joint centres, by the result and by the drawing laid over it."""
+        """Collect joint centres of the calibrated and of the aligned nominal machine."""
         session, state = self.calibration.session, self.calibration.estimate.state
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
         base, platform = (side.T_calibrated_drawing for side in centres)
         after = self.calibration.machine.ends_at(joints, pose)
+        # pose of the nominal machine in its own frames
         old_pose = inverse(base) @ pose @ platform
         before = session.machine.ends_at(joints, old_pose)
-        visible = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
-        drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
-        inside = camera.in_image(visible)
+        calibrated = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
+        nominal = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
+        inside = camera.in_image(calibrated)
         for n, k in enumerate(configurations.tolist()):
             labelled: set[int] = set()
             for side, end in enumerate(("base", "platform")):
                 for j in np.flatnonzero(inside[side, n]).tolist():
-                    old = drawn[side, n, j]
-                    cross = _pair(old) if np.isfinite(old).all() else None
-                    new = _pair(visible[side, n, j])
+                    old = nominal[side, n, j]
+                    cross = _rounded_pixel(old) if np.isfinite(old).all() else None
+                    new = _rounded_pixel(calibrated[side, n, j])
                     self.spots[s, k].append(Spot(j + 1, end, new, cross, j not in labelled))
                     labelled.add(j)
 
 
 def edge_curves(c: Calibration, mine: Integers, s: int) -> Array:
-    """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` in the photographs of station s."""
+    """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` (n,) in the images of station s."""
     edges, camera = c.observation.edges.select(mine), c.session.stations[s].camera
     rows, photograph = np.unique(edges.configuration, return_inverse=True)
     return measured_curves(c.machine, camera, _legs(c, s, rows), photograph, edges)
 
 
 def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:
-    """The calibrated legs before a station's camera, in some configurations."""
+    """Calibrated legs in the frame of a station's camera, in some configurations."""
     state = c.estimate.state
     return legs_in_camera(
         c.machine, state.T_camera_base[s], state.T_base_platform[rows], c.session.joints[rows]
     )
 
 
-def _rejected_words(n: int) -> str:
-    return f", {n} of them put aside" if n else ""
-
-
-def _size(corners: BoardCorners) -> str:
-    """How far corners are off, in words."""
-    rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
-    return f"{brief(rms)} px off"
-
-
-def _pair(point: Array) -> tuple[float, float]:
+def _rounded_pixel(point: Array) -> tuple[float, float]:
+    """Pixel with one decimal."""
     return round(float(point[0]), 1), round(float(point[1]), 1)

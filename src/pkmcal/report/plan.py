@@ -1,4 +1,4 @@
-"""A plan as an outcome: what to measure next, in which order, from where, and what it will give."""
+"""Measurement plan as an outcome: configurations, their order, stations, and expected accuracy."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ INDEX_NAMES = {
     "O1": "the noise amplification index O1",
 }
 FRUSTUM_LENGTH_SHARE = 0.35
-"""Length of a drawn camera's view, in the distance from the camera to the machine."""
+"""Length of a drawn frustum, in distances between camera and machine."""
 PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
@@ -49,12 +49,12 @@ PLAN_METHOD_TEXT = (
     " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. Two"
     " of a place differ by a tenth of some motor's range at least: a photograph taken twice errs by"
     " the same. They are within the joints' ranges, in home's assembly, away from singular poses,"
-    " with legs clear of each other; what lies outside the picture or behind a leg tells nothing.",
+    " with legs clear of each other; what lies outside the image or behind a leg adds nothing.",
 )
 
 
 def outcome_of(plan: MeasurementPlan) -> Outcome:
-    """Everything that ``pkmcal plan`` tells and writes."""
+    """Outcome of ``pkmcal plan``."""
     texts: dict[str, str | bytes] = {
         PLAN_TABLE_FILE: csv_text(
             plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
@@ -63,21 +63,24 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     parts = [_order(plan), _curve(plan)]
     if plan.tried:
         texts[PLAN_PLACES_FILE] = yaml_text(stations_document(plan))
-        parts.append(_places(plan))
+        parts.append(_camera_places(plan))
     if _cameras(plan):
-        parts.append(_where(plan))
+        parts.append(_space(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
     gain = plan.by_chance.position / plan.promised.position
+    findings = [_worth_note(plan)]
+    if blocked := [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]:
+        findings.append(note("plan.blocked", listed(blocked), names=blocked))
     return Outcome(
         command="plan",
         title=f"What to measure next on {machine.name}",
         subject=_purpose(plan),
         verdict=Verdict(
             usable=True,
-            headline=f"These {count(len(plan.names), 'configuration')} will tell the tool's"
-            f" {_accuracy_cells(plan.promised)}, standard deviations, mean over the workspace.",
-            findings=(_paying(plan), *_carefully(plan)),
+            headline=f"These {count(len(plan.names), 'configuration')} will determine the tool's"
+            f" {_accuracy_text(plan.promised)}, standard deviations, mean over the workspace.",
+            findings=tuple(findings),
         ),
         stamp="Plan",
         figures=(
@@ -92,8 +95,8 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
             Figure(
                 "How much better than by chance?",
                 ((number(gain, 1), "×"),),
-                "configurations spread evenly over the joints' ranges, as many, would tell it to"
-                f" {amount(plan.by_chance.position, 'm')}",
+                "as many configurations spread evenly over the joints' ranges would determine it"
+                f" to {amount(plan.by_chance.position, 'm')}",
             ),
             Figure(
                 "How long is the way?",
@@ -109,8 +112,8 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     )
 
 
-def _accuracy_cells(accuracy: Accuracy) -> str:
-    """Position and orientation; a platform that does not turn has no orientation to be known."""
+def _accuracy_text(accuracy: Accuracy) -> str:
+    """Accuracy of position and, if the platform turns, of orientation, in words."""
     words = f"position to {amount(accuracy.position, 'm')}"
     if not accuracy.orientation:
         return words
@@ -118,7 +121,7 @@ def _accuracy_cells(accuracy: Accuracy) -> str:
 
 
 def _purpose(plan: MeasurementPlan) -> str:
-    """What the plan is for, in a sentence."""
+    """Purpose of the plan in a sentence."""
     where = ""
     if len({name for names in plan.stations for name in names}) > 1:
         where = " seen by all stations" if plan.together else " from each place"
@@ -126,8 +129,8 @@ def _purpose(plan: MeasurementPlan) -> str:
     return f"{each}, chosen for {INDEX_NAMES[plan.index]}; workspace: {plan.region}."
 
 
-def _paying(plan: MeasurementPlan) -> Finding:
-    """Where more photographs stop paying."""
+def _worth_note(plan: MeasurementPlan) -> Finding:
+    """Note on the number of configurations beyond which more are not worthwhile."""
     last, until = plan.promised, plan.pays_until
     twice = next(a for a in plan.curve if a.count > last.count)
     facts = {
@@ -140,14 +143,8 @@ def _paying(plan: MeasurementPlan) -> Finding:
     return note("plan.pays_until", number=until, **facts)
 
 
-def _carefully(plan: MeasurementPlan) -> tuple[Finding, ...]:
-    """Configurations to which the straight way is blocked."""
-    names = [name for name, bad in zip(plan.names, plan.blocked, strict=True) if bad]
-    return (note("plan.blocked", listed(names), names=names),) if names else ()
-
-
 def _order(plan: MeasurementPlan) -> Part:
-    """The configurations, in their order."""
+    """Section with the configurations in their order."""
     units = plan.subject.rig.machine.joint_units
     columns = [
         f"{name}, {DISPLAY_UNITS[unit][1]}"
@@ -180,7 +177,7 @@ def _order(plan: MeasurementPlan) -> Part:
 
 
 def _curve(plan: MeasurementPlan) -> Part:
-    """How the tool's deviation falls with the number of configurations."""
+    """Section on the tool's standard deviation against the number of configurations."""
     x = [a.count for a in plan.curve]
     y = [a.position * 1e3 for a in plan.curve]
     here, axis = plan.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
@@ -238,7 +235,7 @@ def _curve(plan: MeasurementPlan) -> Part:
         for a in few
     ]
     table = Table(
-        "What so many from each place tell",
+        "Accuracy by the number from each place",
         ("Configurations", "position", *(["orientation"] if turns else [])),
         tuple(rows),
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
@@ -248,7 +245,7 @@ def _curve(plan: MeasurementPlan) -> Part:
 
 
 def _ticks(values: Sequence[float]) -> dict[str, Any]:
-    """Round places along a logarithmic axis, written out."""
+    """Round ticks of a logarithmic axis, without exponents."""
     low, high = min(values), max(values)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     places = [m * 10.0**k for k in decades for m in (1, 2, 5)]
@@ -257,7 +254,7 @@ def _ticks(values: Sequence[float]) -> dict[str, Any]:
 
 
 def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
-    """Cameras of the plan: station, camera and T_camera_base."""
+    """Cameras of the plan: name of the station, camera, and T_camera_base."""
     out: dict[str, tuple[str, Camera, Array]] = {}
     rig = plan.subject.rig
     for one in rig.instruments:
@@ -267,8 +264,8 @@ def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
     return list(out.values())
 
 
-def _places(plan: MeasurementPlan) -> Part:
-    """Where to put the camera, and what the best places would do alone."""
+def _camera_places(plan: MeasurementPlan) -> Part:
+    """Section on the camera's places, and what the best of them give alone."""
     order = sorted(plan.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
     rows = [
         Row(
@@ -293,8 +290,8 @@ def _places(plan: MeasurementPlan) -> Part:
     return Part("places", "Where to put the camera", tables=(table,))
 
 
-def _where(plan: MeasurementPlan) -> Part:
-    """The drawing: the machine, its configurations, the cameras, and the places tried."""
+def _space(plan: MeasurementPlan) -> Part:
+    """Section with a plot of the machine, its configurations, cameras, and candidate places."""
     rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
     machine = rig.machine
     ends = machine.ends_at(machine.inverse(home), home)
@@ -325,7 +322,7 @@ def _where(plan: MeasurementPlan) -> Part:
             ),
         ]  # fmt: skip
     if plan.tried:
-        data.append(_tried(plan.tried))
+        data.append(_candidate_markers(plan.tried))
     layout = uncropped(data, path_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
@@ -340,8 +337,8 @@ def _where(plan: MeasurementPlan) -> Part:
     return Part("where", "In space", plots=(plot,))
 
 
-def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
-    """Dots at the places that were tried, by what each tells alone."""
+def _candidate_markers(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
+    """Markers at candidate places, coloured by the accuracy that each gives alone."""
     at = np.array([one.place.position for one in tried])
     value = np.array([one.alone for one in tried]) * 1e3
     style = {
@@ -355,7 +352,7 @@ def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
 
 
 def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
-    """The chosen places as entries of session.yaml."""
+    """Chosen places as entries of session.yaml."""
     rig, out = plan.subject.rig, dict[str, Any]()
     for name, _, T_camera_base in _cameras(plan):
         observe = [
@@ -373,7 +370,7 @@ def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
 
 
 def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
-    """Plain data for JSON: m and rad."""
+    """Plan as plain data, m and rad."""
     rig = plan.subject.rig
     joined = zip(
         plan.names, plan.stations, plan.rank, plan.joints, plan.T_base_platform,
@@ -389,11 +386,11 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
                 "turn": plan.region.turn,
             },
             "together": plan.together,
-            "now": _progress_text(plan.now),
-            "promised": _progress_text(plan.promised),
-            "by_chance": _progress_text(plan.by_chance),
+            "now": _accuracy_document(plan.now),
+            "promised": _accuracy_document(plan.promised),
+            "by_chance": _accuracy_document(plan.by_chance),
             "pays_until": plan.pays_until,
-            "curve": [_progress_text(a) for a in plan.curve],
+            "curve": [_accuracy_document(a) for a in plan.curve],
             "columns": list(plan.subject.columns),
             "configurations": [
                 {
@@ -426,7 +423,8 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _progress_text(accuracy: Accuracy) -> dict[str, float]:
+def _accuracy_document(accuracy: Accuracy) -> dict[str, float]:
+    """Accuracy as plain data."""
     return {
         "configurations": accuracy.count,
         "position": accuracy.position,

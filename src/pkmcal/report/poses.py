@@ -1,4 +1,4 @@
-"""Boards and trackers in the report: how far their poses are off, and where they sit."""
+"""Report section on boards and trackers: errors of their poses, and where targets are mounted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pkmcal.wording import brief, count, decimals, number
 MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
-    "Bars by configuration: a jump that stays says that something was moved, a single tall bar"
+    "Bars by configuration: a jump that stays means that something was moved, a single tall bar"
     " that this one photograph, or its readings, are wrong."
 )
 
@@ -29,8 +29,9 @@ POSE_JUMPS_TEXT = (
 def section(
     session: Session, observation: Observation, estimate: Estimate, links: Links
 ) -> Part | None:
-    """The section; None in a session without boards and trackers on the platform. links : to the
-    photographs on the page.
+    """Section of the report; None for a session without measured poses.
+
+    links : to the images on the page.
     """
     poses = observation.poses
     if not len(poses):
@@ -51,26 +52,30 @@ def section(
 
 
 def errors(poses: PoseSet, estimate: Estimate) -> Array:
-    """Predicted less measured (N, 6): rad and m, station frame; NaN for what was not measured."""
+    """Predicted minus measured pose (N, 6), rad and m, station frame.
+
+    NaN for unmeasured components.
+    """
     white = estimate.pose_residuals * estimate.statistics.pose_scale
     error = (np.linalg.pinv(poses.whiten) @ white[..., None])[..., 0]
-    reference_values = np.any(poses.whiten != 0, axis=-2)
-    return np.where(reference_values, error, np.nan)
+    measured = np.any(poses.whiten != 0, axis=-2)
+    return np.where(measured, error, np.nan)
 
 
 def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...]:
+    """Sentences on number, errors and noise of the poses."""
     inliers = estimate.pose_weights >= INLIER_WEIGHT
     s = estimate.statistics
-    n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} put aside"
-    in_view = count(len(np.unique(poses.configuration)), "configuration")
+    n_rejected = "" if inliers.all() else f", {int(np.sum(~inliers))} rejected"
+    configurations = count(len(np.unique(poses.configuration)), "configuration")
     sizes = [_length(error[inliers, 3:]) * 1e3, float(np.rad2deg(_length(error[inliers, :3])))]
     sizes_text = [
         f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)
     ]
-    # the factor itself is never below one
+    # the noise factor is at least 1; the residuals may be smaller
     times = s.pose_scale if s.pose_scale > 1 else np.sqrt(s.chi2_poses / max(s.dof_poses, 1))
     return (
-        f"{count(len(poses), 'pose')} measured in {in_view}{n_rejected}.",
+        f"{count(len(poses), 'pose')} measured in {configurations}{n_rejected}.",
         f"They are {' and '.join(sizes_text)} off the calibrated machine (root mean"
         " square), which is"
         f" {number(times, 2)} times their stated noise.",
@@ -78,7 +83,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
 
 
 def _length(values: Array) -> float:
-    """Root mean square length of vectors (n, 3), what was not measured left out."""
+    """Root mean square length of vectors (n, 3), without unmeasured components."""
     finite = np.isfinite(values)
     if not finite.any():
         return float("nan")
@@ -86,33 +91,33 @@ def _length(values: Array) -> float:
 
 
 def _mounts(session: Session, estimate: Estimate) -> Table:
-    """Where the targets sit, a row each."""
+    """Table of the targets' poses on platform or base."""
     state, rows = estimate.state, list[Row]()
     for m, name in enumerate(mount_names(session, len(state.T_mount))):
         T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
-        reference = identified(estimate.machine, estimate.mount_covariance[m])
-        place = _texts(T[:3, 3], sigma[3:], reference[3:], 1e3)
-        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], reference[:3], 180 / np.pi)
+        determined = identified(estimate.machine, estimate.mount_covariance[m])
+        place = _texts(T[:3, 3], sigma[3:], determined[3:], 1e3)
+        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], determined[:3], 180 / np.pi)
         rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
     return Table(
         "Where it sits",
         ("Target", "Frame", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"),
         tuple(rows),
         "Place and rotation vector of the target's own axes in the body's frame, ± σ. Open: these"
-        " measurements do not tell it, and nothing that they predict depends on it.",
+        " measurements do not determine it, and nothing that they predict depends on it.",
         brief=False,
         words=(1,),
     )
 
 
 def mount_names(session: Session, n: int) -> list[str]:
-    """Names of the mounts: the board, where there is one, the trackers, then the links' points."""
+    """Names of the mounts: the board if there is one, the trackers, then the links' points."""
     others = [table.name for table in session.trackers] + [one.kind for one in session.links]
     return ["board"] * (n - len(others)) + others
 
 
 def _texts(values: Array, sigma: Array, valid: Booleans, factor: float) -> list[str]:
-    """Numbers with their deviations, ``open`` where the data do not determine them."""
+    """Numbers with standard deviations; ``open`` where the data do not determine them."""
     out: list[str] = []
     for value, spread, sure in zip(values.tolist(), sigma.tolist(), valid, strict=True):
         text = number(value * factor, decimals(spread * factor))
@@ -124,7 +129,7 @@ def _texts(values: Array, sigma: Array, valid: Booleans, factor: float) -> list[
 def _by_configuration(
     session: Session, poses: PoseSet, estimate: Estimate, links: Links
 ) -> charts.BarChart | None:
-    """Root mean square of each configuration's poses in standard deviations."""
+    """Root mean square residual of each configuration's poses, in standard deviations."""
     number = np.bincount(poses.configuration, weights=poses.rows)
     square = np.bincount(
         poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
@@ -147,7 +152,7 @@ def _by_configuration(
 def _bars(
     session: Session, poses: PoseSet, error: Array, unit: str, title: str, links: Links
 ) -> charts.BarChart | None:
-    """Length of each configuration's error, largest of its poses."""
+    """Largest error of each configuration's poses."""
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
         return None
@@ -169,7 +174,7 @@ def _bars(
 
 
 def axes(poses: PoseSet, estimate: Estimate) -> charts.RowChart | None:
-    """Boxes of the poses' six numbers, whitened residuals; for the section on residuals."""
+    """Box plots of the whitened residuals of the poses' six numbers."""
     names = ("turn 1", "turn 2", "turn 3", "place 1", "place 2", "place 3")
     measured = np.any(poses.whiten != 0, axis=-1)
     boxes = [
@@ -183,7 +188,7 @@ def axes(poses: PoseSet, estimate: Estimate) -> charts.RowChart | None:
 
 
 def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:
-    """The poses that are farthest off, in standard deviations."""
+    """Table of the poses with the largest residuals, in standard deviations."""
     level = np.sqrt(np.sum(estimate.pose_residuals**2, axis=1) / np.maximum(poses.rows, 1))
     rows: list[Row] = []
     for k in np.argsort(-level, kind="stable")[:MOST_WORST_POSES].tolist():
@@ -193,7 +198,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
             brief(_length(error[k : k + 1, 3:]) * 1e3),
             brief(turn),
             number(float(level[k]), 1),
-            "put aside" if estimate.pose_weights[k] < INLIER_WEIGHT else "used",
+            "rejected" if estimate.pose_weights[k] < INLIER_WEIGHT else "used",
         )
         rows.append(Row(session.station_names[poses.station[k]], cells))
     columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")
@@ -202,7 +207,7 @@ def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -
 
 
 def target_places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:
-    """Where the targets were (N, 3), base frame, by the estimate, and their configurations."""
+    """Estimated positions of the targets (N, 3), base frame, m, and their configurations (N,)."""
     poses, state = observation.poses, estimate.state
     on = state.on_platform[poses.mount]
     body = np.where(on[:, None, None], state.T_base_platform[poses.configuration], np.eye(4))

@@ -1,4 +1,4 @@
-"""How the result was made: where the cameras stood, settings, solver; and what was left out."""
+"""Report sections on how the result was made: stations, settings, solver, and rejected data."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from pkmcal.session.load import Session
 from pkmcal.wording import amount, brief, count, decimals, number
 
 SIGMA_MEANING_TEXT = Markup(
-    "<strong>What σ means here.</strong> The standard deviations say how much the result would"
-    " scatter if the same measurements were taken again. They contain the noise of the measurement,"
-    " and of what the model leaves out (legs that bend, joints with play, a lens that its file does"
-    " not describe, an uneven bed) what these data show. Measurements that the calibration has not"
-    " used are the test for the rest."
+    "<strong>What σ means here.</strong> The standard deviations are those with which the result"
+    " would scatter if the same measurements were taken again. They contain the noise of the"
+    " measurement, and of what the model leaves out (legs that bend, joints with play, a lens that"
+    " its file does not describe, an uneven bed) what these data show. Measurements that the"
+    " calibration has not used are the test for the rest."
 )
 NORMAL_FROM_FREEDOMS = 50
-"""Degrees of freedom from which on a Student distribution is told as the normal one."""
+"""Degrees of freedom above which a Student distribution is reported as normal."""
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
@@ -39,21 +39,24 @@ MOST_CASES = 400
 def used_photographs(
     session: Session, observation: Observation, estimate: Estimate
 ) -> tuple[int, ...]:
-    """How many of each station's photographs show something that is in use: a board that was not
-    rejected, or edges of which most were not. Those that were held out do not.
+    """Number of images of each station that are in use.
+
+    An image is in use if its board's pose is an inlier, or at least half of its edges are.
+    Held-out images are not.
     """
-    names_so_far = set[tuple[int, int]]()
+    in_use = set[tuple[int, int]]()
     for item, weights in (
         (observation.edges, estimate.edge_weights),
         (observation.poses, estimate.pose_weights),
     ):
         pairs = np.stack([item.station, item.configuration], axis=1)
+        # inliers among the measurements of each station and configuration
         pairs, own = np.unique(pairs, axis=0, return_inverse=True)
         inliers = np.bincount(own.ravel(), weights >= INLIER_WEIGHT, len(pairs))
         most = 2 * inliers >= np.bincount(own.ravel(), minlength=len(pairs))
-        names_so_far |= {(s, c) for s, c in pairs[most].tolist()}
+        in_use |= {(s, c) for s, c in pairs[most].tolist()}
     return tuple(
-        sum((s, photo.configuration) in names_so_far for photo in station.photographs)
+        sum((s, photo.configuration) in in_use for photo in station.photographs)
         for s, station in enumerate(session.stations)
     )
 
@@ -61,7 +64,10 @@ def used_photographs(
 def stations(
     session: Session, observation: Observation, estimate: Estimate, space: Plot | None
 ) -> Part:
-    """The machine as it was photographed, and where the cameras stood, one row a station."""
+    """Section with the machine and its cameras.
+
+    The plot in space, and a table with a row for each station.
+    """
     plots, camera = (space,) if space else (), session.camera_of_station
     if not session.station_names:
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
@@ -80,15 +86,17 @@ def stations(
             photographs += f", {pixels} × {pixels} pixels as one"
         places = decimals(sigma)
         cells = (
-            *_place(estimate, s),
+            *_pose_cells(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
-            _shift_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
+            _distance_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
             f"{station.camera_file}, {station.camera.model}, {photographs}",
         )
         rows.append(Row(station.name, cells))
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
-        rows.append(Row(table.name, (*_place(estimate, s), *(["–"] if edges else []), "–", what)))
+        rows.append(
+            Row(table.name, (*_pose_cells(estimate, s), *(["–"] if edges else []), "–", what))
+        )
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
     columns += ("Away from the pose by hand", "Camera")
@@ -99,34 +107,39 @@ def stations(
     return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
 
 
-def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
-    """A station's place with its deviations (mm), and the deviation of its turn (degrees); what the
-    data do not determine is open.
+def _pose_cells(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
+    """Position of a station with standard deviations (mm), and that of its orientation (degrees).
+
+    Open where the data do not determine them.
     """
-    value, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
-    place = inverse(value)[:3, 3] * 1e3
-    covariance = base_camera_covariance(value, covariance)
-    reference = identified(estimate.machine, covariance)
-    # rounding may leave less than none
+    T_camera_base, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
+    place = inverse(T_camera_base)[:3, 3] * 1e3
+    covariance = base_camera_covariance(T_camera_base, covariance)
+    determined = identified(estimate.machine, covariance)
+    # rounding may leave a negative variance
     sigma = 1e3 * np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
     turn = float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
     x, y, z = (
         f"{number(v, decimals(d))} ± {brief(d)}" if sure else "open"
-        for v, d, sure in zip(place.tolist(), sigma.tolist(), reference[3:], strict=True)
+        for v, d, sure in zip(place.tolist(), sigma.tolist(), determined[3:], strict=True)
     )
-    return x, y, z, amount(turn, "rad") if reference[:3].all() else "open"
+    return x, y, z, amount(turn, "rad") if determined[:3].all() else "open"
 
 
-def _shift_cell(rough: Array | None, values: Array) -> str:
+def _distance_cell(rough: Array | None, estimated: Array) -> str:
+    """Distance and angle of the estimated pose from the one by hand."""
     if rough is None:
         return "–"
-    turn = np.rad2deg(np.linalg.norm(pose_difference(values, rough)[:3]))
-    direction = np.linalg.norm(inverse(values)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
-    return f"{number(float(direction), 0)} mm, {number(float(turn), 1)}°"
+    turn = np.rad2deg(np.linalg.norm(pose_difference(estimated, rough)[:3]))
+    distance = np.linalg.norm(inverse(estimated)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
+    return f"{number(float(distance), 0)} mm, {number(float(turn), 1)}°"
 
 
 def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
-    """How it was computed. timings : seconds by step."""
+    """Section on settings, solver and versions.
+
+    timings : seconds by step.
+    """
     html = page.filled_template(
         "how.html.j2",
         model_error=SIGMA_MEANING_TEXT,
@@ -140,7 +153,7 @@ def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> P
 
 
 def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...]:
-    """(what, value) of everything that the result depends on besides the photographs."""
+    """Pairs (name, value) of all that the result depends on besides the images."""
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
@@ -162,7 +175,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             (
                 f"χ² of the {name}",
                 f"{number(chi2, 0)} over {number(n, 0)} numbers"
-                # degrees of freedom that the numbers leave, where they were counted
+                # redundancy of the kind, where it was counted
                 + (f", {count(round(freedom), 'degree')} of freedom" if freedom >= 0.5 else ""),
             )
             for name, chi2, n, freedom in (
@@ -198,8 +211,11 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             if s.n_edges
         ),
         *(
-            (f"What the data allow of the {name}' stated noise", f"{_between(limits)} times")
-            for name, limits, n in (
+            (
+                f"What the data allow of the {name}' stated noise",
+                f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)} times",
+            )
+            for name, (low, high), n in (
                 ("poses", s.pose_range, s.n_poses),
                 ("readings", s.reading_range, s.n_joints),
                 (linked, s.link_range, s.n_links),
@@ -210,18 +226,18 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
 
 
 def link_labels(session: Session) -> str:
-    """What links the session's configurations, in the plural."""
+    """Kinds of links in the session, in the plural."""
     return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
-
-
-def _between(limits: tuple[float, float | None]) -> str:
-    low, high = limits
-    return f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)}"
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One reason. cases : (photograph, what) for the first of ``count`` findings."""
+    """Reason of rejections.
+
+    count : number of rejections.
+    photographs : number of images concerned.
+    cases : (image, rejected part) of the first of them.
+    """
 
     text: str
     count: int
@@ -230,12 +246,12 @@ class Reason:
 
     @property
     def unlisted(self) -> int:
-        """Findings that the list leaves out."""
+        """Number of rejections that the list leaves out."""
         return self.count - len(self.cases)
 
 
 def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estimate) -> Part:
-    """What was rejected, and which values can hardly be told apart."""
+    """Section on rejections, and on tightly correlated parameters."""
     html = page.filled_template(
         "rejected.html.j2",
         reasons=reasons(session, rejected),
@@ -246,7 +262,10 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
 
 
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:
-    """Grouped by reason, the most frequent first; numbers in a reason do not part groups."""
+    """Rejections grouped by reason, the most frequent first.
+
+    Reasons that differ in numbers are one.
+    """
     groups: dict[str, list[Rejection]] = {}
     for item in rejected:
         kind = re.sub(r"[-+−]?\d+(\.\d+)?([eE][-+]?\d+)?", "…", item.reason)
@@ -256,6 +275,7 @@ def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, 
 
 
 def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
+    """Group of rejections."""
     same = len({item.reason for item in items}) == 1
     stations, configurations = session.station_names, session.configurations
     return Reason(
@@ -265,16 +285,16 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
         cases=tuple(
             (
                 f"{stations[i.station]} / {configurations[i.configuration]}",
-                _what(i) if same else f"{_what(i)}: {i.reason}",
+                _rejected_part(i) if same else f"{_rejected_part(i)}: {i.reason}",
             )
             for number, i in enumerate(items)
-            if number < MOST_CASES or i.leg < 0  # whole images and boards are all named
+            if number < MOST_CASES or i.leg < 0  # whole images and boards are always listed
         ),
     )
 
 
-def _what(item: Rejection) -> str:
-    """The rejected thing in words; -1 stands for all of them."""
+def _rejected_part(item: Rejection) -> str:
+    """Rejected part in words; -1 stands for all."""
     if item.leg < 0:
         return "board" if item.reason.startswith("the board") else "whole photograph"
     words = [f"leg {item.leg + 1}"]

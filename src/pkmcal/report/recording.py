@@ -1,7 +1,6 @@
-"""A calibration as a recording: what was photographed, found and made of it, configuration after
-configuration, for a viewer that plays it.
+"""Calibration as a sequence of records for a viewer, configuration after configuration.
 
-Nothing here knows the viewer; :mod:`pkmcal.report.rrd` writes what stands here for rerun.
+Independent of the viewer; :mod:`pkmcal.report.rrd` writes the records for rerun.
 """
 
 from __future__ import annotations
@@ -32,24 +31,24 @@ LoggedKind = Literal[
     "numbers", "text", "clear",
 ]  # fmt: skip
 VIEWER_PIXEL_CORNER = 0.5
-"""px: pixel centres are at integers here, and half a pixel further where a picture begins with its
-first pixel's corner, as in viewers."""
+"""Offset of viewers' pixels, px: pixel centres are integers here, first pixels' corners there."""
 RECORDING_JPEG_QUALITY = 85
 RECORDED_LEG_COLOURS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66),
     (0, 114, 178), (213, 94, 0), (204, 121, 167), (140, 140, 140),
 )  # fmt: skip
-"""Colours that all eyes can tell apart (Okabe and Ito), by leg."""
+"""Colours of legs that are distinct with any colour vision (Okabe and Ito)."""
 RECORDED_GREY, RECORDED_WHITE = (150, 150, 150), (255, 255, 255)
 TUBELESS_LEG_RADIUS = 0.002
-"""m, radius of a leg of which the drawing has no tube."""
+"""Radius of legs without tubes, m."""
 
 
 class Logged(NamedTuple):
-    """One thing that is recorded.
+    """Record.
 
-    path : names from the root on. at : the configuration, from 1; None for all of them.
-    values : by the kind's own names; lengths in m, places in pictures in px from the corner.
+    path : names from the root.
+    values : by the kind's own names; lengths in m, pixels counted from the image's corner.
+    at : configuration, from 1; None for all.
     """
 
     path: tuple[str, ...]
@@ -59,9 +58,9 @@ class Logged(NamedTuple):
 
 
 def recorded(calibration: Calibration) -> Iterator[Logged]:
-    """What there is of a calibration, in the order of time.
+    """Records of a calibration, in the order of time.
 
-    Raises InputError where a photograph cannot be read any more.
+    Raises InputError if an image can no longer be read.
     """
     centres, _ = centres_and_tool(
         calibration.session.machine, calibration.estimate, calibration.session.joints
@@ -74,7 +73,7 @@ def recorded(calibration: Calibration) -> Iterator[Logged]:
 
 
 def _result(c: Calibration) -> Iterator[Logged]:
-    """The verdict and the parameters, as pages."""
+    """Records of verdict and parameters."""
     yield Logged(("result", "summary"), "text", {"text": f"```\n{c.summary()}\n```"})
     rows = ["| parameter | unit | drawing | value | σ | decided by |", "|---|---|---|---|---|---|"]
     rows += [
@@ -86,7 +85,7 @@ def _result(c: Calibration) -> Iterator[Logged]:
 
 
 def _stations(c: Calibration) -> Iterator[Logged]:
-    """Where the cameras stand, and what a viewer can know of their lenses."""
+    """Records of the cameras' poses, and of pinhole intrinsics."""
     for s, station in enumerate(c.session.stations):
         T_base_camera = inverse(c.estimate.state.T_camera_base[s])
         at = ("machine", "cameras", station.name)
@@ -101,7 +100,7 @@ def _stations(c: Calibration) -> Iterator[Logged]:
 
 
 def _configuration(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[Logged]:
-    """Everything of one configuration; what it has not is cleared, or the last one's would stay."""
+    """Records of one configuration; what it lacks is cleared, or the previous one's would stay."""
     at, session, estimate = k + 1, c.session, c.estimate
     name = session.configurations[k]
     yield Logged(("result", "configuration"), "text", {"text": f"## {name}"}, at)
@@ -116,12 +115,13 @@ def _configuration(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iter
         for part in ("platform", "calibrated", "drawing", "measured"):
             yield Logged(("machine", part), "clear", {}, at)
     for s in range(len(session.stations)):
-        yield from _photograph(c, s, k)
+        yield from _image(c, s, k)
 
 
 def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[Logged]:
-    """The machine as calibrated and as drawn, laid over it by all joint centres, and where boards
-    and trackers' targets were.
+    """Records of the calibrated machine, the nominal one aligned with it, and measured targets.
+
+    The alignment is that of all joint centres.
     """
     at, state, joints = k + 1, c.estimate.state, c.session.joints[k]
     pose = state.T_base_platform[k]
@@ -141,9 +141,9 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
             else RECORDED_GREY
             for j in legs
         ]
-        static = {"strips": strips, "radii": radii, "colours": colours}
+        lines = {"strips": strips, "radii": radii, "colours": colours}
         labels = [f"leg {j + 1}" for j in legs]
-        yield Logged(("machine", name), "lines3d", {**static, "labels": labels}, at)
+        yield Logged(("machine", name), "lines3d", {**lines, "labels": labels}, at)
     ends = machine.ends_at(joints, pose)
     points = np.concatenate([ends.a, ends.b])
     labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
@@ -154,14 +154,14 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     if len(c.observation.poses):
         points, configuration = poses.target_places(c.observation, c.estimate)
         points = points[configuration == k]
-        static = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
-        yield Logged(("machine", "measured"), "points3d", static, at)
+        targets = {"points": points, "labels": list[str](), "colour": RECORDED_LEG_COLOURS[0]}
+        yield Logged(("machine", "measured"), "points3d", targets, at)
 
 
 def _tubes(
     machine: Machine, joints: Array, T_base_platform: Array
 ) -> tuple[list[Array], list[float], list[int]]:
-    """Axes (2, 3), m, and radii of all tubes, with their legs from 0; thin lines for the others."""
+    """Axes (2, 3), m, radii, and legs (from 0) of all tubes; thin lines for legs without tubes."""
     ends = machine.ends_at(joints, T_base_platform)
     strips, radii, legs = list[Array](), list[float](), list[int]()
     for j, reference in enumerate(machine.radii()):
@@ -179,14 +179,15 @@ def _tubes(
     return strips, radii, legs
 
 
-def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
-    """A station's photograph with what was found in it, and the calibrated machine's contour."""
+def _image(c: Calibration, s: int, k: int) -> Iterator[Logged]:
+    """Records of a station's image with its edges, and of the calibrated machine's contour."""
     at, session, estimate = k + 1, c.session, c.estimate
     station = session.stations[s]
     path = ("machine", "cameras", station.name, "image")
     photo = next((p for p in station.photographs if p.configuration == k), None)
     if photo is None:
-        # black: rerun's viewer goes on showing a coded picture that was cleared (its issue 12793)
+        # a black image, because rerun's viewer still shows an encoded image after it was cleared
+        # (its issue 12793)
         width, height = station.camera.image_size
         black = coded(np.zeros((height, width)), RECORDING_JPEG_QUALITY)
         yield Logged((*path, "photograph"), "photograph", {"jpeg": black}, at)
@@ -220,15 +221,15 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
         }
         yield Logged((*path, part), "lines2d", logged, at)
     if estimate.configurations[k]:
-        drawn, _ = machine_laid_over(
+        contour, _ = machine_laid_over(
             estimate.machine,
             station.camera,
             estimate.state.T_camera_base[s],
             session.joints[k],
             estimate.state.T_base_platform[k],
         )
-        strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in drawn]
-        labels = [edge.tip for edge in drawn]
+        strips = [np.array(edge.points) + VIEWER_PIXEL_CORNER for edge in contour]
+        labels = [edge.tip for edge in contour]
         logged = {"strips": strips, "colours": [RECORDED_WHITE] * len(strips), "labels": labels}
         yield Logged((*path, "contour"), "lines2d", logged, at)
     if len(mine):
@@ -237,7 +238,7 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
 
 
 def _tip(c: Calibration, n: int) -> str:
-    """An edge in words."""
+    """Edge with its residuals, in words."""
     edges, estimate = c.observation.edges, c.estimate
     name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))
     shift, tilt = estimate.edge_residuals[n].tolist()

@@ -1,4 +1,4 @@
-"""How well the model explains the edges and the readings, by leg, station and configuration."""
+"""Report section on residuals of edges and readings, by leg, station and configuration."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
 GROUP_STANDS_OUT_FACTOR = 1.5
-"""A group whose residuals are this many times the middle group's is worth a sentence."""
+"""Ratio of a group's residuals to the median group's above which a sentence reports it."""
 SHADED_MEAN_SHIFT = 0.05
-"""Mean outward shift (px) from which a sentence is due: shading moves edges by this and more."""
+"""Mean outward shift, px, above which a sentence reports it.
+
+Shading moves edges by this and more.
+"""
 SIGMAS_IN_WORDS = "standard deviations"
 HISTOGRAM_HALF_SPAN = 5.0
-"""Standard deviations that the histogram spans to either side."""
+"""Standard deviations that the histogram spans on either side."""
 RESIDUALS_READING_TEXT = (
     "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
     " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
@@ -42,12 +45,13 @@ def section(
     links: Links,
     poses: charts.RowChart | None = None,
 ) -> Part:
-    """The section's charts, under sentences about what stands out in them.
+    """Section with charts, below sentences on groups that stand out.
 
-    shifts : (N,) px, of :func:`outward_shift`. links : to the photographs on the page. poses : a
-    chart of the poses' residuals.
+    shifts : (N,) px, of :func:`outward_shift`.
+    links : to the images on the page.
+    poses : chart of the poses' residuals, None without poses.
     """
-    display = charts.panels(
+    panels = charts.panels(
         by_leg(session, edges, estimate, links),
         _edge_boxes("station", session.station_names, edges.station, edges, estimate, links),
         _joints(session, estimate, links),
@@ -57,25 +61,28 @@ def section(
         _outward(edges, shifts, links),
         remarks=remarks(session, edges, estimate, shifts),
     )
-    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=display)
+    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=panels)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:
-    """Measured minus predicted place of each edge, px outward from the leg, (N,).
+    """Measured minus predicted position of each edge, px outward from the leg, (N,).
 
-    joints : (K, m) readings. camera : (S,) number of each station's camera.
-    The camera's constant shift is taken out. The two numbers of a residual normal are fitted by
-    one shift along ``edges.shift``, weighted by their covariance; NaN where a leg passes through
-    the camera.
+    The camera's estimated edge shift is subtracted. The two components of a normal's residual are
+    fitted by one shift along ``edges.shift``, weighted by their covariance; NaN where a leg passes
+    through the camera.
+
+    joints : (K, m) readings.
+    camera : (S,) index of each station's camera.
     """
     machine, state = estimate.machine, estimate.state
     k, j = edges.configuration, edges.leg
     legs = legs_in_camera(
         machine, state.T_camera_base[edges.station], state.T_base_platform[k], joints[k]
     )
-    each = np.arange(len(edges))
+    rows = np.arange(len(edges))
     radius = machine.radii_of(edges.leg, edges.tube)
-    normal = edge_normal_jacobians(legs.a[each, j], legs.b[each, j], radius, edges.side).n
+    # measured minus predicted normal in the tangent basis of the measured one
+    normal = edge_normal_jacobians(legs.a[rows, j], legs.b[rows, j], radius, edges.side).n
     error = -np.einsum("nij,ni->nj", edges.basis, normal)
     error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]
     weighted = np.linalg.solve(edges.covariance, edges.shift[..., None])[..., 0]
@@ -83,7 +90,10 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
 
 
 def weighted_edge_rms(white: Array, weights: Array) -> float:
-    """Root mean square of residuals (n, 2) with the edges' weights (n,); NaN without any."""
+    """Weighted root mean square of residuals (n, 2), weights (n,).
+
+    NaN if the weights sum to zero.
+    """
     total = 2 * float(np.sum(weights))
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
@@ -91,7 +101,7 @@ def weighted_edge_rms(white: Array, weights: Array) -> float:
 def by_leg(
     session: Session, edges: EdgeSet, estimate: Estimate, links: Links
 ) -> charts.RowChart | None:
-    """The edges' residuals by leg, in the legs' colours."""
+    """Box plots of the edges' residuals by leg, in the legs' colours."""
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
     return _edge_boxes("leg", legs, edges.leg, edges, estimate, links)
 
@@ -104,8 +114,9 @@ def _edge_boxes(
     estimate: Estimate,
     links: Links,
 ) -> charts.RowChart | None:
-    """A box for each group that has edges; both numbers of a residual count. Each leads to the
-    photograph of its largest.
+    """Box plot of both residual components for each group with edges.
+
+    Each row links to the image of its largest residual.
     """
     white = estimate.edge_residuals
     boxes: list[charts.Spread | None] = []
@@ -121,7 +132,7 @@ def _edge_boxes(
 def _configurations(
     session: Session, edges: EdgeSet, estimate: Estimate, links: Links
 ) -> charts.BarChart | None:
-    """Root mean square of each configuration's edges, with the range that noise alone gives."""
+    """Root mean square of each configuration's edges, with the interval expected of noise alone."""
     bars: list[charts.UprightBar] = []
     for k, name in enumerate(session.configurations):
         mine = edges.configuration == k
@@ -138,7 +149,10 @@ def _configurations(
 
 
 def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -> charts.UprightBar:
-    """A configuration's root mean square, in σ, beside where that of n numbers of noise lies."""
+    """Bar of a configuration's root mean square, in standard deviations, over n numbers.
+
+    With the interval that n numbers of pure noise have.
+    """
     low, high = expected_rms(n)
     tip = (
         f"configuration {name}: {number(level, 2)} σ{of}, {number(low, 2)} to {number(high, 2)}"
@@ -148,7 +162,7 @@ def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -
 
 
 def expected_rms(n: float) -> tuple[float, float]:
-    """Where the root mean square of n standard normal numbers lies 19 times in 20."""
+    """95 % interval of the root mean square of n standard normal numbers."""
     from scipy.special import chdtri
 
     low, high = np.sqrt(chdtri(n, [0.975, 0.025]) / n)
@@ -156,7 +170,7 @@ def expected_rms(n: float) -> tuple[float, float]:
 
 
 def histogram(white: Array) -> charts.BarChart | None:
-    """Counts of all residuals beside the normal density; the outermost bars hold the rest."""
+    """Histogram of all residuals with the normal density; the outermost bars include all beyond."""
     values = white[np.isfinite(white)]
     if not values.size:
         return None
@@ -183,7 +197,7 @@ def histogram(white: Array) -> charts.BarChart | None:
 
 
 def _outward(edges: EdgeSet, shifts: Array, links: Links) -> charts.RowChart | None:
-    """Outward shift of every leg's edges: shading and wrong radii show here."""
+    """Box plots of outward shifts by leg, tube and side, which show shading and wrong radii."""
     boxes = [
         charts.box(
             f"leg {j + 1}, tube {t + 1}, {EDGE_SIDE_NAMES[s]}", shifts[mine], "px", 3, j + 1, lead
@@ -200,7 +214,7 @@ def _outward(edges: EdgeSet, shifts: Array, links: Links) -> charts.RowChart | N
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
-    """Leg, tube and side of the edges, and which edges (N,) are of them."""
+    """Leg, tube and side of the edges, each with a mask (N,) of its edges."""
     kinds = np.stack([edges.leg, edges.tube, edges.side], axis=-1)
     return [
         ((int(j), int(t), int(s)), (kinds == (j, t, s)).all(axis=-1))
@@ -209,7 +223,7 @@ def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
 
 
 def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowChart | None:
-    """Residuals of the readings by joint, each leading to the photograph of its largest."""
+    """Box plots of the readings' residuals by joint, linked to the image of the largest."""
     motor = session.machine.layout.actuated
     used = np.flatnonzero(estimate.configurations)
     white = estimate.joint_residuals[used]
@@ -222,7 +236,8 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowCha
         for column, (legs, k) in enumerate(zip(shifted, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
-    # readings that poses follow are near zero whatever their noise: few freedoms say so
+    # readings that determine the poses have small residuals whatever their noise; the degrees of
+    # freedom show that
     s = estimate.statistics
     note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
     return charts.row_chart(
@@ -231,14 +246,14 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowCha
 
 
 def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:
-    """Sentences about groups that stand out."""
+    """Sentences on groups that stand out."""
     stations = [f"station {name}" for name in session.station_names]
     configurations = [f"configuration {name}" for name in session.configurations]
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
     out: list[str] = []
     for names, group in ((legs, edges.leg), (stations, edges.station)):
         out += _outstanding(names, group, estimate)
-    if not out:  # a bad station would name every configuration that it saw
+    if not out:  # a bad station would raise every configuration that it observed
         out += _outstanding(configurations, edges.configuration, estimate)
     shaded = _shaded(edges, estimate, shifts)
     if shaded:
@@ -248,7 +263,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
         )
     if scatter := estimate.statistics.look_scatter:
         out.append(
-            "Which border is a leg's depends on where it is looked for: from machines as likely as"
+            "Which border is a leg's depends on where it is searched: from machines as likely as"
             f" this one, results scatter by {number(scatter, 1)} of the deviations that noise gives"
             " them, and these contain it."
         )
@@ -256,7 +271,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
 
 
 def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[str]:
-    """Groups whose residuals are far above the middle group's, edges put aside not counted."""
+    """Sentences on groups whose weighted residuals are far above those of the median group."""
     white, weights = estimate.edge_residuals, estimate.edge_weights
     level = {
         g: weighted_edge_rms(white[group == g], weights[group == g])
@@ -266,24 +281,26 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     if len(level) < 3:
         return []
     middle = float(np.median(list(level.values())))
-    results = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
-    results = sorted(results, key=lambda g: -level[g])[:4]
+    outstanding = [g for g, value in level.items() if value > GROUP_STANDS_OUT_FACTOR * middle]
+    outstanding = sorted(outstanding, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
-        "middle one: look at its pictures first."
-        for g in results
+        "middle one: check its photographs first."
+        for g in outstanding
     ]
 
 
 def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
-    """Legs' edges whose mean shift is large and sure, the largest first, in words."""
-    results: list[tuple[float, str]] = []
+    """Edges with a large and significant mean shift, in words, the largest first."""
+    shaded: list[tuple[float, str]] = []
     for (leg, tube, side), mine in _edge_kinds(edges):
-        values = shifts[mine & (estimate.edge_weights >= INLIER_WEIGHT) & np.isfinite(shifts)]
-        if len(values) < 4:
+        finite_shifts = shifts[
+            mine & (estimate.edge_weights >= INLIER_WEIGHT) & np.isfinite(shifts)
+        ]
+        if len(finite_shifts) < 4:
             continue
-        mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
+        mean, error = finite_shifts.mean(), finite_shifts.std(ddof=1) / np.sqrt(len(finite_shifts))
         if abs(mean) > max(SHADED_MEAN_SHIFT, 3 * error):
             where = f"leg {leg + 1} tube {tube + 1} {EDGE_SIDE_NAMES[side]}"
-            results.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
-    return [text for _, text in sorted(results, reverse=True)[:4]]
+            shaded.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
+    return [text for _, text in sorted(shaded, reverse=True)[:4]]

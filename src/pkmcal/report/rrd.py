@@ -1,6 +1,6 @@
-"""A calibration for rerun's viewer, which is an extra: ``pip install '.[rerun]'``.
+"""Calibration as a recording for rerun's viewer, an extra: ``pip install '.[rerun]'``.
 
-The SDK is imported only here, when somebody asks for a recording.
+The SDK is imported only when a recording is written.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ RERUN_APPLICATION = "pkmcal"
 RERUN_TIMELINE = "configuration"
 RERUN_FILE_ENDING = ".rrd"
 STATIONS_SIDE_BY_SIDE = 4
-"""Stations whose photographs stand beside each other; those of more behind each other."""
+"""Most stations whose images are side by side; of more they are in tabs."""
 
 
 def check_rrd(path: Path | str) -> None:
-    """Raise InputError where no recording could be written; call it before the work."""
+    """Raise InputError if no recording could be written. Call it before the calibration."""
     path = Path(path)
     if path.suffix != RERUN_FILE_ENDING:
         raise InputError(
@@ -46,8 +46,8 @@ def check_rrd(path: Path | str) -> None:
 def write_rrd(calibration: Calibration, path: Path | str) -> None:
     """Write a recording that ``rerun PATH`` opens, whole or not at all.
 
-    Raises InputError where rerun is not installed, where the file cannot be written, and where a
-    photograph cannot be read any more.
+    Raises InputError if rerun is not installed, if the file cannot be written, and if an image can
+    no longer be read.
     """
     check_rrd(path)
     rr: Any = import_module("rerun")
@@ -61,11 +61,11 @@ def write_rrd(calibration: Calibration, path: Path | str) -> None:
             if one.at is not None:
                 stream.set_time(RERUN_TIMELINE, sequence=one.at)
             stream.log(list(one.path), what, static=one.at is None)
-        stream.disconnect()  # which waits for the file
+        stream.disconnect()  # waits for the file
 
 
 def _archetype(rr: Any, one: Logged) -> Any:
-    """What rerun calls it."""
+    """Archetype of rerun for a record."""
     v = one.values
     match one.kind:
         case "world":
@@ -103,7 +103,7 @@ def _archetype(rr: Any, one: Logged) -> Any:
 
 
 def _blueprint(stations: tuple[str, ...]) -> Any:
-    """The machine in space, the photographs beside it, below them numbers and words."""
+    """Layout: the machine in space beside the images, with residuals and texts below these."""
     rr: Any = import_module("rerun")
     rrb: Any = import_module("rerun.blueprint")
     photographs = [

@@ -1,6 +1,6 @@
-"""The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged.
+"""Geometry before and after calibration, as in [B] Fig. 7: joint centres at home, errors enlarged.
 
-Two plane views as SVG, and one in space as a Plotly figure, whose lengths are millimetres.
+Two plane views as SVG, and one in space as a Plotly figure in millimetres.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
 ELLIPSE_SIGMAS = 2.0
-"""Standard deviations that ellipses and ellipsoids reach."""
+"""Standard deviations of ellipses and ellipsoids."""
 ENLARGED_ERROR_SHARE = 0.22
-"""Part of the machine's radius that the large errors should span once enlarged."""
+"""Length of large errors after enlargement, in radii of the machine."""
 PLANE_VIEW_MARGIN = 30.0
 LABELS_MERGED_WITHIN = 9.0
-"""SVG units within which two labels are written as one."""
+"""Distance, in SVG units, below which two labels become one."""
 ELLIPSOID_RING_POINTS = 25
 """Points of an ellipsoid's ring."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint centre at home, base frame, m.
+    """Joint centre at home, base frame, m.
 
-    drawing, displaced : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
-    covariance. leg : from 1. arm : (2, k, 3) of a joint on the base, from where a motor holds its
-    arm to the joint, by the drawing and enlarged; of another the joint alone.
+    leg : from 1.
+    drawing, displaced : (3,) by the nominal model, and with the enlarged error.
+    spread : (3, 3) enlarged covariance.
+    arm : (2, k, 3) nominal and enlarged; points from where a motor holds the arm to a base joint;
+        a platform joint has only itself.
     """
 
     leg: int
@@ -55,10 +57,11 @@ class Joint:
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """All joint centres, base and platform in turn.
+    """All joint centres, of base, then of platform.
 
-    factor : enlarges the errors. spread_factor : enlarges the ellipses, which would often be
-    hidden by the marks if they were drawn as the errors are.
+    factor : enlargement of errors.
+    spread_factor : enlargement of ellipses, which would be hidden by the markers if it were that
+        of errors.
     """
 
     factor: float
@@ -66,13 +69,16 @@ class BeforeAfter:
     joints: tuple[Joint, ...]
 
     def of_side(self, side: str) -> tuple[Joint, ...]:
-        """The joints of base or platform, by leg."""
+        """Joints of base or platform, by leg."""
         return tuple(joint for joint in self.joints if joint.side == side)
 
 
 @dataclass(frozen=True)
 class JointMark:
-    """A joint in a plane view, SVG units. ellipse : rx, ry, angle in degrees."""
+    """Joint in a plane view, SVG units.
+
+    ellipse : half axes rx and ry, and angle in degrees.
+    """
 
     leg: int
     side: str
@@ -84,9 +90,11 @@ class JointMark:
 
 @dataclass(frozen=True)
 class Projection:
-    """The scene from one direction. limbs : by the drawing, each from its arm to the platform.
+    """Scene in one direction.
 
-    grid : (horizontal?, place, text). labels : (x, y, text).
+    limbs : of the nominal model, each from its arm to the platform.
+    grid : (horizontal?, position, text).
+    labels : (x, y, text).
     """
 
     title: str
@@ -105,12 +113,12 @@ def section(
     estimate: Estimate,
     centres: tuple[Centres, ...],
 ) -> Part:
-    """The section."""
-    drawn = scene_of(session, estimate, centres)
+    """Section of the report."""
+    scene = scene_of(session, estimate, centres)
     return Part(
         "geometry",
         "Geometry before and after",
-        (page.filled_template("geometry.html.j2", scene=drawn),),
+        (page.filled_template("geometry.html.j2", scene=scene),),
         plots=(
             Plot(
                 "space",
@@ -118,21 +126,22 @@ def section(
                 "Drag to turn, wheel or pinch to come nearer.",
                 "The machine in three dimensions: joint centres by the drawing and as calibrated."
                 " The two plane views show the same.",
-                figure_of(drawn),
+                figure_of(scene),
                 height=420,
             ),
         ),
-        html=page.filled_template("views.html.j2", views=plane_projections(drawn)),
+        html=page.filled_template("views.html.j2", views=plane_projections(scene)),
         menu="Geometry",
     )
 
 
 def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> BeforeAfter:
-    """Joint centres at home with their errors enlarged by a round factor."""
+    """Joint centres at home, errors enlarged by a round factor."""
     try:
         home = session.machine.home()
-    except PkmcalError:  # the drawing has none: the first pose that was seen
+    except PkmcalError:  # no home in the nominal model: use the first pose with data
         home = estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
+    # errors are enlarged to a fixed share of the machine's radius
     placed = {"base": np.eye(4), "platform": home}
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
@@ -144,7 +153,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
-        display = drawing + factor * (apply(T, side.calibrated) - drawing)
+        enlarged = drawing + factor * (apply(T, side.calibrated) - drawing)
         spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
         for j in range(len(drawing)):
             dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
@@ -152,16 +161,16 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
                 f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
                 f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
             )
-            arm = np.stack([drawing[j], display[j]])[:, None]
+            arm = np.stack([drawing[j], enlarged[j]])[:, None]
             if side.side == "base":
                 old = apply(side.T_calibrated_drawing, before[j])
                 arm = np.stack([old, old + factor * (after[j] - old)])
-            joints.append(Joint(j + 1, side.side, drawing[j], display[j], spread[j], tip, arm))
+            joints.append(Joint(j + 1, side.side, drawing[j], enlarged[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
 def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
-    """From above, and from the side that parts the base joints best."""
+    """Views from above, and from the side in which the base joints are best separated."""
     base = np.array([joint.drawing for joint in scene.of_side("base")])
     gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
     across = int(np.argmax(gaps))
@@ -172,18 +181,20 @@ def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
 
 
 def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
-    """Project the scene on two axes, the second one upwards."""
+    """Projection of the scene onto two axes, the second one upwards."""
     pick = list(axes)
-    drawn = np.array([joint.drawing[pick] for joint in scene.joints])
-    visible = np.array([joint.displaced[pick] for joint in scene.joints])
+    nominal = np.array([joint.drawing[pick] for joint in scene.joints])
+    displaced = np.array([joint.displaced[pick] for joint in scene.joints])
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
-    corners = np.concatenate([drawn, visible, *arms])
+    # scale and limits, so that all points fit into the width of a chart
+    corners = np.concatenate([nominal, displaced, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = (CHART_WIDTH - 2 * PLANE_VIEW_MARGIN) / (high - low).max()
     width, height = CHART_WIDTH, float((high - low)[1] * scale + 2 * PLANE_VIEW_MARGIN)
     left = (width - float((high - low)[0]) * scale) / 2
 
     def place(point: Array) -> tuple[float, float]:
+        """SVG coordinates of a point (2,), m."""
         x, y = (point - low) * scale
         return round(left + float(x), 1), round(height - PLANE_VIEW_MARGIN - float(y), 1)
 
@@ -192,9 +203,9 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         JointMark(
             j.leg, j.side, place(d), place(s), _ellipse(j.spread[np.ix_(pick, pick)], scale), j.tip
         )
-        for j, d, s in zip(scene.joints, drawn, visible, strict=True)
+        for j, d, s in zip(scene.joints, nominal, displaced, strict=True)
     )
-    half = len(marks) // 2  # base joints first, then the platform's
+    half = len(marks) // 2  # base joints come first, then the platform's
     return Projection(
         title=title,
         alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
@@ -213,7 +224,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
 
 
 def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
-    """Half axes (SVG units) and turn (degrees, y downwards) of ``ELLIPSE_SIGMAS`` sigma."""
+    """Half axes (SVG units) and angle (degrees, y downwards) of the ``ELLIPSE_SIGMAS`` ellipse."""
     values, vectors = np.linalg.eigh(spread)
     ry, rx = ELLIPSE_SIGMAS * scale * np.sqrt(np.maximum(values, 0))
     angle = -np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
@@ -223,7 +234,7 @@ def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
 def _grid(
     low: Array, high: Array, place: Callable[[Array], tuple[float, float]]
 ) -> tuple[tuple[bool, float, str], ...]:
-    """Lines every 100 mm (or a round multiple), with their coordinate."""
+    """Grid lines every 100 mm, or a multiple, with their coordinate."""
     step = 0.1 * max(1, round(float((high - low).max()) / 0.6))
     lines: list[tuple[bool, float, str]] = []
     for axis, level in ((0, False), (1, True)):
@@ -238,7 +249,10 @@ def _grid(
 def _labels(
     marks: tuple[JointMark, ...], centre: tuple[float, float]
 ) -> tuple[tuple[float, float, str], ...]:
-    """Leg numbers beside their marks, away from the middle; those that would meet share one."""
+    """Leg numbers beside their marks, away from the centre.
+
+    Numbers that would overlap share a label.
+    """
     placed: list[tuple[float, float, list[int]]] = []
     for mark in marks:
         dx, dy = mark.drawing[0] - centre[0], mark.drawing[1] - centre[1]
@@ -290,7 +304,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
 
 
 def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
-    """Three rings of every centre's ellipsoid, along its principal planes."""
+    """Three rings of each centre's ellipsoid, in its principal planes."""
     angle = np.linspace(0, 2 * np.pi, ELLIPSOID_RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     segments: list[Array] = []
@@ -304,7 +318,7 @@ def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
 
 
 def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:
-    """Markers of the drawing's centres with leg numbers and tooltips."""
+    """Markers of the nominal centres with leg numbers and tooltips."""
     joints = (*base, *platform)
     style = {
         "size": 5,

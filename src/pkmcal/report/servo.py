@@ -1,4 +1,4 @@
-"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image."""
+"""Study of visual servoing as an outcome, as in [B] Fig. 10: curves, an animation, the image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_la
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
-"""Choices of legs told of each number of them."""
+"""Listed sets of legs of each size."""
 SERVO_ESTIMATE_COLOURS = {
     "true": "--quiet",
     "identified": "--drawing",
@@ -26,13 +26,13 @@ SERVO_ESTIMATE_COLOURS = {
 }
 SERVO_BAND_COLOURS = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
 ANIMATION_FRAMES = 60
-"""Pictures of the animation; more only make the page heavy."""
+"""Frames of the animation; more would only make the page large."""
 SERVO_CURVE_POINTS = 300
 """Points of a curve."""
 LEAST_SERVO_ERROR_SHARE = 1e-5
-"""Part of the error's start below which a curve tells nothing."""
+"""Lower limit of curves, as a share of the initial error."""
 SERVO_EDGE_PLACES = 17
-"""Places along an edge that is drawn; edges are curves in a mirror."""
+"""Points along a drawn edge; in a mirror edges are curved."""
 SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
     " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
@@ -47,7 +47,7 @@ SERVO_METHOD_TEXT = (
 
 
 def outcome_of(study: Study) -> Outcome:
-    """Everything that `pkmcal servo` tells and writes."""
+    """Outcome of `pkmcal servo`."""
     verdict, run = judgement(study), example_run(study)
     document = servo_document(study, verdict)
     ends = ends_table(study)
@@ -123,21 +123,21 @@ def outcome_of(study: Study) -> Outcome:
 
 
 def stillness(s: Study) -> str:
-    """How still the platform is held, in a sentence."""
+    """Sentence on the platform's motion when held at the goal."""
     position, turn = rms(s.held.position), rms(s.held.turn)
-    one, one_turn = rms(s.image.position), rms(s.image.turn)
+    image_position, image_turn = rms(s.image.position), rms(s.image.turn)
     if not position > 0:
         return "The edges are without noise."
     return (
         f"Held at its goal, noise of {s.plan.loop.noise.shift:g} px moves the platform by"
         f" {brief(1e3 * position)} mm and {brief(np.rad2deg(turn))}° (root mean square);"
-        f" one image alone is good to {brief(1e3 * one)} mm and"
-        f" {brief(np.rad2deg(one_turn))}°."
+        f" one image alone is good to {brief(1e3 * image_position)} mm and"
+        f" {brief(np.rad2deg(image_turn))}°."
     )
 
 
 def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
-    """Plain data for JSON: m, rad, s; legs count from 1."""
+    """Study as plain data: m, rad, s; legs count from 1."""
     return {
         "machine": s.scene.machine.name,
         "origin": s.scene.origin,
@@ -180,15 +180,17 @@ def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
 
 
 def example_run(study: Study) -> int:
-    """The run that is drawn: the one whose estimate by hand leaves the way farthest, of those that
-    all estimates bring to their goal.
+    """Index of the run that is drawn.
+
+    Of the runs in which all estimates reach the goal, the one in which the estimate by hand strays
+    farthest from the path.
     """
     everywhere = np.all([o.runs.reached for o in study.outcomes], axis=0)
     return int(np.argmax(np.where(everywhere, study.outcome("hand").astray, -1.0)))
 
 
 def servo_cards(s: Study) -> tuple[Figure, ...]:
-    """The main numbers."""
+    """Main numbers."""
     good, hand = s.outcome("identified"), s.outcome("hand")
     n = s.plan.runs
     return (
@@ -226,7 +228,7 @@ def servo_cards(s: Study) -> tuple[Figure, ...]:
 
 
 def outcome_table(study: Study) -> Table:
-    """One row an estimate."""
+    """Table with a row for each estimate."""
     rows = [
         Row(
             o.estimate.title,
@@ -262,7 +264,7 @@ def outcome_table(study: Study) -> Table:
 
 
 def ends_table(study: Study) -> Table | None:
-    """How runs ended that failed; None where none did."""
+    """Table of how failed runs ended; None without failed runs."""
     kinds = {end for o in study.outcomes for end in o.ends if not end.good}
     if not kinds:
         return None
@@ -275,19 +277,19 @@ def ends_table(study: Study) -> Table | None:
 
 
 def choices_table(s: Study) -> Table:
-    """Which legs must be seen."""
+    """Table of the sets of legs that have to be observed."""
     useful = [c for c in s.choices if not c.blind]
     sizes = sorted({len(c.legs) for c in useful})
-    display = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
-    if s.own not in display:
-        display = [s.own, *display]
+    listed = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
+    if s.own not in listed:
+        listed = [s.own, *listed]
     rows = [
         Row(
             chosen_legs(c, s) + (", as seen" if c == s.own else ""),
             (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
              if c.fading else "yes"),
         )
-        for c in display
+        for c in listed
     ]  # fmt: skip
     return Table(
         f"Which legs must be seen, by their {s.plan.loop.law}",
@@ -301,7 +303,7 @@ def choices_table(s: Study) -> Table:
 
 
 def settings_table(study: Study) -> Table:
-    """What was simulated."""
+    """Table of the simulation's settings."""
     s, units = _settings(study), dict.fromkeys(study.eye.true.machine.joint_units)
     s |= {
         "hand_position": 1e3 * s["hand_position"],
@@ -327,6 +329,7 @@ def settings_table(study: Study) -> Table:
 
 
 def _run_words(value: Any) -> str:
+    """Setting as text."""
     if isinstance(value, list):
         return ", ".join(str(item) for item in value)
     return (
@@ -335,6 +338,7 @@ def _run_words(value: Any) -> str:
 
 
 def _settings(s: Study) -> dict[str, Any]:
+    """Settings as plain data."""
     loop, plan = s.plan.loop, s.plan
     return {
         "law": loop.law,
@@ -354,15 +358,16 @@ def _settings(s: Study) -> dict[str, Any]:
 
 
 def _outcome_document(o: Trials) -> dict[str, Any]:
+    """Runs of one estimate as plain data."""
     return {
         "title": o.estimate.title,
         "reached": o.reached,
         "ends": {end.word: n for end, n in o.ends.items()},
-        "astray_median": _over(o.astray, o, np.median),
-        "astray_largest": _over(o.astray, o, np.max),
-        "overshoot_median": _over(o.overshoot, o, np.median),
-        "overshoot_largest": _over(o.overshoot, o, np.max),
-        "error_rise_largest": _over(o.rise, o, np.max),
+        "astray_median": _statistic(o.astray, o, np.median),
+        "astray_largest": _statistic(o.astray, o, np.max),
+        "overshoot_median": _statistic(o.overshoot, o, np.median),
+        "overshoot_largest": _statistic(o.overshoot, o, np.max),
+        "error_rise_largest": _statistic(o.rise, o, np.max),
         "settling_median": _settled(o),
         "runs": [
             {"end": end.word, "way": sense, "astray": off, "overshoot": over, "settling": settling}
@@ -373,36 +378,38 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
     }
 
 
-def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
-    """A figure over the runs that reached the goal."""
+def _statistic(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
+    """Statistic over the runs that reached the goal, None without any."""
     good = values[o.runs.reached]
     return float(of(good)) if good.size else None
 
 
 def _percent(values: Any, o: Trials) -> str:
-    """Parts of a way, the largest of the runs that reached the goal."""
-    value = _over(values, o, np.max)
+    """Largest value over the runs that reached the goal, as a percentage."""
+    value = _statistic(values, o, np.max)
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
 def _mm(values: Array, o: Trials, of: Callable[[Any], Any] = np.median) -> str:
-    """Metres, of the runs that reached the goal, as millimetres."""
-    value = _over(values, o, of)
+    """Statistic in m over the runs that reached the goal, as millimetres."""
+    value = _statistic(values, o, of)
     return "–" if value is None else _magnitude(1e3 * value)
 
 
 def _settled(o: Trials) -> float | None:
-    """Median time (s) of the runs that came to rest at the goal, of which there may be none."""
+    """Median settling time (s) of the runs that came to rest at the goal, None without any."""
     finite = o.settling[np.isfinite(o.settling)]
     return float(np.median(finite)) if finite.size else None
 
 
 def _seconds(o: Trials) -> str:
+    """Settling time in words."""
     time = _settled(o)
     return "–" if time is None else f"{time:.1f}"
 
 
 def _magnitude(value: float) -> str:
+    """Magnitude with two digits, or 0."""
     return brief(value) if value > 0 else "0"
 
 
@@ -410,26 +417,29 @@ def _magnitude(value: float) -> str:
 
 
 def shares(o: Trials, values: Array) -> Array:
-    """Values (R, K) as parts of the start's, of the runs that reached the goal; of all where none
-    did.
+    """Values (R, K) relative to the start, of the runs that reached the goal.
+
+    Of all runs if none did.
     """
     rows = o.runs.reached if o.reached else np.ones(len(values), dtype=bool)
     return values[rows] / np.maximum(values[rows, :1], 1e-300)
 
 
-def _every(samples: int, most: int) -> Integers:
+def _sample_rows(samples: int, most: int) -> Integers:
+    """Indices of at most ``most`` samples at equal distances."""
     return np.unique(np.linspace(0, samples - 1, min(samples, most)).round().astype(int))
 
 
-def _rounded(values: Array, digits: int = 4) -> list[float]:
+def _significant(values: Array, digits: int = 4) -> list[float]:
+    """Numbers with so many significant digits."""
     return [float(f"{v:.{digits}g}") for v in values]
 
 
 def curves(s: Study) -> dict[str, Any]:
-    """Norm of the error against time, a line and a band for each estimate."""
+    """Plot of the error's norm against time, a line and a band for each estimate."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), SERVO_CURVE_POINTS)
+    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
         values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST_SERVO_ERROR_SHARE)
         name = o.estimate.name
@@ -446,10 +456,10 @@ def curves(s: Study) -> dict[str, Any]:
 
 
 def tail(s: Study) -> dict[str, Any]:
-    """Distance from the goal, as a part of the way, enlarged near zero."""
+    """Plot of the distance from the goal as a share of the path, enlarged near zero."""
     data: list[dict[str, Any]] = []
     time = s.outcomes[0].runs.time
-    rows = _every(len(time), SERVO_CURVE_POINTS)
+    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
     for o in s.outcomes:
         values = 100 * np.median(shares(o, o.runs.travel)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
@@ -459,23 +469,27 @@ def tail(s: Study) -> dict[str, Any]:
 
 
 def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
+    """Trace of an estimate."""
     dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
     style = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
     entries = {"hoverinfo": "all", "hovertemplate": hover}
-    return _flat(o.estimate.title, _rounded(time), _rounded(values), style, **entries)
+    return _line_trace(o.estimate.title, _significant(time), _significant(values), style, **entries)
 
 
-def _flat(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """A trace of a line in the plane."""
+def _line_trace(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Trace of a line in the plane."""
     plain = {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": y}
     return {**plain, "line": style, "hoverinfo": "skip", **more}
 
 
 def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
+    """Trace of the band between the smallest and the largest of all runs."""
     both = np.concatenate([time, time[::-1]])
     edge = np.concatenate([values.max(axis=0), values.min(axis=0)[::-1]])
     fill = {"fill": "toself", "fillcolor": colour, "showlegend": False}
-    return _flat(f"{name}, all runs", _rounded(both), _rounded(edge), {"width": 0}, **fill)
+    return _line_trace(
+        f"{name}, all runs", _significant(both), _significant(edge), {"width": 0}, **fill
+    )
 
 
 # ------------------------------------------------------------------ in space
@@ -489,23 +503,26 @@ def _limbs(s: Study, poses: Array) -> tuple[Array, Array]:
 
 
 def _moving(s: Study, pose: Array) -> list[dict[str, Any]]:
-    """Coordinates of what moves, one a trace: each leg, then the platform."""
+    """Coordinates of the moving traces: each leg, then the platform."""
     a, b = (v[0] for v in _limbs(s, pose[None]))
     legs = (coordinates([np.stack(ends)]) for ends in zip(a, b, strict=True))
     return [dict(leg) for leg in legs] + [dict(coordinates([ring(b)]))]
 
 
 def space(s: Study, run: int) -> dict[str, Any]:
-    """The machine on its way; what moves comes first, so that frames name it by its place."""
-    run_numbers = s.outcome("identified").runs
-    start, goal = run_numbers.T_base_platform[run, 0], run_numbers.goals[run]
-    in_view = set(s.eye.true.legs.tolist())
+    """Plot of the machine on its path.
+
+    Moving traces come first, so that frames refer to them by index.
+    """
+    runs = s.outcome("identified").runs
+    start, goal = runs.T_base_platform[run, 0], runs.goals[run]
+    observed = set(s.eye.true.legs.tolist())
     *legs, platform = _moving(s, start)
     data = [
         line(
-            f"leg {j + 1}" + ("" if j in in_view else ", not seen"),
-            f"--leg{j % N_COLOURS + 1}" if j in in_view else "--quiet",
-            8 if j in in_view else 4,
+            f"leg {j + 1}" + ("" if j in observed else ", not seen"),
+            f"--leg{j % N_COLOURS + 1}" if j in observed else "--quiet",
+            8 if j in observed else 4,
             (),
             **leg,
         )
@@ -519,7 +536,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     data.append(dashed)
     for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
         o = s.outcome(name)
-        poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
+        poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
         middle = _limbs(s, poses)[1].mean(axis=1)
         data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
     camera = markers(
@@ -542,10 +559,10 @@ def space(s: Study, run: int) -> dict[str, Any]:
 
 
 def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
-    """The pictures of :func:`space`'s animation."""
+    """Frames of the animation of :func:`space`."""
     runs = s.outcome("identified").runs
     out: list[dict[str, Any]] = []
-    for row in _every(int(runs.last[run]) + 1, ANIMATION_FRAMES):
+    for row in _sample_rows(int(runs.last[run]) + 1, ANIMATION_FRAMES):
         moving = _moving(s, runs.T_base_platform[run, row])
         out.append(
             {
@@ -558,7 +575,7 @@ def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
 
 
 def _player() -> dict[str, Any]:
-    """The buttons that play the animation."""
+    """Buttons of the animation."""
     still = {"transition": {"duration": 0}}
     play = {"frame": {"duration": 60, "redraw": True}, "fromcurrent": True, **still}
     pause = {"frame": {"duration": 0, "redraw": False}, "mode": "immediate", **still}
@@ -584,17 +601,17 @@ def _player() -> dict[str, Any]:
 
 
 def image(s: Study, run: int) -> dict[str, Any]:
-    """Edges at start and goal, the ways of their ends, and the image's frame."""
+    """Plot of edges at start and goal, paths of their ends, and the border of the image."""
     width, height = s.eye.camera.image_size
     right, bottom = width - 0.5, height - 0.5
     x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
-    data = [_flat("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
+    data = [_line_trace("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
     runs = s.outcome("identified").runs
     first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
     data += _edges(s, first, 1.2, "at the start", "dot")
     data += _edges(s, goal, 2.6, "at the goal", "solid")
-    data += _ways(s, run, "identified", "solid")
-    data += _ways(s, run, "hand", "dash")
+    data += _end_paths(s, run, "identified", "solid")
+    data += _end_paths(s, run, "hand", "dash")
     layout = plane("x, pixels", "y, pixels")
     layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width], "constrain": "domain"}
     layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "constrain": "domain"}
@@ -603,15 +620,16 @@ def image(s: Study, run: int) -> dict[str, Any]:
 
 
 def _pixels(s: Study, poses: Array, places: int) -> Array:
-    """Pixels (n, E, places, 2) along the edges of the seen legs."""
+    """Pixels (n, E, places, 2) along the edges of the observed legs."""
     machine = s.eye.true.machine
     return s.eye.points(poses, np.nan_to_num(machine.inverse(poses)), places).pixel
 
 
 def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[dict[str, Any]]:
+    """Traces of the edges at a pose."""
     pixels = _pixels(s, pose, SERVO_EDGE_PLACES)[0]
     return [
-        _flat(
+        _line_trace(
             f"edges {name}",
             _pixel_list(pixels[e, :, 0]),
             _pixel_list(pixels[e, :, 1]),
@@ -623,16 +641,16 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
     ]
 
 
-def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
-    """Ways of both ends of each leg's first edge."""
+def _end_paths(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
+    """Traces of the paths of both ends of each leg's first edge."""
     o = s.outcome(name)
-    poses = o.runs.T_base_platform[run][_every(len(o.runs.time), ANIMATION_FRAMES)]
+    poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
     pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
     data: list[dict[str, Any]] = []
     for e in range(0, len(s.eye.tubes.leg), 2):
         ways = np.concatenate([pixels[:, e, 0], gap, pixels[:, e, -1]])
         data.append(
-            _flat(
+            _line_trace(
                 f"way, {o.estimate.title.lower()}",
                 _pixel_list(ways[:, 0]),
                 _pixel_list(ways[:, 1]),
@@ -645,4 +663,5 @@ def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
 
 
 def _pixel_list(values: Array) -> list[float | None]:
+    """Pixels with one decimal, None for NaN."""
     return [round(float(v), 1) if np.isfinite(v) else None for v in values]

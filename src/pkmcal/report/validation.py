@@ -1,4 +1,4 @@
-"""What a validation found, as an outcome, and what is told of held-out configurations."""
+"""Validation as an outcome, and the report section on held-out configurations."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
     " platform are estimated from the photographs; a configuration's own readings have no part in"
     " its pose, and where photographs leave open where a camera or a board is, the readings of the"
-    " other configurations tell. The readings are then predictions. The drawing is judged in the"
+    " other configurations decide. The readings are then predictions. The drawing is judged in the"
     " same way, frames laid over each other, on the poses that suit it best.",
     "The uncertainty of “times better” is from drawing the configurations again at random"
-    " (bootstrap). Directions count by how well the photographs see them: one photograph tells"
-    " depth poorly, and there any two machines look alike.",
+    " (bootstrap). Directions count by how well the photographs see them: one photograph"
+    " determines depth poorly, and there any two machines look the same.",
     "The promise holds the calibration's covariance and the noise of these photographs and"
     " readings. It is broken where chance explains the residuals less than once in a thousand times"
     " even if all deviations were half as large again.",
@@ -31,7 +31,7 @@ VALIDATION_METHOD_TEXT = (
 
 
 def outcome_of(v: Validation) -> Outcome:
-    """Everything that ``pkmcal validate`` tells and writes."""
+    """Outcome of ``pkmcal validate``."""
     prior = [n for n, flag in zip(v.session.configurations, v.calibrated, strict=True) if flag]
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
     sentences = (
@@ -61,9 +61,9 @@ def outcome_of(v: Validation) -> Outcome:
 
 
 def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
-    """The main numbers."""
+    """Main numbers."""
     session, again = v.session, int(v.repeated[judged.rows].sum())
-    new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
+    calibrated, nominal = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
     weighed = ""
     if unit:
@@ -80,11 +80,12 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
         Figure(
             "Where is the tool, by the readings?",
             tuple(
-                (_size(value, unit), DISPLAY_UNITS[unit][1])
-                for value, unit in ((new.position, "m"), (new.orientation, "rad"))
+                (_magnitude(value, unit), DISPLAY_UNITS[unit][1])
+                for value, unit in ((calibrated.position, "m"), (calibrated.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
-            f" the drawing {amount(old.position, 'm')} and {amount(old.orientation, 'rad')}",
+            f" the drawing {amount(nominal.position, 'm')} and"
+            f" {amount(nominal.orientation, 'rad')}",
         ),
         Figure(
             "Is the promise kept?",
@@ -101,8 +102,8 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
 
 
 def _readings(judged: BesideDrawing, session: Session) -> Part:
-    """New data: charts, the readings' residuals, [C] Table 3, and the tool point's errors."""
-    old, new = judged.figures(judged.drawing), judged.figures(judged.calibrated)
+    """Section on readings and tool: charts, residuals as in [C] Table 3, and tool point errors."""
+    nominal, calibrated = judged.figures(judged.drawing), judged.figures(judged.calibrated)
     test = judged.promise
     residuals = Table(
         "Readings: measured less predicted",
@@ -111,11 +112,11 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
             Row(
                 name,
                 (
-                    *_mean_rms(old, k, unit),
-                    *_mean_rms(new, k, unit),
-                    _size(test.joint_rms[k], unit),
+                    *_mean_rms(nominal, k, unit),
+                    *_mean_rms(calibrated, k, unit),
+                    _magnitude(test.joint_rms[k], unit),
                     _signed(test.common[k], test.common_sigma[k], unit),
-                    _size(test.common_sigma[k], unit),
+                    _magnitude(test.common_sigma[k], unit),
                 ),
             )
             for k, (name, unit) in enumerate(_joints(session))
@@ -128,8 +129,8 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
         "Tool point: forward kinematics of the readings against the photographs",
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
-            Row(name, (_size(f.position, "m"), _size(f.orientation, "rad")))
-            for name, f in (("Drawing", old), ("Calibrated", new))
+            Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
+            for name, f in (("Drawing", nominal), ("Calibrated", calibrated))
         ),
         "Root mean squares, frames laid over each other for the drawing. The photographs' own noise"
         " is in both.",
@@ -139,7 +140,7 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
 
 
 def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
-    """Regions held out, one a row."""
+    """Table of held-out regions."""
     unit = _unit(session)
 
     def text(value: float) -> str:
@@ -172,10 +173,10 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
 
 
 def paths_table(paths: tuple[LinePath, ...]) -> Table:
-    """Straight paths, [C] Table 4."""
+    """Table of straight paths, as in [C] Table 4."""
 
     def text(value: Straightness | None) -> str:
-        return f"{_size(value.rms, 'm')} ({_size(value.largest, 'm')})" if value else "–"
+        return f"{_magnitude(value.rms, 'm')} ({_magnitude(value.largest, 'm')})" if value else "–"
 
     rows = [
         Row(path.name, (str(path.n), *map(text, (path.seen, path.drawing, path.calibrated))))
@@ -191,30 +192,30 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
 
 
 def held_out_part(item: HoldOut, session: Session) -> Part:
-    """What a calibration's report says of configurations held out of it."""
+    """Report section on the configurations held out of a calibration."""
     out, used, unit = item.left_out, item.used, _unit(session)
     amounts = inside = ""
     if unit:
         amounts = f": {against(out.after, out.before, unit)}"
         inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
-    retained = "" if out.promise.holds else " That is more than the deviations promise."
+    broken = "" if out.promise.holds else " That is more than the deviations promise."
     held = count(len(out.rows), "configuration")
     poses = len(np.unique(same_pose(session.joints[out.rows], session.joint_noise)))
     if poses < len(out.rows):
         held += f" of {count(poses, 'pose')}"
     sentence = (
         f"On {held} held out, the calibrated machine predicts the"
-        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{retained}"
+        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{broken}"
     )
-    in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
-    drawn = out.figures(out.drawing)
+    in_use, held_out = used.figures(used.calibrated), out.figures(out.calibrated)
+    nominal = out.figures(out.drawing)
     rows = [
         Row(
             name,
             (
                 *_mean_rms(in_use, k, unit),
-                *_mean_rms(new, k, unit),
-                _size(drawn.joint_rms[k], unit),
+                *_mean_rms(held_out, k, unit),
+                _magnitude(nominal.joint_rms[k], unit),
             ),
         )
         for k, (name, unit) in enumerate(_joints(session))
@@ -223,7 +224,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         ("tool position, mm", "position", "m"),
         ("tool orientation, °", "orientation", "rad"),
     ):
-        cells = [_size(getattr(f, field), unit) for f in (in_use, new, drawn)]
+        cells = [_magnitude(getattr(f, field), unit) for f in (in_use, held_out, nominal)]
         rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
     table = Table(
         "Residuals of configurations in use and held out",
@@ -237,37 +238,38 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
 
 
 def _joints(session: Session) -> list[tuple[str, str]]:
-    """Name with unit for a table's row, and m or rad, of each reading."""
+    """Name with unit, and unit m or rad, of each reading."""
     names, units = session.document["joints"]["columns"], session.machine.joint_units
     return [(f"{n}, {DISPLAY_UNITS[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
 
 
 def _unit(session: Session) -> str | None:
-    """The unit of all readings, None where they differ."""
+    """Unit of all readings, None if they differ."""
     units = session.machine.joint_units
     return units[0] if len(set(units)) == 1 else None
 
 
 def _mean_rms(value: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
-    """A joint's mean with the digits of its root mean square, and that."""
+    """Mean and root mean square of a joint's residuals, with the same digits."""
     root = value.joint_rms[k]
-    return _signed(value.joint_mean[k], root, unit), _size(root, unit)
+    return _signed(value.joint_mean[k], root, unit), _magnitude(root, unit)
 
 
 def _signed(value: float, sigma: float, unit: str) -> str:
-    """A number with the digits that ``sigma`` deserves."""
+    """Number with the digits that ``sigma`` justifies."""
     scale = DISPLAY_UNITS[unit][0]
     return number(value * scale, decimals(sigma * scale), signed=True)
 
 
-def _size(value: float, unit: str) -> str:
-    """A magnitude in the unit that people read, two significant digits."""
+def _magnitude(value: float, unit: str) -> str:
+    """Magnitude in the displayed unit, two significant digits."""
     return brief(value * DISPLAY_UNITS[unit][0])
 
 
 def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
-    """Residuals of the readings by configuration: bars of the calibrated machine, a line of the
-    drawing.
+    """Residuals of readings by configuration.
+
+    Bars for the calibrated machine, a line for the nominal model.
     """
     unit = _unit(session)
     if unit is None:
@@ -295,10 +297,10 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
 
 
 def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None:
-    """The calibrated machine's residuals in the standard deviations that are promised."""
-    values = judged.calibrated.residuals / judged.promise.expected
+    """Residuals of the calibrated machine, in predicted standard deviations."""
+    normalized = judged.calibrated.residuals / judged.promise.expected
     boxes = [
-        charts.box(name, values[:, k], "σ", 1, k + 1)
+        charts.box(name, normalized[:, k], "σ", 1, k + 1)
         for k, name in enumerate(session.document["joints"]["columns"])
     ]
     return charts.row_chart(

@@ -1,4 +1,4 @@
-"""What a look at a calibrated machine found, as an outcome: its tests as tables and pictures."""
+"""Test of a calibrated machine for changes as an outcome: tables and charts of its tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, named, n
 
 NO_VALUE_SIGN = "–"
 LARGE_RESIDUAL_SIGMAS = 2.0
-"""Standard deviations from which on a configuration's residuals stand out."""
+"""Standard deviations above which a configuration's residuals are emphasized."""
 WATCH_METHOD_TEXT = (
     "Nothing is calibrated anew. The machine is held as the calibration left it; every pose of the"
     " platform, and where cameras and boards stand, are found from the new data. What is left over"
@@ -22,23 +22,23 @@ WATCH_METHOD_TEXT = (
     " poses, stations, edge shifts and shading cannot take it up. Each leg is then tested for a"
     " change of its numbers: a score test, chi-square of as many degrees of freedom as these data"
     " see.",
-    "A camera's place costs six freedoms, unless it is said to have been left in place: what moves"
-    " all of the machine against its camera is not seen then. Directions in which"
-    " a change by the drawing's whole tolerance would make less than one standard deviation are"
+    "A camera's place costs six freedoms, unless it is stated to have been left in place: what"
+    " moves all of the machine against its camera is not seen then. Directions in which a"
+    " change by the drawing's whole tolerance would make less than one standard deviation are"
     " left out.",
 )
 
 
 FIXED_STATION_TEXT = (
-    "Where the calibration had a camera is known as well as its covariance with the machine tells,"
-    " most of which the photographs of both share. Whether such a camera was moved is tested as"
-    " well; a base that moved against its camera looks the same."
+    "A camera's place in the calibration is used with its covariance, most of which it shares with"
+    " the machine. Whether such a camera was moved is tested as well; a base that moved against its"
+    " camera looks the same."
 )
 
 
 def outcome_of(w: Watch) -> Outcome:
-    """Everything that ``pkmcal watch`` tells and writes."""
-    value, bars = _findings_table(w), _by_configuration(w)
+    """Outcome of ``pkmcal watch``."""
+    causes, bars = _findings_table(w), _by_configuration(w)
     parts = (
         Part(
             "legs",
@@ -46,7 +46,7 @@ def outcome_of(w: Watch) -> Outcome:
             html=charts.panels(_statistics(w), _zeros(w)),
             tables=(legs_table(w), _others_table(w)),
         ),
-        Part("causes", "Causes", tables=(value,)) if value else None,
+        Part("causes", "Causes", tables=(causes,)) if causes else None,
         Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
         _how(w),
     )
@@ -65,10 +65,11 @@ def outcome_of(w: Watch) -> Outcome:
 
 
 def _how(w: Watch) -> Part:
+    """Section on the method."""
     poses = w.session.board or w.session.trackers
     allowed = (
         "Several tests are made, so each chance is adjusted: noise is drawn 20 000 times through"
-        " the same tests, and the share in which any of them comes out as small is told. So"
+        " the same tests, and the share in which any of them comes out as small is given. So"
         f" {w.judged.alpha:g} of machines that did not change are flagged. The noise is"
         f" {w.noise_scale:.2f} times the stated one of edges"
         + (f" and {w.pose_scale:.2f} times that of poses" if poses else "")
@@ -82,15 +83,15 @@ def _how(w: Watch) -> Part:
 
 
 def stamp(w: Watch) -> str:
-    """The verdict in a word or three."""
+    """Verdict in one to three words."""
     if w.verdict.usable:
         return "Still as calibrated"
     parts = {f.suspect.cause.part for f in w.judged.findings}
-    return "Changed" if w.judged.changed and parts != {"camera"} else "Cannot be told"
+    return "Changed" if w.judged.changed and parts != {"camera"} else "Undecided"
 
 
 def _cards(w: Watch) -> tuple[Figure, ...]:
-    """The main numbers."""
+    """Main numbers."""
     judged = w.judged
     named_tests = [(named(leg.legs), leg.chance) for leg in judged.legs]
     named_tests += [("all legs together", judged.machine.adjusted)]
@@ -125,7 +126,7 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
 
 
 def legs_table(w: Watch) -> Table:
-    """One row a leg: statistics, chance, its zero's change, and what would have been found."""
+    """Table with a row for each leg: statistics, chance, change of its zero, detectable changes."""
     rows = [
         Row(
             named(leg.legs).capitalize(),
@@ -161,7 +162,7 @@ def legs_table(w: Watch) -> Table:
 
 
 def _others_table(w: Watch) -> Table:
-    """Tests of all legs together."""
+    """Table of the tests of all legs together."""
     j = w.judged
     scale = j.scale_change
     text = NO_VALUE_SIGN
@@ -185,13 +186,16 @@ def _others_table(w: Watch) -> Table:
 
 
 def _findings_table(w: Watch) -> Table | None:
-    """What explains a change, best first, with what these data cannot tell from it."""
+    """Table of the explanations of a change, the best first.
+
+    Explanations that these data do not separate from it follow each one.
+    """
     if not w.judged.findings:
         return None
-    names = names_of(w.session)
+    station_names = names_of(w.session)
     rows = [
         Row(
-            f"{mark} {cause_words(suspect, names)}",
+            f"{mark} {cause_words(suspect, station_names)}",
             (number(suspect.chi2, 1), str(len(suspect.cause.sizes))),
         )
         for place, finding in enumerate(w.judged.findings, start=1)
@@ -211,7 +215,7 @@ def _findings_table(w: Watch) -> Table | None:
 
 
 def chance_text(chance: float) -> str:
-    """A probability with one or two digits, never zero."""
+    """Probability with one or two digits, never zero."""
     if not np.isfinite(chance):
         return NO_VALUE_SIGN
     if chance < 1e-4:
@@ -220,6 +224,7 @@ def chance_text(chance: float) -> str:
 
 
 def _cells(test: Score) -> tuple[str, str, str]:
+    """Statistic, degrees of freedom and probability of a test, as text."""
     cells = (
         (number(test.chi2, 1), chance_text(test.adjusted))
         if test.dof
@@ -229,26 +234,29 @@ def _cells(test: Score) -> tuple[str, str, str]:
 
 
 def _statistic(test: Score | None) -> str:
+    """Statistic and degrees of freedom of a test, as text."""
     return (
         f"{number(test.chi2, 1)} / {test.dof}" if test is not None and test.dof else NO_VALUE_SIGN
     )
 
 
 def _zero(leg: LegTest) -> str:
+    """Change of a reading's zero, as text."""
     if leg.change is None or leg.zero is None or not leg.zero.dof:
         return NO_VALUE_SIGN
     return signed(float(leg.change.value[0]), float(leg.change.sigma[0]), leg.unit)
 
 
 def _span(sizes: tuple[float, float]) -> str:
+    """Interval of sizes in mm, as text."""
     texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NO_VALUE_SIGN for v in sizes]
     return NO_VALUE_SIGN if texts == [NO_VALUE_SIGN, NO_VALUE_SIGN] else " to ".join(texts)
 
 
 def _statistics(w: Watch) -> charts.BarChart | None:
-    """Each leg's larger statistic, as a share of its threshold."""
+    """Chart of the larger statistic of each leg, relative to its threshold."""
     bars = [
-        _bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
+        _leg_bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
         for leg in w.judged.legs
         if leg.whole.dof
     ]
@@ -262,7 +270,8 @@ def _statistics(w: Watch) -> charts.BarChart | None:
     )
 
 
-def _bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
+def _leg_bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
+    """Bar of a leg's tests."""
     from scipy.special import chdtri
 
     limits = [float(chdtri(t.dof, level)) for t in tests]
@@ -276,7 +285,7 @@ def _bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
 
 
 def _zeros(w: Watch) -> charts.RowChart | None:
-    """Changes of the readings' zeros: middle half and nine tenths of what they may be."""
+    """Box plots of the changes of the readings' zeros, by their standard deviations."""
     legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
     if not legs or len({leg.unit for leg in legs}) > 1:
         return None
@@ -302,7 +311,7 @@ def _zeros(w: Watch) -> charts.RowChart | None:
 
 
 def _by_configuration(w: Watch) -> charts.BarChart | None:
-    """Residuals of each configuration with the machine held, root mean square."""
+    """Root mean square residual of each configuration with the machine fixed."""
     rows = np.flatnonzero(w.observed)
     values = [float(w.residuals[k]) for k in rows]
     names = [w.session.configurations[k] for k in rows]

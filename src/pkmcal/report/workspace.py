@@ -1,4 +1,4 @@
-"""The map of the tool's error in the report: slices through the workspace, and points in space."""
+"""Report section on the tool's error over the workspace: slices, and points in space."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from pkmcal.wording import brief, count, number
 SLICE_ROW_HEIGHT = 170
 """Height of a row of slices, px."""
 SLICES_MARGIN, SLICES_RIGHT_MARGIN, SLICES_TOP_MARGIN, SLICES_BOTTOM_MARGIN = 92, 74, 26, 40
-"""Margins round the slices, px, in which their names, the legend and the axes' numbers stand."""
+"""Margins around the slices, px, for names, legend and tick labels."""
 SLICE_GAP_SHARE = 0.045
-"""Between slices, as a part of the width."""
+"""Gap between slices, in widths of the plot."""
 POSE_NEAR_SLICE_SHARE = 0.2
-"""Of the poses' extent across a slice: how far from it a photographed pose is drawn in it."""
+"""Largest distance of a pose that is drawn in a slice, in extents of the poses across it."""
 THIN_EXTENT_SHARE = 0.2
-"""Part of the widest extent below which a coordinate's own tells nothing."""
+"""Least extent of a coordinate worth an axis, in extents of the widest."""
 LEAST_TURN_DRAWN = 1.0
-"""Degrees; what turns less is not drawn."""
+"""Least range of a rotation that is drawn, degrees."""
 SLICES_READING_TEXT = (
     "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
     " measured, near the slice. By the drawing: how sure the platform would be by the drawing's"
@@ -50,7 +50,7 @@ TOO_NARROW_TEXT = "The workspace has an extent along one axis at most, so there 
 
 
 def section(session: Session, estimate: Estimate, tool_map: ToolMap | str, links: Links) -> Part:
-    """The section; of a machine without a map the sentence that says why."""
+    """Section of the report; for a machine without a map the sentence on the reason."""
     name, title, menu = "workspace", "The tool over the workspace", "Workspace"
     if isinstance(tool_map, str):
         return Part(name, title, (tool_map,), menu=menu)
@@ -73,23 +73,14 @@ def section(session: Session, estimate: Estimate, tool_map: ToolMap | str, links
 
 
 def _narrow(tool_map: ToolMap) -> bool:
-    """Whether the region itself, and not the machine, leaves no plane to cut."""
+    """Whether the region, rather than the machine, leaves no plane for slices."""
     named = any(side is not None and side[0] == side[1] for side in tool_map.region.sides)
     wide = np.ptp(tool_map.evenly[1].T_base_platform[:, :3, 3], axis=0)
     return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
-def _quantities(tool_map: ToolMap) -> tuple[tuple[str, Array], ...]:
-    """What is shown of each pose, m, with its name."""
-    return (
-        ("By the drawing, σ", tool_map.before.position),
-        ("Drawing's error", tool_map.after.off_position),
-        ("Calibrated, σ", tool_map.after.position),
-    )
-
-
 def _headline(tool_map: ToolMap) -> str:
-    """The main figures in a sentence."""
+    """Main numbers in a sentence."""
     _, after = tool_map.evenly
     sigma, off = (x[np.isfinite(x)] * 1e3 for x in (after.position, after.off_position))
     text = (
@@ -106,7 +97,7 @@ def _headline(tool_map: ToolMap) -> str:
 
 
 def _table(tool_map: ToolMap) -> Table:
-    """Medians and largest over the evenly spread poses."""
+    """Table of the median and the largest error over the evenly spread poses."""
     before, after = tool_map.evenly
     rows: list[Row] = []
     turns = float(np.nanmax(before.orientation)) > NO_TURN
@@ -124,7 +115,7 @@ def _table(tool_map: ToolMap) -> Table:
 
 
 def middle_and_worst(values: Array) -> tuple[str, str]:
-    """Median and largest of what is known."""
+    """Median and largest of the finite values, as text."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "–", "–"
@@ -135,11 +126,19 @@ def middle_and_worst(values: Array) -> tuple[str, str]:
 
 
 def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Links) -> Plot | None:
-    """Every quantity in every slice, one under the other; a single slice's beside each other."""
+    """Plot of all quantities in all slices, one below the other.
+
+    Side by side for a single slice.
+    """
     if not tool_map.slices:
         return None
-    quantities = _quantities(tool_map)
+    quantities = (
+        ("By the drawing, σ", tool_map.before.position),
+        ("Drawing's error", tool_map.after.off_position),
+        ("Calibrated, σ", tool_map.after.position),
+    )
     single = len(tool_map.slices) == 1
+    # table of panels: a column for each slice and a row for each quantity, or one row
     across, down = (len(quantities), 1) if single else (len(tool_map.slices), len(quantities))
     extent = _extent(tool_map)
     data: list[dict[str, Any]] = []
@@ -152,7 +151,7 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
             axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
             data.append(_heat(cut, values * 1e3, name, axes))
             data.append(_crosses(session, estimate, tool_map, cut, axes, links))
-            _place_axes(layout, cut, panel, place, (across, down), extent)
+            _add_axes(layout, cut, panel, place, (across, down), extent)
             if single or row == 0:
                 layout["annotations"].append(_label(name if single else _title(cut), panel, "top"))
             if not single and column == 0:
@@ -181,7 +180,7 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
 
 
 def _extent(tool_map: ToolMap) -> Array:
-    """Lowest and highest coordinate of all slices' poses, (3, 2) mm, and a little more."""
+    """Limits (3, 2) of all slices' coordinates, mm, with a margin."""
     places = tool_map.after.T_base_platform[tool_map.spread :, :3, 3] * 1e3
     low, high = places.min(axis=0), places.max(axis=0)
     more = 0.06 * float((high - low).max())
@@ -189,15 +188,16 @@ def _extent(tool_map: ToolMap) -> Array:
 
 
 def _title(cut: Slice) -> str:
+    """Coordinate of a slice's plane."""
     return f"{'xyz'[cut.normal]} = {number(cut.level * 1e3, 0)} mm"
 
 
 def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[str, Any]:
-    """A slice's cells, by the logarithm of values (n,), mm."""
+    """Heat map of a slice: logarithms of values (n,), mm."""
     visible = np.where(cut.rows >= 0, values[cut.rows], np.nan)
     with np.errstate(divide="ignore"):
         level = np.log10(visible)
-    one, other = "xyz"[cut.across], "xyz"[cut.up]
+    x_name, y_name = "xyz"[cut.across], "xyz"[cut.up]
     return {
         "type": "heatmap",
         "name": name,
@@ -205,7 +205,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "y": np.round(cut.v * 1e3, 1).tolist(),
         "z": np.round(level, 4),
         "customdata": _significant(visible, 4),
-        "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
+        "hovertemplate": f"{x_name} %{{x:.0f}}, {y_name} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
         "hoverongaps": False,
         "coloraxis": "coloraxis",
@@ -214,11 +214,11 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
 
 
 def _significant(values: Array, digits: int) -> Array:
-    """Numbers with so many digits, as short as they can be written."""
+    """Numbers rounded to significant digits."""
     with np.errstate(divide="ignore", invalid="ignore"):
         places = digits - 1 - np.floor(np.log10(np.abs(values)))
-    one = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
-    return np.round(values * one) / one
+    scale = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
+    return np.round(values * scale) / scale
 
 
 def _crosses(
@@ -229,7 +229,7 @@ def _crosses(
     axes: dict[str, str],
     links: Links,
 ) -> dict[str, Any]:
-    """Measured poses near a slice, each of which leads to its photograph."""
+    """Markers of the measured poses near a slice, each linked to its image."""
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
     even = tool_map.evenly[1].T_base_platform[:, cut.normal, 3]
@@ -252,7 +252,7 @@ def _crosses(
     }
 
 
-def _place_axes(
+def _add_axes(
     layout: dict[str, Any],
     cut: Slice,
     panel: str,
@@ -260,7 +260,12 @@ def _place_axes(
     shape: tuple[int, int],
     extent: Array,
 ) -> None:
-    """The axes of one panel in a table of panels; extent : (3, 2) mm."""
+    """Add the axes of one panel of a table of panels.
+
+    place : column and row.
+    shape : number of columns and rows.
+    extent : (3, 2) mm.
+    """
     (column, row), (across, down) = place, shape
     wide = (1 - SLICE_GAP_SHARE * (across - 1)) / across
     gap = SLICE_GAP_SHARE if down > 1 else 0.0
@@ -269,8 +274,8 @@ def _place_axes(
     common = {**COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "tickfont": {"size": 10}}
     common |= {"nticks": 4, "tickangle": 0}
     last = row == down - 1
-    one, other = "xyz"[cut.across], "xyz"[cut.up]
-    named = column == 0 or other == "z"  # slices side by side share their y
+    x_name, y_name = "xyz"[cut.across], "xyz"[cut.up]
+    named = column == 0 or y_name == "z"  # slices side by side share their y
     layout[f"xaxis{panel}"] = {
         **common,
         "domain": [left, left + wide],
@@ -278,7 +283,7 @@ def _place_axes(
         "anchor": f"y{panel}",
         "constrain": "domain",
         "showticklabels": last,
-        "title": {"text": f"{one}, mm" if last else "", "font": {"size": 11}, "standoff": 4},
+        "title": {"text": f"{x_name}, mm" if last else "", "font": {"size": 11}, "standoff": 4},
     }
     layout[f"yaxis{panel}"] = {
         **common,
@@ -287,12 +292,12 @@ def _place_axes(
         "anchor": f"x{panel}",
         "scaleanchor": f"x{panel}",
         "constrain": "domain",
-        "title": {"text": f"{other}, mm" if named else "", "font": {"size": 11}, "standoff": 2},
+        "title": {"text": f"{y_name}, mm" if named else "", "font": {"size": 11}, "standoff": 2},
     }
 
 
 def _label(text: str, panel: str, side: str) -> dict[str, Any]:
-    """A panel's name, above it or to its left."""
+    """Annotation with a panel's name, above or to the left."""
     at = {"xref": f"x{panel} domain", "yref": f"y{panel} domain", "showarrow": False}
     font = {"size": 12, "color": "--ink"}
     if side == "top":
@@ -307,7 +312,7 @@ def _label(text: str, panel: str, side: str) -> dict[str, Any]:
 
 
 def _colours(values: Array) -> dict[str, Any]:
-    """One scale for all values (n,), mm, by their logarithms."""
+    """Common colour axis for values (n,), mm, by their logarithms."""
     finite = values[np.isfinite(values) & (values > 0)]
     low, high = np.log10(np.quantile(finite, (0.01, 0.995)))
     high = max(high, low + 0.3)
@@ -333,10 +338,12 @@ def _colours(values: Array) -> dict[str, Any]:
 
 
 def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
-    """Which three of the six numbers of poses (n, 4, 4) to draw, and their names: where they are,
-    or, of a platform that hardly moves along some axes, how it turns instead. None where less than
-    three numbers change.
+    """Indices of three of the poses' six components (n, 4, 4) to plot, and their names.
+
+    The position, with rotations in place of coordinates in which the platform hardly moves; None
+    if fewer than three components change.
     """
+    # rotations replace coordinates of little extent, the largest first
     places = np.ptp(poses[:, :3, 3], axis=0)
     thin = places <= THIN_EXTENT_SHARE * places.max()
     turns = np.rad2deg(np.ptp(pose_difference(poses, poses[0])[:, :3], axis=0))
@@ -344,27 +351,28 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     if np.count_nonzero(thin) > len(order):
         return None
     instead = sorted(order[: np.count_nonzero(thin)])
-    which = np.array([*instead, *(3 + np.flatnonzero(~thin))])
+    components = np.array([*instead, *(3 + np.flatnonzero(~thin))])
     names = ("turn about x, °", "turn about y, °", "turn about z, °", "x, mm", "y, mm", "z, mm")
-    return which, tuple(names[k] for k in which)
+    return components, tuple(names[k] for k in components)
 
 
-def _drawn(poses: Array, home: Array, which: Integers) -> Array:
-    """Numbers (n, 3) of poses that are drawn: turns from home in degrees, places in mm."""
+def _plot_coordinates(poses: Array, home: Array, components: Integers) -> Array:
+    """Plotted components (n, 3) of poses: rotations from home in degrees, positions in mm."""
     turns = np.rad2deg(pose_difference(poses, home)[:, :3])
-    return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
+    return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, components]
 
 
 def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | None:
-    """The evenly spread poses, coloured by what is left, and the measured ones; None of a machine
-    that moves in a plane.
+    """Plot of the evenly spread poses, coloured by sigma, and of the measured poses.
+
+    None for a machine that moves in a plane.
     """
     _, after = tool_map.evenly
     poses = after.T_base_platform
     axes = _axes(poses)
     if axes is None:
         return None
-    which, names = axes
+    components, names = axes
     sigma, turn = after.position * 1e3, np.rad2deg(after.orientation)
     turns = bool(np.nanmax(turn) > np.rad2deg(NO_TURN))
     columns = [sigma, after.off_position * 1e3, turn if turns else np.zeros_like(turn)]
@@ -372,12 +380,12 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     hover += "<br>σ %{customdata[0]:.3g} mm"
     hover += ", %{customdata[2]:.2g}°" if turns else ""
     hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
-    home = poses[0] if which.min() >= 3 else session.machine.home()
+    home = poses[0] if components.min() >= 3 else session.machine.home()
     used = np.flatnonzero(estimate.configurations)
     data = [
         coloured(
             "Calibrated, σ",
-            _drawn(poses, home, which) * 1e-3,
+            _plot_coordinates(poses, home, components) * 1e-3,
             sigma,
             "σ, mm",
             customdata=_significant(np.column_stack(columns), 3),
@@ -385,7 +393,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
         ),
         markers(
             "Measured",
-            _drawn(estimate.state.T_base_platform[used], home, which) * 1e-3,
+            _plot_coordinates(estimate.state.T_base_platform[used], home, components) * 1e-3,
             {"size": 4, "color": "--calibrated", "symbol": "diamond"},
             hovertext=[f"measured: {session.configurations[k]}" for k in used],
             hoverinfo="text",
@@ -395,7 +403,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     layout["showlegend"] = False
     for axis, name in zip("xyz", names, strict=True):
         layout["scene"][f"{axis}axis"]["title"] = {"text": name}
-    if which.min() < 3:
+    if components.min() < 3:
         layout["scene"]["aspectmode"] = "cube"
     return Plot(
         "reach",

@@ -1,1 +1,1 @@
-"""A session's photographs with the machine laid over, on a page of this computer."""
+"""Local web page that overlays the machine on a session's images."""

@@ -1,6 +1,6 @@
-"""What is shown: a session, photograph by photograph, and its calibration where there is one.
+"""Contents of the page: a session image by image, and its calibration if there is one.
 
-Nothing is read or worked out of a photograph before somebody looks at it.
+An image is decoded, and anything computed from it, only when it is displayed.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ if TYPE_CHECKING:
     from pkmcal.observe.pose_likelihood import StationView
 
 DECODED_IMAGES_CACHED = 16
-"""Decoded photographs that are kept: those that one goes back and forth between."""
+"""Decoded images in the cache, for going back and forth between a few of them."""
 WIDEST_VIEWED_PICTURE = 1600
-"""px; a screen shows no more of a telephone's picture beside two columns."""
+"""Width of a displayed image, px; a screen has no more room for it beside two columns."""
 VIEWED_JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True)
 class Pane:
-    """A machine before a camera: what is laid over one photograph.
+    """Machine in front of a camera: the overlay of one image.
 
-    joints : (m,) readings. T_base_platform, T_camera_base : (4, 4). response : how the photograph
-    codes light.
+    joints : (m,) readings.
+    T_base_platform, T_camera_base : (4, 4).
+    response : tone curve of the image.
     """
 
     machine: Machine
@@ -59,9 +60,9 @@ class Pane:
 
 
 class Viewed:
-    """A session and, where there is one, its calibration.
+    """Session and, if there is one, its calibration.
 
-    calibration : folder that `pkmcal calibrate` wrote; None for none.
+    calibration : folder that `pkmcal calibrate` wrote, None for none.
     """
 
     def __init__(self, session: Session, calibration: Path | None) -> None:
@@ -73,40 +74,46 @@ class Viewed:
         self.views: dict[int, StationView] = {}
 
     def station(self, s: int) -> Station:
-        """A station by its number. Raises InputError where there is none."""
+        """Station by its index. Raises InputError for an index out of range."""
         if not 0 <= s < len(self.session.stations):
             raise InputError("there is no such station", found=s + 1)
         return self.session.stations[s]
 
     def photograph(self, s: int, k: int) -> Photograph:
-        """A station's photograph by its number. Raises InputError where there is none."""
+        """Image of a station by its index. Raises InputError for an index out of range."""
         photographs = self.station(s).photographs
         if not 0 <= k < len(photographs):
             raise InputError(f"station {self.station(s).name} has no such photograph", found=k + 1)
         return photographs[k]
 
     def _image(self, s: int, k: int) -> Integers:
-        """A photograph as grey levels (height, width). Raises InputError as `decode`."""
+        """Image as grey levels (height, width). Raises InputError as `decode`."""
         path = self.photograph(s, k).path
         return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
 
     def jpeg(self, s: int, k: int) -> bytes:
-        """A photograph at a size for the screen."""
+        """Image as JPEG in the size of the screen."""
         from pkmcal.pages.jpegs import coded, narrowed
 
         return coded(narrowed(self.image(s, k), WIDEST_VIEWED_PICTURE), VIEWED_JPEG_QUALITY)
 
     def drawn(self, s: int, k: int) -> Pane:
-        """The drawing's machine before a station's camera."""
+        """Nominal machine in front of a station's camera.
+
+        The camera is at the station's pose, or at a default pose without one.
+        """
         row, station = self.photograph(s, k).configuration, self.station(s)
         machine, joints = self.session.machine, self.session.joints[row]
-        there = station.T_camera_base
-        there = self.start(s) if there is None else there
-        return Pane(machine, station.camera, joints, self.poses[row], there, station.response)
+        T_camera_base = station.T_camera_base
+        T_camera_base = self.start(s) if T_camera_base is None else T_camera_base
+        return Pane(
+            machine, station.camera, joints, self.poses[row], T_camera_base, station.response
+        )
 
     def _start(self, s: int) -> Array:
-        """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it:
-        before the machine, far enough to have all of it in the picture.
+        """Default T_camera_base (4, 4) of a station without a pose.
+
+        The camera faces the machine, far enough away to have all of it in the image.
         """
         from pkmcal.simulation.placement import default_stations
 
@@ -116,22 +123,27 @@ class Viewed:
 
     @cached_property
     def poses(self) -> Array:
-        """T_base_platform (K, 4, 4) by the drawing: the nearest ones, where it does not close."""
+        """T_base_platform (K, 4, 4) by the nominal model.
+
+        The nearest pose where its loops do not close.
+        """
         try:
             return self.session.machine.forward_result(self.session.joints).T_base_platform
-        except GeometryError as error:  # the drawing is the user's: it is at fault
+        except GeometryError as error:  # the nominal model is the user's file
             raise error.as_input(self.session.document["mechanism"]) from None
 
     def calibrated(self, s: int, k: int) -> Pane:
-        """The calibrated machine, as the calibration left it, before the camera as it found it.
+        """Calibrated machine in front of the camera.
 
-        Raises InputError where the calibration is another session's, or has not this station.
+        With the estimated pose, intrinsics and focal scale of the station. Raises InputError if
+        the calibration is of another session or lacks the station.
         """
         saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
         refined = saved.path.parent / written_camera(station.camera_file)
         camera = load_camera(refined) if refined.is_file() else station.camera
+        # breathing: the station's own focal length differs from the camera file's
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
         pose = saved.T_base_platform[row]
@@ -141,7 +153,7 @@ class Viewed:
 
     @cached_property
     def saved(self) -> SavedCalibration:
-        """The calibration. Raises InputError where there is none, or it is another session's."""
+        """Calibration. Raises InputError if there is none, or if it is of another session."""
         from pkmcal.calibration.saved_calibration import load
 
         if self.calibration is None:
@@ -151,6 +163,7 @@ class Viewed:
                 next_step="Run pkmcal calibrate, or name its folder with --calibration",
             )
         saved = load(self.calibration)
+        # the same configurations with the same readings: otherwise poses belong to other images
         same = saved.configurations == self.session.configurations
         if not same or not np.allclose(saved.joints, self.session.joints):
             raise InputError(
@@ -162,7 +175,10 @@ class Viewed:
         return saved
 
     def number(self, s: int) -> int:
-        """A station's number in the calibration, which may have left some out."""
+        """Index of a station in the calibration, which may have excluded some.
+
+        Raises InputError for a station that the calibration lacks.
+        """
         names = [station.name for station in self.saved.stations]
         if (name := self.station(s).name) not in names:
             raise InputError(
@@ -178,7 +194,7 @@ class Viewed:
         return board_of(self.session)
 
     def _corners(self, s: int, k: int) -> Detection | None:
-        """The board in a photograph of a station that observes it; None of one that does not."""
+        """Detection of the board in an image; None for a station that does not observe a board."""
         from pkmcal.boards.find import detect_board
 
         if self._board is None or "board" not in self.station(s).observe:

@@ -1,8 +1,8 @@
-"""What is found in one photograph: edges of legs, those that are not, and a board's corners.
+"""Measurements in one image: edges of legs, rejected edges, and corners of the board.
 
-The same looks as `calibrate` takes: of the drawing, each leg as a whole within a few pixels; of a
-calibrated machine, each edge by itself to sub-pixel. What the calibration made of it is read from
-its file.
+Edges are measured as `calibrate` does: for the nominal model each leg as a whole within a few
+pixels, for a calibrated machine each edge by itself to sub-pixel accuracy. Weights and residuals
+of the calibration are read from its file.
 """
 
 from __future__ import annotations
@@ -34,11 +34,14 @@ from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import count, number
 
 MIDDLE_EDGE_SIGMAS = 2.0
-"""Standard deviations, of drawing and search, within which the middle edge has to lie."""
+"""Largest median offset of a fitting machine, in standard deviations.
+
+Those of the nominal model and of the search count, added in squares.
+"""
 
 
-class _Judged(NamedTuple):
-    """What a calibration made of an edge: weight and residuals (standard deviations)."""
+class _EdgeResult(NamedTuple):
+    """Weight of an edge in the calibration, and its residuals in standard deviations."""
 
     weight: float
     shift: float
@@ -46,8 +49,9 @@ class _Judged(NamedTuple):
 
 
 def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
-    board's corners, and all that in words.
+    """Edges with their offsets (px) from the overlaid machine, edges not found, and board corners.
+
+    Edges that are not found have a reason. Sentences summarize the result.
     """
     pane = placed_by_hand(viewed, request)
     texts: list[str] = []
@@ -64,7 +68,8 @@ def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
 
 
 def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any]) -> None:
-    """What is found of the legs, put into the answer."""
+    """Measure the legs' edges and add them to the answer."""
+    # measure the edges in a batch of this one image
     row = viewed.photograph(request.station, request.photograph).configuration
     taken = Photographs(
         request.station,
@@ -75,12 +80,17 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
         pane.response,
         legs.first_binning(pane.camera.image_size),
     )
-    take = legs.measure if request.shown == "calibration" else legs.search
-    in_view = take(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
-    judged, reasons = _judged(viewed, request)
-    curves, away = _off(pane, in_view.edges)
+    measure = legs.measure if request.shown == "calibration" else legs.search
+    measured = measure(taken, pane.machine, pane.T_camera_base, pane.T_base_platform[None])
+    judged, reasons = _calibration_results(viewed, request)
+    # measured edges, with weights and residuals of the calibration
+    curves, away = _offset_curves(pane, measured.edges)
     for n, points in enumerate(straightened(curves)):
-        place = (int(in_view.edges.leg[n]), int(in_view.edges.tube[n]), int(in_view.edges.side[n]))
+        place = (
+            int(measured.edges.leg[n]),
+            int(measured.edges.tube[n]),
+            int(measured.edges.side[n]),
+        )
         shift = number(float(away[n]), 2, signed=True)
         tip = f"{edge_name(*place).capitalize()}: {shift} px outward"
         quiet = False
@@ -89,20 +99,22 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
             tip += f"; {residual_words(of.shift, of.tilt, of.weight)}"
         if place in reasons:
             quiet, tip = True, f"{tip}; {reasons[place]}"
-        drawn = polyline(place[0], points, quiet, tip)
-        if drawn:
-            out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
-    missed = _missed(pane, in_view.edges, in_view.rejected, reasons)
+        line = polyline(place[0], points, quiet, tip)
+        if line:
+            out["edges"].append({"leg": line.leg, "d": line.path, "quiet": quiet, "tip": tip})
+    # predicted edges that were not measured
+    missed = _missing_edges(pane, measured.edges, measured.rejected, reasons)
     out["missed"] = missed
     out["median"] = float(np.median(np.abs(away))) if len(away) else None
-    out["told"] += _words(pane, request, len(curves), len(missed), out["median"])
+    out["told"] += _agreement_text(pane, request, len(curves), len(missed), out["median"])
 
 
-def _judged(
+def _calibration_results(
     viewed: Viewed, request: ViewRequest
-) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
-    """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
-    and side from 0; -1 where all of them are meant.
+) -> tuple[dict[tuple[int, int, int], _EdgeResult], dict[tuple[int, int, int], str]]:
+    """Weights and residuals of an image's edges in the calibration, and reasons of rejections.
+
+    Both by leg, tube and side from 0; -1 stands for all. Empty without a calibration.
     """
     if request.shown != "calibration":
         return {}, {}
@@ -110,7 +122,7 @@ def _judged(
     k = viewed.photograph(request.station, request.photograph).configuration
     rows = (document.get("residuals") or {}).get("edges") or []
     judged = {
-        (int(leg) - 1, int(tube) - 1, int(side) - 1): _Judged(weight, shift, tilt)
+        (int(leg) - 1, int(tube) - 1, int(side) - 1): _EdgeResult(weight, shift, tilt)
         for station, row, leg, tube, side, weight, shift, tilt, *_ in rows
         if (station, row) == (s, k + 1)
     }
@@ -124,70 +136,70 @@ def _judged(
     return judged, reasons
 
 
-def _off(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
-    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and how far outward (n,) px of the
-    machine's own they lie in the middle.
+def _offset_curves(pane: Pane, edges: EdgeSet) -> tuple[Array, Array]:
+    """Measured edges as curves (n, EDGE_CURVE_POINTS, 2) px, and their outward offsets (n,) px.
+
+    The offset is that from the machine's own edge, at the middle of the curve.
     """
     if not len(edges):
         return np.zeros((0, EDGE_CURVE_POINTS, 2)), np.zeros(0)
     machine, one = pane.machine, np.zeros(len(edges), dtype=int)
     pose, joints = pane.T_base_platform[None], pane.joints[None]
     axes = legs_in_camera(machine, pane.T_camera_base, pose, joints)
-    measured, drawn = (
+    # curves of the measured edges and of the machine's own, over the same spans
+    measured, predicted = (
         measured_curves(machine, pane.camera, axes, one, part)
         for part in (edges, own_edges(machine, axes, one, edges))
     )
-    # outward of the leg: away from where its axis is seen
+    # outward: away from the image of the leg's axis
     a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
     axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
     middle = EDGE_CURVE_POINTS // 2
-    normal, off = offsets_across_curves(drawn, measured)
-    outward = np.sign(dot(normal[:, middle], drawn[:, middle] - axis))
+    normal, off = offsets_across_curves(predicted, measured)
+    outward = np.sign(dot(normal[:, middle], predicted[:, middle] - axis))
     return measured, outward * off[:, middle]
 
 
-def _missed(
+def _missing_edges(
     pane: Pane,
     edges: EdgeSet,
     rejected: tuple[Rejection, ...],
     reasons: dict[tuple[int, int, int], str],
 ) -> list[dict[str, Any]]:
-    """Edges of the machine that were looked for and not found, as they should lie, each with why;
-    those of which a part would be in the picture.
-    """
+    """Predicted edges within the image that were not measured, each with the reason."""
     tubes = tubes_of(pane.machine)
     pixel = _contours(pane, EDGE_CURVE_POINTS).pixel
-    in_view = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
+    measured = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
     now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
     out: list[dict[str, Any]] = []
     inside = np.where(pane.camera.in_image(pixel)[..., None], pixel, np.nan)
     for e, points in enumerate(straightened(inside)):
         place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
-        if place in in_view:
+        if place in measured:
             continue
         whole = (place[0], -1, -1)
         why = reasons.get(place) or now.get(place) or reasons.get(whole) or now.get(whole)
         why = why or "too little of it is seen"
         tip = f"{edge_name(*place).capitalize()}: {why}"
-        drawn = polyline(place[0], points, True, tip)
-        if drawn:
-            out.append({"leg": drawn.leg, "d": drawn.path, "tip": drawn.tip, "reason": why})
+        line = polyline(place[0], points, True, tip)
+        if line:
+            out.append({"leg": line.leg, "d": line.path, "tip": line.tip, "reason": why})
     return out
 
 
 def _contours(pane: Pane, samples: int) -> EdgePoints:
-    """Points of the machine's own edges."""
+    """Points of the machine's predicted edges."""
     legs = legs_in_camera(pane.machine, pane.T_camera_base, pane.T_base_platform, pane.joints)
     return edge_points(pane.machine, pane.camera, legs, tubes_of(pane.machine), samples)
 
 
-def _words(
-    pane: Pane, request: ViewRequest, in_view: int, missed: int, median: float | None
+def _agreement_text(
+    pane: Pane, request: ViewRequest, measured: int, missed: int, median: float | None
 ) -> list[str]:
-    """How well the machine lies on what is seen."""
-    if in_view + missed == 0:
+    """Sentences on the agreement of the machine with the image."""
+    if measured + missed == 0:
         return ["No leg of the machine would be in this photograph at this pose."]
-    text = f"{in_view} of {in_view + missed} edges of legs are found"
+    text = f"{measured} of {measured + missed} edges of legs are found"
     if median is None:
         return [f"It does not fit: {text}."]
     if request.shown == "calibration":
@@ -195,12 +207,13 @@ def _words(
     tolerance = pane.machine.document.tolerance.center
     gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
+    # expected offset: prior sigma of a centre, projected, and resolution of the search
     near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
-    # other things' edges lie near by chance, too, though not most of them
+    # some background edges lie near by chance, but not most of the machine's
     verdict = (
-        "It fits" if near and in_view > missed else "It may fit" if near else "It does not fit"
+        "It fits" if near and measured > missed else "It may fit" if near else "It does not fit"
     )
-    # the search goes by whole pixels
+    # the search has a resolution of whole pixels
     off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
     return [
         f"{verdict}: {text}, and the middle one lies {off} from the drawing. The drawing's"

@@ -1,4 +1,4 @@
-"""The machine recognised in a station's photographs from a pose by hand, as `calibrate` begins."""
+"""Localization of a station in its images from a pose set by hand, as `calibrate` begins."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import brief, count
 
 FIT_PHOTOGRAPHS = 16
-"""Photographs of a station that take part: a search looks at eight and asks the others, in about a
-second; `calibrate` asks up to 64."""
+"""Images of a station that are used.
+
+A search uses eight and verifies with the others, in about a second; `calibrate` uses up to 64.
+"""
 FEWEST_FITTED_TOGETHER = 2
-"""Photographs from which some can be asked what the others found."""
+"""Fewest images of which some can verify the pose that the others give."""
 LEAST_CHANCE_DISPLAYED = 1e-9
-"""Probability below which no digits are told."""
+"""Probability below which no digits are displayed."""
 
 
 def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """The pose at which the machine is recognised, from the one given or from anywhere, what it
-    lays over, and how sure that is, in words; where it is not recognised, the pose stays.
+    """Localized pose with its overlay, and in words how certain the pose is.
+
+    The search starts at the request's pose, or everywhere. Without success the pose remains
+    unchanged. Raises InputError for a station without legs to be localized by.
     """
     station = viewed.station(request.station)
     if "legs" not in station.observe or not len(tubes_of(viewed.session.machine)):
@@ -40,13 +44,15 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
             next_step="Its place is found from the board when you calibrate",
         )
     start = placed_by_hand(viewed, request).T_camera_base
-    view = _view(viewed, request.station)
+    view = _search_view(viewed, request.station)
     many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
     if many:
-        value, sure, text = _together(view, None if request.anywhere else start)
+        localized, sure, text = _from_images(view, None if request.anywhere else start)
     else:
-        value, sure, text = _from_one_image(view, viewed.image(request.station, request.photograph))
-    pose = value if sure else start
+        localized, sure, text = _from_one_image(
+            view, viewed.image(request.station, request.photograph)
+        )
+    pose = localized if sure else start
     plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
     return {
         **overlay_after_gesture(viewed, request.model_copy(update=plain)),
@@ -55,8 +61,8 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     }
 
 
-def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
-    """From several photographs."""
+def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
+    """Localization from several images: pose, success, and a sentence."""
     pose = find_station(view, start, np.random.default_rng(0))
     shots = count(len(view.configuration), "photograph")
     if pose.good:
@@ -74,30 +80,30 @@ def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]
     else:
         text = (
             f"Not recognised in {shots} about this pose. Bring two or three joints to their places"
-            " and try again, or look whether drawing, readings and photographs belong together."
+            " and try again, or check whether drawing, readings and photographs belong together."
         )
     return pose.T_camera_base, pose.good, text
 
 
 def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, str]:
-    """From one photograph, which is searched from everywhere."""
-    value = localize_image(view, image)
-    best = value.T_camera_base[0]
-    if value.rival_probability < RIVAL_POSE_PROBABILITY:
+    """Localization from one image, with a global search: pose, success, and a sentence."""
+    localized = localize_image(view, image)
+    best = localized.T_camera_base[0]
+    if localized.rival_probability < RIVAL_POSE_PROBABILITY:
         return best, True, "Placed: from no other place does the machine fit as well."
-    why = f"with probability {brief(value.rival_probability)} another place is the right one"
+    why = f"with probability {brief(localized.rival_probability)} another place is the right one"
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
-def _view(viewed: Viewed, s: int) -> StationView:
-    """What the search looks at; kept, for one fits again and again."""
-    retained: dict[int, StationView] = viewed.views
-    if s not in retained:
+def _search_view(viewed: Viewed, s: int) -> StationView:
+    """Data of a station for the search, cached because the user fits repeatedly."""
+    views: dict[int, StationView] = viewed.views
+    if s not in views:
         session, station = viewed.session, viewed.station(s)
         rows = np.array([photo.configuration for photo in station.photographs])
         few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_PHOTOGRAPHS, len(rows))).astype(int))
         tables = distance_tables([viewed.image(s, int(k)) for k in few])
-        retained[s] = StationView(
+        views[s] = StationView(
             session.machine,
             station.camera,
             rows[few],
@@ -105,4 +111,4 @@ def _view(viewed: Viewed, s: int) -> StationView:
             viewed.poses,
             tables,
         )
-    return retained[s]
+    return views[s]

@@ -1,8 +1,8 @@
-"""Poses moved by hand in a photograph: what a pull of the mouse does to T_camera_base.
+"""Poses adjusted by mouse in an image: the change of T_camera_base by a gesture.
 
-A pull turns the camera about its own centre, so that whatever was taken hold of stays under the
-mouse, near or far, with every camera model. Turns, rolls and the distance are about the machine's
-middle. Four such motions make all six freedoms of a pose.
+A pull turns the camera about its own centre, so that the point taken hold of stays under the
+mouse, at any distance and with any camera model. Turn, roll and distance are about the machine's
+middle. The four gestures together cover the six degrees of freedom of a pose.
 """
 
 from __future__ import annotations
@@ -16,27 +16,33 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, pose, rotation
 
 PINNED_JOINT_SIGMA = 2.0
-"""Pixels (standard deviation) to which a hand puts a joint."""
+"""Standard deviation of a joint placed by hand, px."""
 HAND_POSE_SPREAD = np.array([*np.full(3, np.radians(6.0)), 0.1, *np.full(2, np.radians(6.0))])
-"""Standard deviations of a pose by hand about which three joints or more move: aim and roll, the
-distance's share, turns. It only decides what the joints leave open."""
+"""Prior sigmas of the hand-set pose that three or more pinned joints adjust.
+
+Aim and roll (rad), relative distance, turns (rad). They only decide what the joints leave
+undetermined.
+"""
 PINNING_ROUNDS = 4
-"""Times that the pose by hand is replaced by what was found, so that it pulls at nothing else."""
+"""Repetitions in which the result replaces the hand-set pose as the mean of the prior.
+
+The prior then affects only what the joints leave undetermined.
+"""
 UNSEEN_JOINT_PIXELS = 1e3
-"""Pixels by which a joint that has no picture counts as off."""
+"""Residual, px, of a joint that does not project into the image."""
 
 
 def aimed(camera: Camera, T_camera_base: Array, start: Array, end: Array) -> Array:
-    """The pose in which what was seen at pixel ``start`` (2,) is seen at ``end``."""
+    """Pose that moves what is seen at pixel ``start`` (2,) to pixel ``end`` (2,)."""
     return _about_camera(_shortest(camera, start, end)) @ T_camera_base
 
 
 def turned_as_ball(
     camera: Camera, T_camera_base: Array, points: Array, start: Array, end: Array
 ) -> Array:
-    """The machine turned about its middle as a ball that is rolled by its near side.
+    """Pose with the machine turned about its middle, as a ball that is rolled by its near side.
 
-    points : (n, 3) of the machine, base frame, m; the ball holds them.
+    points : (n, 3) points of the machine, base frame, m, which the ball contains.
     """
     middle = apply(T_camera_base, points.mean(axis=0))
     radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
@@ -45,7 +51,10 @@ def turned_as_ball(
 
 
 def rolled(camera: Camera, T_camera_base: Array, points: Array, start: Array, end: Array) -> Array:
-    """The machine turned about the line of sight to its middle, by the angle that is pulled."""
+    """Pose with the machine turned about the line of sight to its middle.
+
+    The angle is that of the pull about this line.
+    """
     middle = apply(T_camera_base, points.mean(axis=0))
     axis = middle / np.linalg.norm(middle)
     before, after = (ray - (ray @ axis) * axis for ray in _rays(camera, start, end))
@@ -54,7 +63,10 @@ def rolled(camera: Camera, T_camera_base: Array, points: Array, start: Array, en
 
 
 def farther(camera: Camera, T_camera_base: Array, points: Array, at: Array, factor: float) -> Array:
-    """The machine at ``factor`` times the distance, moved along the view ray of a pixel (2,)."""
+    """Pose with the machine at ``factor`` times the distance.
+
+    The machine moves along the view ray of pixel ``at`` (2,).
+    """
     away = float(np.linalg.norm(apply(T_camera_base, points.mean(axis=0))))
     ray = np.nan_to_num(camera.ray(at))
     return pose(np.eye(3), (factor - 1) * away * ray) @ T_camera_base
@@ -63,49 +75,61 @@ def farther(camera: Camera, T_camera_base: Array, points: Array, at: Array, fact
 def pinned(
     camera: Camera, T_camera_base: Array, points: Array, pins: Array, pixels: Array
 ) -> Array:
-    """The pose that brings joints to their places in photographs of one station.
+    """Pose that brings joints to given pixels in images of one station.
 
-    points : as :func:`turned_as_ball`. pins : (n, 3) joint centres, base frame, each as its
-    photograph's configuration has it. pixels : (n, 2). One joint aims the camera; two also roll and
-    bring nearer, both exactly; from three on least squares move all six freedoms, near
-    T_camera_base where the joints leave them open.
+    One joint aims the camera; two also set roll and distance, both exactly; three or more adjust
+    all six degrees of freedom by least squares with a prior at T_camera_base.
+
+    points : as in :func:`turned_as_ball`.
+    pins : (n, 3) joint centres, base frame, m, in the configuration of each one's image.
+    pixels : (n, 2).
     """
     if len(pins) == 1:
         visible = camera.project(apply(T_camera_base, pins[0]))
         return aimed(camera, T_camera_base, visible, pixels[0])
     from scipy.optimize import least_squares
 
-    count = 4 if len(pins) == 2 else 6
-    spread = HAND_POSE_SPREAD[:count]
+    freedoms = 4 if len(pins) == 2 else 6
+    spread = HAND_POSE_SPREAD[:freedoms]
 
+    # two joints fix aim, roll and distance exactly; more are fitted together with the prior
     def misfit(shifted: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        """Residuals as a function of x in prior sigmas.
+
+        The prior takes part from three joints on.
+        """
+
         def rows(x: Array) -> Array:
             visible = camera.project(apply(shifted(x * spread), pins))
             off = (
                 np.nan_to_num(visible - pixels, nan=UNSEEN_JOINT_PIXELS).ravel()
                 / PINNED_JOINT_SIGMA
             )
-            return off if count == 4 else np.concatenate([off, x])
+            return off if freedoms == 4 else np.concatenate([off, x])
 
         return rows
 
-    for _ in range(1 if count == 4 else PINNING_ROUNDS):
+    for _ in range(1 if freedoms == 4 else PINNING_ROUNDS):
         shifted = _motion(T_camera_base, points)
-        with np.errstate(over="ignore"):  # of a pixel that is kilometres away
-            x = least_squares(misfit(shifted), np.zeros(count)).x
+        with np.errstate(over="ignore"):  # a pixel may be kilometres away
+            x = least_squares(misfit(shifted), np.zeros(freedoms)).x
         T_camera_base = shifted(x * spread)
     return T_camera_base
 
 
 def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:
-    """A pose by up to six numbers: aim and roll (3, rad, about the camera), the distance's
-    logarithm, and turns about the machine's middle (2, rad, across the line of sight).
+    """Pose as a function of up to six numbers.
+
+    Aim and roll (3, rad, about the camera), logarithm of the distance, and turns about the
+    machine's middle (2, rad, across the line of sight).
     """
     middle = apply(T_camera_base, points.mean(axis=0))
     sight = middle / np.linalg.norm(middle)
+    # two axes across the line of sight
     across = np.linalg.svd(sight[None])[2][1:]
 
     def shifted(x: Array) -> Array:
+        """Pose at x, (4,) or (6,)."""
         turn = x[4:] @ across if len(x) > 4 else np.zeros(3)
         near = pose(np.eye(3), (np.exp(x[3]) - 1) * middle)
         return _about_camera(x[:3]) @ near @ _about(turn, middle) @ T_camera_base
@@ -114,13 +138,13 @@ def _motion(T_camera_base: Array, points: Array) -> Callable[[Array], Array]:
 
 
 def _rays(camera: Camera, start: Array, end: Array) -> Array:
-    """View rays (2, 3) of two pixels; the first twice where one has none."""
+    """View rays (2, 3) of two pixels; the optical axis twice if one of them has no ray."""
     rays = camera.ray(np.stack([start, end]))
     return rays if np.isfinite(rays).all() else np.tile([0.0, 0.0, 1.0], (2, 1))
 
 
 def _shortest(camera: Camera, start: Array, end: Array) -> Array:
-    """Rotation vector (3,) that turns the one pixel's ray to the other's."""
+    """Rotation vector (3,) that turns the ray of one pixel to that of the other."""
     before, after = _rays(camera, start, end)
     axis = np.cross(before, after)
     sine = float(np.linalg.norm(axis))
@@ -128,10 +152,11 @@ def _shortest(camera: Camera, start: Array, end: Array) -> Array:
 
 
 def _about_camera(omega: Array) -> Array:
+    """Rotation about the camera's centre, (4, 4)."""
     return pose(rotation(omega), np.zeros(3))
 
 
 def _about(omega: Array, middle: Array) -> Array:
-    """A turn about a point of the camera frame."""
+    """Rotation about a point of the camera frame, (4, 4)."""
     rot = rotation(omega)
     return pose(rot, middle - rot @ middle)

@@ -1,8 +1,8 @@
-"""Who may ask: only a page that was opened with the token, on this computer.
+"""Access control: only the page that was opened with the token, on this computer, is served.
 
-The port is on the loopback, which every program and, by way of a browser, every web page may call.
-A page elsewhere knows no token; and one whose name was made to point here (DNS rebinding) gives
-itself away by its Host or Origin.
+The port is on the loopback interface, which every local program can reach and, through a browser,
+every web page. Other pages do not know the token, and a page whose host name was made to resolve
+to this address (DNS rebinding) is recognised by its Host or Origin header.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VIEW_RESPONSE_HEADERS = {
 
 
 class Guard:
-    """An application in front of another one; refuses with 403, whatever was asked for."""
+    """ASGI application in front of another one; unauthorized requests get 403 for every path."""
 
     def __init__(self, app: ASGIApp, token: str, port: int) -> None:
         self._app = app
@@ -37,7 +37,7 @@ class Guard:
         self._hosts = {f"{name}:{port}".encode("ascii") for name in LOOPBACK_HOST_NAMES}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As ASGI has it."""
+        """ASGI entry point."""
         from starlette.datastructures import MutableHeaders
         from starlette.responses import PlainTextResponse
 
@@ -57,6 +57,7 @@ class Guard:
         await self._app(scope, receive, with_headers)
 
     def _allowed(self, scope: Scope) -> bool:
+        """Whether Host and Origin of a request are loopback and its path begins with the token."""
         headers: dict[bytes, bytes] = dict(scope["headers"])
         origins = {b"http://" + host for host in self._hosts}
         first = scope["path"].encode("utf-8").split(b"/")[1:2]

@@ -1,6 +1,6 @@
-"""The machine laid over a photograph, and the pose that a hand gives it: one round trip a move.
+"""Machine overlaid on an image, at a pose that the user adjusts; one request for each change.
 
-Here and in the modules beside, what the first picture can do without is imported when it is needed.
+Here and in the neighbouring modules, imports that the first image does not need are local.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned_as_ball
 from pkmcal.view.requests import ViewRequest, requested_pose
 
 STATION_POSE_DECIMALS = 4
-"""Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
+"""Decimals of a written position in m; nobody places a camera to a tenth of a millimetre."""
 
 
 def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
-    """The machine that a request shows, before the camera where the files have it."""
-    take = viewed.calibrated if request.shown == "calibration" else viewed.drawn
-    return take(request.station, request.photograph)
+    """Machine of a request, in front of the camera at the pose of the files."""
+    machine_shown = viewed.calibrated if request.shown == "calibration" else viewed.drawn
+    return machine_shown(request.station, request.photograph)
 
 
 def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """The pose after the gesture, and what it lays over the photograph, in pixels."""
+    """Pose after the request's gesture, and the overlay in pixels."""
     pane = placed_by_hand(viewed, request)
     edges, spots = machine_laid_over(
         pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
@@ -69,11 +69,12 @@ def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any
 
 
 def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
-    """The same, before the camera as the hand put it there."""
+    """Machine of a request, in front of the camera at the pose after pins and gesture."""
     pane, T_camera_base = pane_of(viewed, request), requested_pose(request)
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
+    # pins first, then the gesture
     if request.pins:
         pins = np.stack([_joint(viewed, request, k) for k in range(len(request.pins))])
         pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
@@ -96,14 +97,17 @@ def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
 
 
 def place_of(T_camera_base: Array) -> dict[str, list[float]]:
-    """A pose as session.yaml has it, with as many digits as are written there."""
+    """Pose in the form of session.yaml, with the digits that are written there."""
     from pkmcal.simulation.placement import StationPlace
 
     return StationPlace.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 
 
 def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
-    """A pinned joint's centre (3,), base frame, m, in its own photograph's configuration."""
+    """Centre (3,) of a pinned joint, base frame, m, in the configuration of the pin's image.
+
+    Raises InputError for a leg that the machine lacks.
+    """
     pin = request.pins[k]
     other = request.model_copy(update={"photograph": pin.photograph})
     points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
@@ -113,7 +117,7 @@ def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
 
 
 def _bare_limbs(pane: Pane) -> list[Drawn]:
-    """Axes of the legs that show no tube."""
+    """Axes of the legs without tubes."""
     bare = [j for j, leg in enumerate(pane.machine.document.legs) if not leg.tubes]
     if not bare:
         return []
@@ -122,6 +126,6 @@ def _bare_limbs(pane: Pane) -> list[Drawn]:
         apply(pane.T_camera_base, a + np.linspace(0, 1, EDGE_CURVE_POINTS)[:, None] * (b - a))
     )
     whole = np.isfinite(pixel).all(axis=(1, 2))
-    in_view = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
-    lines = (polyline(j, points, True, "") for j, points in in_view)
+    curves = zip(np.array(bare)[whole].tolist(), straightened(pixel[whole]), strict=True)
+    lines = (polyline(j, points, True, "") for j, points in curves)
     return [line for line in lines if line]

@@ -1,4 +1,4 @@
-"""A pose written back into session.yaml, of which nothing else changes."""
+"""Station poses written back into session.yaml; nothing else in the file changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pkmcal.view.overlay import place_of
 
 
 class PoseFile:
-    """session.yaml as it was read when the page was opened, and written since."""
+    """session.yaml in the state in which this process last read or wrote it."""
 
     def __init__(self, folder: Path) -> None:
         self._path = resolved(folder) / SESSION_FILE_NAME
@@ -21,11 +21,11 @@ class PoseFile:
         self._lock = Lock()
 
     def write(self, station: Station, T_camera_base: Array) -> str:
-        """Write a station's pose; returns what was written, in words.
+        """Write a station's pose and return a sentence about it.
 
-        Raises InputError for a camera that is held by hand, for a file that is a link, as in
-        somebody else's session, or that somebody else has changed meanwhile, and where the pose
-        cannot be changed by itself.
+        Raises InputError for a hand-held camera, for a file that is a symbolic link (as in a copy
+        of somebody else's session), for a file that somebody else has changed since it was last
+        read, and for a pose that cannot be edited by itself.
         """
         keys = ("stations", station.entry, "pose")
         if station.handheld:

@@ -1,4 +1,4 @@
-"""What the page asks for, checked as files are: a page may be older than the program."""
+"""Requests of the page, validated as files are, because a page may be older than the program."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ from pkmcal.files import Document, Schema, validated_document
 Pixel = tuple[float, float]
 RequestedPoseRow = tuple[float, float, float, float]
 DisplayMachine = Literal["drawing", "calibration"]
-"""Which machine is laid over: the drawing's at the session's poses, or the calibrated one."""
+"""Overlaid machine: the nominal one at the session's poses, or the calibrated one."""
 
 
 class Pin(Schema):
-    """A joint that was put to its place in a photograph; leg : from 1."""
+    """Joint placed at a pixel of an image.
+
+    leg : from 1.
+    """
 
     photograph: int
     end: Literal["base", "platform"]
@@ -29,8 +32,9 @@ class Pin(Schema):
 
 
 class Gesture(Schema):
-    """A pull of the mouse from one pixel to another, or a turn of its wheel: ``factor`` times as
-    far away.
+    """Pull of the mouse from one pixel to another, or a turn of its wheel.
+
+    factor : ratio of the new distance to the old one.
     """
 
     kind: Literal["aim", "turn", "roll", "distance"]
@@ -40,7 +44,11 @@ class Gesture(Schema):
 
 
 class ViewRequest(Schema):
-    """One photograph with a machine laid over; pose : T_camera_base, where not the files' own."""
+    """Image with the machine to overlay.
+
+    pose : T_camera_base as rows; None for the pose of the files.
+    anywhere : search the pose globally rather than near the given one.
+    """
 
     station: int
     photograph: int
@@ -54,7 +62,7 @@ class ViewRequest(Schema):
 
 
 def checked_request(body: bytes) -> ViewRequest:
-    """A request of the page. Raises InputError for anything else."""
+    """Request of the page. Raises InputError for anything that is not one."""
     try:
         data = json.loads(body)
     except ValueError:
@@ -65,7 +73,10 @@ def checked_request(body: bytes) -> ViewRequest:
 
 
 def requested_pose(request: ViewRequest) -> Array | None:
-    """T_camera_base (4, 4) that a request gives, if it does. Raises InputError for another map."""
+    """T_camera_base (4, 4) of a request, None without one.
+
+    Raises InputError for a matrix that is not a rigid motion.
+    """
     if request.pose is None:
         return None
     pose = np.array(request.pose, dtype=float)

@@ -1,4 +1,4 @@
-"""The page's server: photographs, and what is asked about them, on the loopback."""
+"""Server of the page on the loopback interface: images, and answers to the page's requests."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ TOKEN_BYTES = 24
 LOOPBACK_ADDRESS = "127.0.0.1"
 CONNECTIONS_WAITING = 64
 ANSWER_TIME_AT_CLOSING = 2
-"""Seconds that answers under way have when the program is ended."""
+"""Seconds for requests in progress when the program is interrupted."""
 
 
 def listening_socket(port: int) -> socket.socket:
-    """A socket on the loopback, of a free port where ``port`` is 0. Raises InputError where the
-    port is taken.
+    """Listening socket on the loopback interface.
+
+    port : 0 for any free port. Raises InputError if the port is taken.
     """
-    # the protocol by its number: without it asyncio does not ask to send at once, and the second
-    # part of every answer waits 40 ms for the first one to be acknowledged
+    # asyncio sets TCP_NODELAY only if the protocol is given by number; without it the second part
+    # of every answer waits 40 ms for the acknowledgement of the first
     socket_ = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     socket_.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -49,19 +50,19 @@ def listening_socket(port: int) -> socket.socket:
 
 
 def new_token() -> str:
-    """What nobody can guess."""
+    """Unguessable token for the page's address."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 def application(viewed: Viewed, token: str, port: int) -> Guard:
-    """The ASGI application, of a page at /TOKEN/ and of what it asks for."""
+    """ASGI application: the page at /TOKEN/ and the paths of its requests."""
     from starlette.applications import Starlette
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Mount, Route
 
-    retained = PoseFile(viewed.session.folder)
+    pose_file = PoseFile(viewed.session.folder)
 
-    def value(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+    def edges(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         from pkmcal.view.edge_search import edge_search
 
         return edge_search(viewed, request)
@@ -73,7 +74,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
 
     def save(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         pose = placed_by_hand(viewed, request).T_camera_base
-        return {"said": retained.write(viewed.station(request.station), pose)}
+        return {"said": pose_file.write(viewed.station(request.station), pose)}
 
     def answering(answer: Callable[[Viewed, ViewRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
@@ -105,7 +106,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         *(
             Route(f"/{name}", answering(answer), methods=["POST"])
             for name, answer in (
-                ("overlay", overlay_after_gesture), ("found", value), ("fit", fit), ("save", save),
+                ("overlay", overlay_after_gesture), ("found", edges), ("fit", fit), ("save", save),
             )
         ),
     ]  # fmt: skip
@@ -113,7 +114,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
 
 
 async def _answered(work: Callable[[], Any]) -> Response:
-    """What the work gives, or its error in words; never a traceback."""
+    """Response with the result of the work, or with its error as JSON; never a traceback."""
     from starlette.concurrency import run_in_threadpool
     from starlette.responses import JSONResponse, Response
 
@@ -139,7 +140,7 @@ async def _answered(work: Callable[[], Any]) -> Response:
 
 
 def serve_until_interrupted(app: Guard, socket_: socket.socket) -> None:
-    """Answer until the program is interrupted."""
+    """Serve until the program is interrupted."""
     from contextlib import suppress
 
     import uvicorn
@@ -153,7 +154,7 @@ def serve_until_interrupted(app: Guard, socket_: socket.socket) -> None:
 
 
 def view_page_html(viewed: Viewed) -> str:
-    """The page itself; photographs and overlays are asked for by it."""
+    """HTML of the page; it requests images and overlays itself."""
     from pkmcal.pages.page import environment
 
     session = viewed.session
