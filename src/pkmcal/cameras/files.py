@@ -1,4 +1,4 @@
-"""Camera files: ``model``, ``image_size`` and the model's own fields."""
+"""Camera files of pkmcal, OpenCV, ROS and Kalibr."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
-    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected by content.
+    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected from the content.
 
     Parameters
     ----------
     path :
-        The file; one of several cameras in a Kalibr file is named behind it,
+        The file. For a Kalibr file with several cameras, the camera's name follows a #,
         ``camchain.yaml#cam1``.
     label :
         The file's name in messages.
@@ -61,23 +61,25 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
 
 
 def written_camera(file: str) -> str:
-    """The name of a camera's file as refined with the machine, or turned by half as photographs
-    were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
-    and a # in it, become hyphens.
+    """Name of the output file for a camera that was refined with the machine, or rotated by 180
+    degrees as its images were.
+
+    file : the camera's file as the session names it. cameras/front.yaml becomes camera-front.yaml;
+    other folders, and a #, become hyphens.
     """
     parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
     return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
 
 
 def camera_path(path: Path | str) -> tuple[Path, str | None]:
-    """A camera's file, and its name in it where one stands behind a #."""
+    """Path of a camera's file, and the camera's name within the file if one follows a #."""
     path = Path(path)
     file, sign, camera = path.name.rpartition("#")
     return (path.with_name(file), camera) if file and sign and not path.exists() else (path, None)
 
 
 def camera_from_document(document: Document) -> Camera:
-    """The camera of a file's fields, checked."""
+    """Camera from a document in pkmcal's format, validated; raises InputError."""
     models = camera_models()
     name = document.data.get("model")
     if not isinstance(name, str) or name not in models:
@@ -110,7 +112,9 @@ def camera_from_document(document: Document) -> Camera:
 
 
 def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
-    """A covariance of the camera's parameters, or the reason why it is none."""
+    """Covariance (n, n) of the camera's parameters, checked for size, symmetry and negative
+    variances.
+    """
     n = len(camera.parameter_names)
     if len(rows) != n or any(len(row) != n for row in rows):
         raise InputError(
@@ -127,7 +131,7 @@ def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) ->
 
 
 def camera_text(camera: Camera) -> str:
-    """The text of a camera file, which :func:`load_camera` reads back the same."""
+    """Text of a camera file; :func:`load_camera` reads back the same camera."""
     document = camera.document()
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
@@ -136,7 +140,8 @@ def camera_text(camera: Camera) -> str:
 
 CAMERA_FILE_FORMATS = ("opencv", "ros", "kalibr")
 CAMERA_NUMBER_ROUNDING = 1e-12
-"""Relative difference of a number before and after; decimal text of sixteen digits keeps it."""
+"""Relative difference allowed between a number before writing and after reading; decimal text with
+sixteen digits stays below."""
 _ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
@@ -155,9 +160,10 @@ _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
 
 
 def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
-    """The text of another program's camera file; it is read back and compared before.
+    """Text of another program's camera file, verified by reading it back.
 
-    form : opencv (XML where the path ends so, else YAML), ros or kalibr.
+    form : opencv (XML if the path has this suffix, else YAML), ros or kalibr.
+    Raises InputError if the format is unknown or cannot represent the camera.
     """
     path = Path(path)
     if form not in CAMERA_FILE_FORMATS:
@@ -186,6 +192,8 @@ def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
 
 
 def _from_opencv(text: str, label: str) -> Camera:
+    """Camera of an OpenCV file, YAML or XML."""
+    """Camera of an OpenCV file, YAML or XML."""
     import cv2
 
     try:
@@ -196,7 +204,7 @@ def _from_opencv(text: str, label: str) -> Camera:
         flag = storage.getNode("fisheye_model")
         fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
         storage.release()
-    except (cv2.error, SystemError):  # the latter where its constructor meets what is no YAML
+    except (cv2.error, SystemError):  # SystemError: its constructor met invalid YAML
         raise InputError(
             "not valid as OpenCV writes it",
             where=label,
@@ -224,12 +232,16 @@ def _from_opencv(text: str, label: str) -> Camera:
 
 
 def _word(storage: Any) -> str:
-    """The distortion model's name, where the file has one."""
+    """Name of the distortion model in an OpenCV file; empty if absent."""
     node = storage.getNode("distortion_model")
     return node.string() if not node.empty() and node.isString() else ""
 
 
 def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
+    """Numbers (n,) under the first of several names that an OpenCV file has, or None."""
+    """Numbers (n,) under the first of several names that an OpenCV file has; None if it has
+    none.
+    """
     for name in names:
         node = storage.getNode(name)
         if node.empty():
@@ -243,6 +255,8 @@ def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
 
 
 def _opencv_text(camera: Camera, xml: bool) -> str:
+    """Text of an OpenCV file."""
+    """Text of an OpenCV file."""
     import cv2
 
     form = cv2.FileStorage_FORMAT_XML if xml else cv2.FileStorage_FORMAT_YAML
@@ -260,6 +274,8 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 
 
 def _from_ros(document: Document) -> Camera:
+    """Camera of a ROS camera_info file."""
+    """Camera of a ROS camera_info file."""
     word = document.data.get("distortion_model", "plumb_bob")
     if not isinstance(word, str) or word not in _ROS:
         value = word if isinstance(word, str) else quoted(word)
@@ -273,6 +289,12 @@ def _from_ros(document: Document) -> Camera:
 
 
 def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
+    """Content of a ROS camera_info file; raises InputError for models that the format does not
+    have.
+    """
+    """Content of a ROS camera_info file; raises InputError for models that the format does not
+    have.
+    """
     words = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
     if camera.model not in words:
         raise InputError(
@@ -301,10 +323,14 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
 
 
 def _is_kalibr(value: Any) -> bool:
+    """Whether an entry of a document is a camera in Kalibr's format."""
+    """Whether an entry of a document is a camera in Kalibr's format."""
     return isinstance(value, dict) and "camera_model" in value
 
 
 def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
+    """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
+    """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     if wanted is None and len(cameras) > 1:
         raise InputError(
             "the file holds several cameras", where=document.label, found=listed(cameras),
@@ -334,6 +360,8 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
 
 
 def _kalibr_data(camera: Camera) -> dict[str, Any]:
+    """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
+    """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
     values, k = _named(camera), camera.document()["distortion"]
     if any(k[4:]):
         raise InputError(
@@ -355,7 +383,12 @@ def _kalibr_data(camera: Camera) -> dict[str, Any]:
 def _made(
     model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
 ) -> Camera:
-    """A camera of this program from another's numbers, with its own checks."""
+    """Camera from another program's numbers, validated like pkmcal's own files.
+
+    matrix : (9,) or (3, 3) camera matrix.
+    k : distortion coefficients in the model's order; those beyond the model's number must be zero.
+    Raises InputError.
+    """
     kind = camera_models()[model]
     most = len([name for name in kind.parameter_names if name[0] in "kp" and name[1:].isdigit()])
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
@@ -387,10 +420,14 @@ def _made(
 
 
 def _named(camera: Camera) -> dict[str, float]:
+    """Parameters of a camera by name."""
+    """Parameters of a camera by name."""
     return dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
 
 
 def _matrix(values: dict[str, float]) -> Array:
+    """Camera matrix (3, 3)."""
+    """Camera matrix (3, 3)."""
     return np.array(
         [
             [values["focal.x"], 0, values["center.x"]],
@@ -401,6 +438,8 @@ def _matrix(values: dict[str, float]) -> Array:
 
 
 def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
+    """Value under a path of keys; raises InputError if absent."""
+    """Value under a path of keys; raises InputError if absent."""
     value: Any = document.data
     for key in keys:
         try:
@@ -411,6 +450,8 @@ def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
 
 
 def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
+    """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
+    """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
     values = _value(document, keys)
     numeric = isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in values
@@ -429,6 +470,8 @@ def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -
 def _size(
     document: Document, width: tuple[str | int, ...], height: tuple[str | int, ...]
 ) -> tuple[int, int]:
+    """Image size (width, height) from two paths of keys, px."""
+    """Image size (width, height) from two paths of keys, px."""
     out: list[int] = []
     for keys in (width, height):
         value = _value(document, keys)
@@ -444,6 +487,8 @@ def _size(
 
 
 def _not_ours(where: str, text: str, reference_values: Any) -> InputError:
+    """Error about a camera or lens model that pkmcal does not support."""
+    """Error about a camera or lens model that pkmcal does not support."""
     return InputError(
         "this model of camera or lens is not known here",
         where=where,

@@ -3,9 +3,9 @@
 A line is a unit direction ``u`` and a moment ``m = p x u`` for any of its points p. A cylinder of
 radius R about the line shows two edges to a camera at the origin. Each edge spans a plane with the
 camera's centre. The plane's unit normal ``n`` points away from the axis: ``n . a = -R`` for every
-point a of the axis ([B] 12-13). With the unit moment m and w = u x m, side 0 is ``n_0 = cos m - sin
-w`` and side 1 is ``n_1 = -cos m - sin w``, where sin = R / (distance of the line) ([B] eq. 3 in its
-consistent form). Then u = n_1 x n_0, normalised.
+point a of the axis ([B] 12-13). With the unit moment m and w = u x m, side 0 is
+``n_0 = cos m - sin w`` and side 1 is ``n_1 = -cos m - sin w``, where sin = R / (distance of the
+line) ([B] eq. 3 in its consistent form). Then u = n_1 x n_0, normalised.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class LineSilhouettes(NamedTuple):
     u : (..., 3) unit direction from a to b.
     m : (..., 3) unit moment, along ``a x u``.
     w : (..., 3) ``u x m``, towards the line's nearest point.
-    distance, length, before, behind : (...) m, with ``a = distance w + before u`` and ``b =
-    distance w + behind u``.
+    distance, length, before, behind : (...) m, with ``a = distance w + before u`` and
+    ``b = distance w + behind u``.
     """
 
     u: Array

@@ -1,11 +1,11 @@
 """Rigid motions, in batches.
 
-A pose is a 4x4 matrix ``T_a_b`` that maps coordinates of frame ``b`` to frame ``a``: ``p_a = T_a_b
-p_b``, so inner names cancel in products.
+A pose is a 4x4 matrix ``T_a_b`` that maps coordinates of frame ``b`` to frame ``a``:
+``p_a = T_a_b p_b``, so inner names cancel in products.
 
-Perturbation, defined here for the whole project: six numbers ``delta = (omega, tau)`` change ``T =
-(R, t)`` from the left to ``(Exp(omega) R, t + tau)``; ``omega`` is a rotation vector (rad), ``tau``
-a translation (m), both in the outer frame.
+Perturbation, defined here for the whole project: six numbers ``delta = (omega, tau)`` change
+``T = (R, t)`` from the left to ``(Exp(omega) R, t + tau)``; ``omega`` is a rotation vector (rad),
+``tau`` a translation (m), both in the outer frame.
 """
 
 from __future__ import annotations
@@ -216,8 +216,8 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
 
 
 def look_at(position: Array, target: Array, up: Array) -> Array:
-    """``T_camera_base`` (4, 4) of a camera at ``position`` that looks at ``target`` (base frame,
-    m).
+    """``T_camera_base`` (4, 4) of a camera at ``position`` that looks at ``target``
+    (base frame, m).
 
     Camera axes as in OpenCV: z forward, x right, y down; ``up`` points upwards in the image. The
     caller ensures that ``up`` is not parallel to the viewing direction.
