@@ -34,9 +34,7 @@ def light_of_levels(response: Response) -> Array:
 
 
 def levels_of_light(light: Array, response: Response) -> Array:
-    """Grey levels, not rounded, of light 0..255 of any shape; inverse of
-    :func:`light_of_levels`.
-    """
+    """Grey levels, not rounded, of light 0..255, any shape; inverse of :func:`light_of_levels`."""
     if response == "linear":
         return light
     part = np.clip(light / 255, 0, 1)

@@ -1,4 +1,4 @@
-"""Photographs of a session: found by their names, and their sizes read without decoding them."""
+"""Image files of a session: found by name patterns, their sizes read without decoding."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _FIELDS = ("configuration", "repeat")
 class Photograph:
     """One image file.
 
-    configuration : row of the session's joints that it belongs to.
-    repeat : the pattern's {repeat} part, where it has one.
+    configuration : row of the session's joint readings that the image belongs to.
+    repeat : text matched by the pattern's {repeat}, None without this placeholder.
     """
 
     configuration: int
@@ -42,13 +42,16 @@ class Photograph:
 def find_photographs(
     folder: Path, pattern: str, names: Sequence[str], where: str, *, needed: bool = True
 ) -> tuple[Photograph, ...]:
-    """Find the files that a pattern such as ``images/front/{configuration}.png`` stands for.
+    """Find the image files of a pattern such as ``images/front/{configuration}.png``.
 
+    folder : the session's folder.
     pattern : relative to `folder`, or absolute.
-    names : configurations in joints.csv; a file is paired with its row by name alone, never by
-        order, so that one missing photograph cannot shift the others.
-    where : place of the pattern in session.yaml, for messages. needed : whether none is a fault.
-    Returns photographs by configuration and repeat. A configuration without one is no fault.
+    names : configurations in joints.csv. A file is paired with its row by name only, never by
+    order, so one missing image cannot shift the others.
+    where : location of the pattern in session.yaml, for messages.
+    needed : whether finding no file is an error.
+    Returns images sorted by configuration and repeat; configurations may be without an image.
+    Raises InputError for an invalid pattern and for images of unknown configurations.
     """
     parts = _parts(pattern, where)
     wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
@@ -56,8 +59,8 @@ def find_photographs(
     lengths = sorted({len(name) for name in names}, reverse=True)
 
     def above_limit(path: str) -> re.Match[str] | None:
-        """The path as the pattern's, of a configuration that there is; the longest name first."""
-        # only names that stand in it: thousands as one expression would be tried one by one
+        """Match of a path with the pattern for any configuration, longest names first."""
+        # Only names that occur in the path: an alternation of thousands is matched one by one.
         within = (path[at : at + n] for n in lengths for at in range(len(path) - n + 1))
         some = dict.fromkeys(name for name in within if name in rows)
         return re.fullmatch(_regex(parts, "|".join(map(re.escape, some))), path) if some else None
@@ -67,7 +70,7 @@ def find_photographs(
     files = [
         path
         for path in (Path(name).as_posix() for name in matches)
-        # A folder or a pipe that has a photograph's name is told; others are nobody's business.
+        # A folder or pipe with an image's name is kept, and refused when its header is read.
         if (folder / path).is_file() or above_limit(path)
     ]
     if not files and not needed:
@@ -90,11 +93,12 @@ def find_photographs(
 
 
 def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
-    """Return an image's (width, height) in pixels as stored, before any EXIF rotation.
+    """Size (width, height) in pixels of an image as stored, before any EXIF rotation.
 
-    From its first bytes; of PNG, JPEG, TIFF, BMP and PGM files.
-    label : the file's name in messages; the path unless told.
-    Raises InputError for what is no file, no image, or states a size that its bytes cannot fill.
+    Reads only the header of PNG, JPEG, TIFF, BMP and PGM files.
+    label : the file's name in messages, by default the path.
+    Raises InputError if the path is no regular file or no image, or if the stated size exceeds the
+    file's data.
     """
     path = Path(path)
     label = label or str(path)
@@ -117,12 +121,14 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
 
 
 def label_of(folder: Path, path: Path) -> str:
-    """A photograph's name in messages: its path inside the session, as session.yaml writes it."""
+    """Name of an image in messages: its path relative to the session, as in session.yaml."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
-    """Split a pattern into (text, None) and ("", field)."""
+    """Split a pattern into (text, None) and ("", placeholder); raises InputError for unknown or
+    missing placeholders.
+    """
     try:
         pieces = list(Formatter().parse(Path(pattern).as_posix()))
     except ValueError:
@@ -152,7 +158,10 @@ def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
 
 
 def _regex(parts: Sequence[tuple[str, str | None]], configuration: str) -> str:
-    """The pattern as a regular expression; a field's second occurrence repeats its first."""
+    """Pattern as a regular expression. A placeholder's second occurrence repeats its first.
+
+    configuration : expression for the configuration's name.
+    """
     bodies = {"configuration": configuration, "repeat": "[^/]+?"}
     names_so_far: set[str] = set()
     text = ""
@@ -168,14 +177,16 @@ def _regex(parts: Sequence[tuple[str, str | None]], configuration: str) -> str:
 
 
 def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> InputError:
-    """Say what stands where the photographs should be."""
+    """Error about a pattern without files, with the content of its folder and other suffixes of
+    images there.
+    """
     place = folder / wildcard
     while "*" in str(place):
         place = place.parent
     value = f"no folder {place}"
     try:
         standing = place.is_dir()
-    except OSError:  # such as a name that no folder can have
+    except OSError:  # e.g. an invalid folder name
         standing = False
     if standing:
         entries = sorted(entry.name for entry in place.iterdir())
@@ -197,10 +208,10 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
 
 
 def _endings(folder: Path, wildcard: str) -> list[str]:
-    """Those of the photographs under a pattern without its ending, .JPG and the like."""
+    """Suffixes of the images that match a pattern apart from its own suffix, such as .JPG."""
     try:
         names = glob.glob(f"{wildcard}.*", root_dir=folder)
-    except (OSError, ValueError):  # such as a name that no folder can have
+    except (OSError, ValueError):  # e.g. an invalid folder name
         return []
     return [ending for name in names if (ending := Path(name).suffix).lower() in IMAGE_FILE_ENDINGS]
 
@@ -208,7 +219,7 @@ def _endings(folder: Path, wildcard: str) -> list[str]:
 def _stranger(
     files: Sequence[str], parts: Sequence[tuple[str, str | None]], names: Sequence[str], where: str
 ) -> InputError:
-    """A photograph whose configuration has no readings."""
+    """Error about an image whose configuration has no joint readings."""
     match = re.fullmatch(_regex(parts, "[^/]+?"), files[0])
     name = match["configuration"] if match else files[0]
     more = f" (one of {len(files)} such files)" if len(files) > 1 else ""
