@@ -1,4 +1,4 @@
-"""The calibration board of a session, looked for in its stations' photographs."""
+"""Detection of a session's calibration board in the images of its stations."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session
 
 SLOW_SEARCH_PHOTOGRAPHS = 4
-"""Photographs in which a chessboard that stands still is looked for by slow ways."""
+"""Images in which a still chessboard is searched by the slow methods."""
 OTHER_BOARD_TRIALS = 2
-"""Photographs that are examined for another board."""
+"""Images examined for another board."""
 
 
 def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> Boards:
-    """The session's board in every station that observes it.
+    """Detect the session's board in all stations that observe it.
 
-    images : decoded photographs by the station's number. Raises `InputError` where a station's
-    photographs do not show the board, or show that it moved though it is fixed to the base.
+    images : decoded images by station number.
+    Raises `InputError` if a station's images do not show the board, or if a board on the base
+    moved.
     """
     board = board_of(session)
     if board is None:
@@ -39,7 +40,7 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
         if not station.handheld:
             results[number] = station_board(session, board, number, images[number])
             continue
-        # walking round a machine one does not see its board from everywhere
+        # Hand-held images need not all show the board.
         one, views = _board_by_hand(session, board, number, images[number])
         by_hand.setdefault(station.entry, []).append((station.photographs[0].path, one))
         if views is not None:
@@ -51,7 +52,7 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
 
 
 def board_of(session: Session) -> Board | None:
-    """The board that stations of a session observe, from its file; None where none does."""
+    """Board that stations of the session observe, read from its file; None if no station does."""
     if session.board is None or not any("board" in s.observe for s in session.stations):
         return None
     return load_board(session.board, label=label_of(session.folder, session.board))
@@ -60,14 +61,14 @@ def board_of(session: Session) -> Board | None:
 def station_board(
     session: Session, board: Board, number: int, images: Sequence[Integers]
 ) -> StationBoard:
-    """The board in one station's photographs, all of them decoded."""
+    """Board in the images of one fixed station."""
     station = session.stations[number]
     labels = [label_of(session.folder, photo.path) for photo in station.photographs]
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.success for detection in detections)
     _check_another(board, station.name, [p.path for p in station.photographs], detections)
-    # A board that moves says something new in every photograph; a still one is seen enough.
+    # Each image of a moving board is a new measurement; of a still one, a few are enough.
     most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
     detections = detect_again(images, board, detections, most)
     _check_visible(station.name, board, detections)
@@ -85,7 +86,7 @@ def station_board(
 
 
 def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> None:
-    """Raise `InputError` where no photograph of a station shows the board."""
+    """Raise `InputError` if no image of a station shows the board."""
     if not any(detection.success for detection in detections):
         raise InputError(
             f"the board is in none of the photographs of station {name}",
@@ -100,7 +101,7 @@ def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> 
 def _board_by_hand(
     session: Session, board: Board, number: int, images: Sequence[Integers]
 ) -> tuple[Detection, StationBoard | None]:
-    """The board in a photograph by hand, and what it tells if it is seen well enough."""
+    """Detection in a hand-held image, and the board's pose if it is usable."""
     station = session.stations[number]
     labels = [label_of(session.folder, photo.path) for photo in station.photographs]
     detections = detect_again(images, board, detect_in(images, board, labels), len(images))
@@ -117,7 +118,7 @@ def _board_by_hand(
 def _check_another(
     board: Board, name: str, paths: Sequence[Path], detections: Sequence[Detection]
 ) -> None:
-    """Raise `InputError` where photographs show another board, or more of it than is described."""
+    """Raise `InputError` if images show another board, or a larger one than described."""
     visible = np.flatnonzero([detection.success for detection in detections])
     rows = visible if visible.size else np.arange(len(detections))
     few = rows[evenly(len(rows), OTHER_BOARD_TRIALS)]

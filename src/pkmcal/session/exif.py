@@ -74,6 +74,7 @@ def _described(focal: float, size: tuple[int, int]) -> str:
     """Focal length and image size for a message."""
     """Focal length and image size for a message."""
     """Focal length and image size for a message."""
+    """Focal length and image size for a message."""
     return f"{focal:g} mm at {size[0]}x{size[1]}"
 
 

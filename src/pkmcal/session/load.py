@@ -514,6 +514,7 @@ def _workspace(document: Document, schema: SessionDocument) -> Region | None:
     """Region of the session, None if not stated; raises InputError with its location."""
     """Region of the session, None if not stated; raises InputError with its location."""
     """Region of the session, None if not stated; raises InputError with its location."""
+    """Region of the session, None if not stated; raises InputError with its location."""
     if schema.workspace is None:
         return None
     try:
@@ -730,6 +731,9 @@ def _unphotographed(
     trackers: tuple[PoseTable, ...],
     links: tuple[LinkSet, ...],
 ) -> list[Finding]:
+    """Warning about configurations without measurements; raises InputError if fewer than two have
+    any.
+    """
     """Warning about configurations without measurements; raises InputError if fewer than two have
     any.
     """

@@ -163,9 +163,7 @@ class SessionDocument(Schema):
         return {k: s for k, s in self.stations.items() if isinstance(s, TrackerStationDocument)}
 
     def links(self) -> dict[str, Schema]:
-        """Entries of measurements that depend on two configurations, by kind; absent ones left
-        out.
-        """
+        """Entries of measurements that depend on two configurations, by kind, if present."""
         results = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
         return {code: node for code, node in results.items() if node is not None}
 
