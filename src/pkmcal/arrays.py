@@ -50,8 +50,6 @@ def short_repr(self: Any) -> str:
 
 def _short(value: Any) -> str:
     """Repr of one field's value, at most LONGEST_VALUE characters."""
-    """Repr of one field's value, at most LONGEST_VALUE characters."""
-    """Repr of one field's value, at most LONGEST_VALUE characters."""
     if isinstance(value, np.ndarray):
         return f"<{' × '.join(map(str, value.shape)) or 'one number'}>"
     if is_dataclass(value):

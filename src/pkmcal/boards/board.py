@@ -46,8 +46,6 @@ LONGEST_SQUARE_SIDE = 5.0
 class _Dictionary(Schema):
     """Field of boards with markers."""
 
-    """Field of boards with markers."""
-
     dictionary: str = Field(description="a dictionary's name in OpenCV, such as DICT_5X5_100")
 
     @field_validator("dictionary")
@@ -63,7 +61,6 @@ class _Dictionary(Schema):
 
 
 def _metres(length: float) -> float:
-    """Length if plausible in metres; raises ValueError beyond LONGEST_SQUARE_SIDE."""
     """Length if plausible in metres; raises ValueError beyond LONGEST_SQUARE_SIDE."""
     if length > LONGEST_SQUARE_SIDE:
         raise ValueError(f"{length:g} looks like millimetres; lengths are wanted in metres")
@@ -243,7 +240,6 @@ def _grid(
     kind: str, counts: tuple[int, int], square: float, first: tuple[float, float], data: Any
 ) -> Board:
     """Board with a rectangular grid of corners. first : (x, y) of corner 0, m."""
-    """Board with a rectangular grid of corners. first : (x, y) of corner 0, m."""
     columns, rows = counts
     y, x = np.mgrid[:rows, :columns].reshape(2, -1)
     points = np.stack([first[0] + square * x, first[1] + square * y, 0.0 * x], axis=-1)
@@ -253,7 +249,6 @@ def _grid(
 
 
 def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
-    """Board with the corners of a grid of markers."""
     """Board with the corners of a grid of markers."""
     columns, rows = fields.markers
     row, column = np.mgrid[:rows, :columns].reshape(2, -1)

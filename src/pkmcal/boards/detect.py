@@ -34,7 +34,6 @@ SQUARE_MISCOUNTS_TRIED = 2
 """Largest miscount of a chessboard's columns or rows that is tried."""
 MOST_SQUARES = 16
 """Columns and rows of a ChArUco board are tried up to below this number."""
-"""Columns and rows of a ChArUco board are tried up to below this number."""
 COUNTING_IMAGE_WIDTH = 512
 """Width in px to which images are reduced to try many sizes of chessboards: a try takes a quarter
 of a second, and more than one second at full size."""
@@ -45,7 +44,6 @@ OTHER_MARKER = 0.1
 """Least relative difference between measured and described markers. Corners of markers are located
 to about half a pixel, a twentieth of the smallest markers used."""
 LEAST_MARKERS = 4
-"""Fewest markers for a measurement of their size."""
 """Fewest markers for a measurement of their size."""
 NO_SIZE = 9999
 """Size of a dictionary that belongs to no family."""
@@ -73,7 +71,6 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
 
 
 def _detect(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
-    """Detection in one image file."""
     """Detection in one image file."""
     return detect_board(decode(path, size, path.name), board, path.name, quick)
 
@@ -151,7 +148,6 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
 
 
 def _another(path: Path, other: str, board: Board) -> InputError:
-    """Error about images of another board than the one described."""
     """Error about images of another board than the one described."""
     grid = board.type == "aruco_grid"
     first = f" with first_id: {board.document.get('first_id', 0)}" if grid else ""

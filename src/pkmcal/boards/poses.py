@@ -52,7 +52,6 @@ TWO_TILTS = 25.0
 the same."""
 UNSURE_BOARD_REASON = "the board: too few corners agree on one pose, or its tilt is not sure"
 """Reason for the rejection of a pose."""
-"""Reason for the rejection of a pose."""
 STILL_BOARD_DIFFERENCE = 0.2
 """Difference between two images of a still board allowed beyond noise, px rms over the board. A
 camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of legs,
@@ -64,7 +63,6 @@ MOST_ODD = 1 / 3
 _EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
     "station show the board in one place"  # fmt: skip
 MOST_COMMON = 0.99
-"""Largest share of a pose's covariance that repeats have in common."""
 """Largest share of a pose's covariance that repeats have in common."""
 ODD_BOARD_REASON = "the board lies {:.1f} standard deviations from where the repeats show it"
 ODD_BOARD_DEVIATIONS = 5.0

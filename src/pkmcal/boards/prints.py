@@ -65,7 +65,6 @@ class Print:
 
 def _charuco(data: dict[str, Any]) -> Print:
     """Pattern of a ChArUco board."""
-    """Pattern of a ChArUco board."""
     columns, rows = data["squares"]
     square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
     margin = (square - marker) / 2
@@ -87,7 +86,6 @@ def _charuco(data: dict[str, Any]) -> Print:
 
 
 def _markers(data: dict[str, Any]) -> Print:
-    """Pattern of a grid of markers."""
     """Pattern of a grid of markers."""
     columns, rows = data["markers"]
     bits = marker_bits(data["dictionary"]) + 2

@@ -37,7 +37,6 @@ CAMERA_STARTS_REFINED = 3
 """Number of best starting values that are refined."""
 CAMERA_START_ROUNDS = 3
 """IRLS rounds of this refinement."""
-"""IRLS rounds of this refinement."""
 HELD_OUT_PARTS = 10
 """Number of parts into which the views are dealt; each is predicted by a camera fitted to the
 others."""
@@ -103,7 +102,6 @@ def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
 
 
 def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
-    """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     width, height = image_size
     kind = camera_models()[model]

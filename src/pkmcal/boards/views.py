@@ -48,7 +48,6 @@ class StationBoard:
     @cached_property
     def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
         """Measurements and rejections of a board on the platform."""
-        """Measurements and rejections of a board on the platform."""
         from pkmcal.boards.poses import one_a_configuration
 
         return one_a_configuration(self.views, ONLY_BOARD_MOUNT)

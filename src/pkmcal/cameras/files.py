@@ -193,8 +193,6 @@ def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
 
 def _from_opencv(text: str, label: str) -> Camera:
     """Camera of an OpenCV file, YAML or XML."""
-    """Camera of an OpenCV file, YAML or XML."""
-    """Camera of an OpenCV file, YAML or XML."""
     import cv2
 
     try:
@@ -240,10 +238,6 @@ def _word(storage: Any) -> str:
 
 def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
     """Numbers (n,) under the first of several names that an OpenCV file has, or None."""
-    """Numbers (n,) under the first of several names that an OpenCV file has, or None."""
-    """Numbers (n,) under the first of several names that an OpenCV file has; None if it has
-    none.
-    """
     for name in names:
         node = storage.getNode(name)
         if node.empty():
@@ -257,8 +251,6 @@ def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
 
 
 def _opencv_text(camera: Camera, xml: bool) -> str:
-    """Text of an OpenCV file."""
-    """Text of an OpenCV file."""
     """Text of an OpenCV file."""
     import cv2
 
@@ -278,8 +270,6 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 
 def _from_ros(document: Document) -> Camera:
     """Camera of a ROS camera_info file."""
-    """Camera of a ROS camera_info file."""
-    """Camera of a ROS camera_info file."""
     word = document.data.get("distortion_model", "plumb_bob")
     if not isinstance(word, str) or word not in _ROS:
         value = word if isinstance(word, str) else quoted(word)
@@ -293,12 +283,6 @@ def _from_ros(document: Document) -> Camera:
 
 
 def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
-    """Content of a ROS camera_info file; raises InputError for models that the format does not
-    have.
-    """
-    """Content of a ROS camera_info file; raises InputError for models that the format does not
-    have.
-    """
     """Content of a ROS camera_info file; raises InputError for models that the format does not
     have.
     """
@@ -331,14 +315,10 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
 
 def _is_kalibr(value: Any) -> bool:
     """Whether an entry of a document is a camera in Kalibr's format."""
-    """Whether an entry of a document is a camera in Kalibr's format."""
-    """Whether an entry of a document is a camera in Kalibr's format."""
     return isinstance(value, dict) and "camera_model" in value
 
 
 def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
-    """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
-    """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     if wanted is None and len(cameras) > 1:
         raise InputError(
@@ -369,8 +349,6 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
 
 
 def _kalibr_data(camera: Camera) -> dict[str, Any]:
-    """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
-    """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
     """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
     values, k = _named(camera), camera.document()["distortion"]
     if any(k[4:]):
@@ -431,14 +409,10 @@ def _made(
 
 def _named(camera: Camera) -> dict[str, float]:
     """Parameters of a camera by name."""
-    """Parameters of a camera by name."""
-    """Parameters of a camera by name."""
     return dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
 
 
 def _matrix(values: dict[str, float]) -> Array:
-    """Camera matrix (3, 3)."""
-    """Camera matrix (3, 3)."""
     """Camera matrix (3, 3)."""
     return np.array(
         [
@@ -451,8 +425,6 @@ def _matrix(values: dict[str, float]) -> Array:
 
 def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
     """Value under a path of keys; raises InputError if absent."""
-    """Value under a path of keys; raises InputError if absent."""
-    """Value under a path of keys; raises InputError if absent."""
     value: Any = document.data
     for key in keys:
         try:
@@ -463,8 +435,6 @@ def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
 
 
 def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
-    """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
-    """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
     """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
     values = _value(document, keys)
     numeric = isinstance(values, list) and all(
@@ -485,8 +455,6 @@ def _size(
     document: Document, width: tuple[str | int, ...], height: tuple[str | int, ...]
 ) -> tuple[int, int]:
     """Image size (width, height) from two paths of keys, px."""
-    """Image size (width, height) from two paths of keys, px."""
-    """Image size (width, height) from two paths of keys, px."""
     out: list[int] = []
     for keys in (width, height):
         value = _value(document, keys)
@@ -502,8 +470,6 @@ def _size(
 
 
 def _not_ours(where: str, text: str, reference_values: Any) -> InputError:
-    """Error about a camera or lens model that pkmcal does not support."""
-    """Error about a camera or lens model that pkmcal does not support."""
     """Error about a camera or lens model that pkmcal does not support."""
     return InputError(
         "this model of camera or lens is not known here",

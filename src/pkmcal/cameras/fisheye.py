@@ -105,8 +105,6 @@ class Fisheye(Camera):
 
     def _reaches(self, angle: Array, points: Array) -> Booleans:
         """Whether points with these angles from the axis are inside the field of view; (...)."""
-        """Whether points with these angles from the axis are inside the field of view; (...)."""
-        """Whether points with these angles from the axis are inside the field of view; (...)."""
         return (angle < self._limit()) & np.any(points != 0, axis=-1)
 
     def _radius(self, angle: Array) -> Array:

@@ -140,8 +140,6 @@ def _undistort_radially(target: Array, k: Array) -> Array:
 
 def _radial(r2: Any, k: Array) -> Any:
     """Radial factor of the distortion at squared radii r2."""
-    """Radial factor of the distortion at squared radii r2."""
-    """Radial factor of the distortion at squared radii r2."""
     return 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
 
 
@@ -152,8 +150,6 @@ def _fold(k: Array) -> float:
 
 @lru_cache(maxsize=64)  # evaluated with every projection
 def _radial_fold(k1: float, k2: float, k3: float) -> float:
-    """Cached computation of :func:`_fold`."""
-    """Cached computation of :func:`_fold`."""
     """Cached computation of :func:`_fold`."""
     if k1 >= 0 and k2 >= 0 and k3 >= 0:
         return np.inf

@@ -1,4 +1,6 @@
-"""Machines as limbs between a base and a platform: closure, kinematics, parameters, files."""
+"""Machines with limbs between a base and a platform: closure equations, kinematics, parameters,
+files.
+"""
 
 from __future__ import annotations
 
@@ -39,12 +41,13 @@ __all__ = [
 
 
 LARGEST_DEVIATION_SHARE = 0.25
-"""Of a machine's size. The distance of two points that are each uncertain by more would be known to
-hardly more than its order; the tolerances of real drawings are a hundredth of it at most."""
+"""Largest prior sigma as a share of the machine's size. If two points are each uncertain by more,
+only the order of magnitude of their distance is known; prior sigmas of real machines are a
+hundredth of it at most."""
 
 
 def catalogue() -> dict[str, Path]:
-    """The built-in machines' files by name."""
+    """Files of the built-in machines by name."""
     folder = resources.files("pkmcal.mechanisms") / "catalog"
     return {Path(str(f)).stem: Path(str(f)) for f in folder.iterdir() if f.name.endswith(".yaml")}
 
@@ -66,7 +69,7 @@ def load_mechanism(
     Raises
     ------
     pkmcal.errors.InputError
-        Anything that the schema does not allow, with file, line and field.
+        Any content that the schema does not allow, with file, line and field.
 
     """
     built_in = catalogue()
@@ -93,19 +96,20 @@ def load_mechanism(
 
 
 def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
-    """A file's fields, as they stand there and as the schema has them."""
+    """Document of a mechanism file, raw and validated."""
     document = read_yaml(path, label)
     return document, validated_document(document, MechanismDocument)
 
 
 _drawing = cache(_read)
-"""The same of a built-in machine, read once: the package's own files stay as they are."""
+""":func:`_read` for built-in machines, cached because the package's own files do not change."""
 
 
 def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:
-    """The machine of a file's fields, which stand under `keys` in it.
+    """Machine from a validated document whose fields are under `keys` in its file.
 
-    Raises InputError with file and field for a drawing that cannot be a machine's.
+    Raises InputError with file and field if the nominal model is not a machine, or is likely in
+    millimetres.
     """
     try:
         machine = machine_from_document(checked, lambda *inner: document.where(*keys, *inner))
@@ -133,8 +137,11 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
 
 
 def check_plausible(value: float, machine: Machine, where: str, what: str) -> None:
-    """Raise InputError for a deviation, m, with which nothing would be known of a machine's size;
-    as a rule it was meant in millimetres. where : its place in a file. what : what it is called.
+    """Raise InputError for a standard deviation of a length, m, above LARGEST_DEVIATION_SHARE of
+    the machine's size; usually the value was meant in millimetres.
+
+    where : location of the value in its file.
+    what : name of the value in the message.
     """
     most = LARGEST_DEVIATION_SHARE * machine.size
     if value <= most:
@@ -151,7 +158,9 @@ def check_plausible(value: float, machine: Machine, where: str, what: str) -> No
 
 
 def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
-    """The entry under ``fixed`` or ``tied`` that a sentence is about, if it names one."""
+    """Path of the entry under ``fixed`` or ``tied`` that an error's sentence names, empty if it
+    names none.
+    """
     entries: list[tuple[tuple[str | int, ...], str]] = [
         (("fixed", k), name) for k, name in enumerate(checked.fixed)
     ]
@@ -168,7 +177,7 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
 
 
 def _model(document: MechanismDocument, name: str) -> DocumentModel:
-    """One of a machine's models by its name."""
+    """Model of a machine by name; raises InputError."""
     if name in document.models:
         return document.models[name]
     names = sorted(document.models)
@@ -181,5 +190,5 @@ def _model(document: MechanismDocument, name: str) -> DocumentModel:
 
 
 def mechanism_text(machine: Machine) -> str:
-    """The machine as the text of a mechanism file, present values in it."""
+    """Text of a mechanism file with the machine's present values."""
     return yaml_text(machine.to_document())

@@ -72,9 +72,6 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
 
 def _described(focal: float, size: tuple[int, int]) -> str:
     """Focal length and image size for a message."""
-    """Focal length and image size for a message."""
-    """Focal length and image size for a message."""
-    """Focal length and image size for a message."""
     return f"{focal:g} mm at {size[0]}x{size[1]}"
 
 

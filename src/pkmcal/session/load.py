@@ -512,9 +512,6 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
 
 def _workspace(document: Document, schema: SessionDocument) -> Region | None:
     """Region of the session, None if not stated; raises InputError with its location."""
-    """Region of the session, None if not stated; raises InputError with its location."""
-    """Region of the session, None if not stated; raises InputError with its location."""
-    """Region of the session, None if not stated; raises InputError with its location."""
     if schema.workspace is None:
         return None
     try:
@@ -731,15 +728,6 @@ def _unphotographed(
     trackers: tuple[PoseTable, ...],
     links: tuple[LinkSet, ...],
 ) -> list[Finding]:
-    """Warning about configurations without measurements; raises InputError if fewer than two have
-    any.
-    """
-    """Warning about configurations without measurements; raises InputError if fewer than two have
-    any.
-    """
-    """Warning about configurations without measurements; raises InputError if fewer than two have
-    any.
-    """
     """Warning about configurations without measurements; raises InputError if fewer than two have
     any.
     """

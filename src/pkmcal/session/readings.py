@@ -67,9 +67,6 @@ def check_readings(
 
 def _check_columns(table: CsvTable, n_joints: int) -> None:
     """Check number and order of the columns."""
-    """Check number and order of the columns."""
-    """Check number and order of the columns."""
-    """Check number and order of the columns."""
     names = len(table.columns)
     if names != n_joints:
         raise InputError(
@@ -182,15 +179,6 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
     """Refuse readings beyond the margin of their range; return a warning about those within the
     margin.
     """
-    """Refuse readings beyond the margin of their range; return a warning about those within the
-    margin.
-    """
-    """Refuse readings beyond the margin of their range; return a warning about those within the
-    margin.
-    """
-    """Refuse readings beyond the margin of their range; return a warning about those within the
-    margin.
-    """
     far = np.argwhere(~_inside(table.values, ranges))
     if len(far):
         row, column = far[0]
@@ -298,9 +286,6 @@ def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
-    """Refuse readings of which none changes; return a warning about joints that do not move."""
-    """Refuse readings of which none changes; return a warning about joints that do not move."""
-    """Refuse readings of which none changes; return a warning about joints that do not move."""
     """Refuse readings of which none changes; return a warning about joints that do not move."""
     still = unmoved_readings(table.values, noise)
     if still.all():
