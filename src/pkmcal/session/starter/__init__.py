@@ -1,7 +1,7 @@
-"""A session to fill in: the files that ``pkmcal new`` writes, each with comments for a newcomer.
+"""Starter session: the files that ``pkmcal new`` writes, each with comments for a newcomer.
 
-The starter session is a hexapod seen by its legs from one place; one of another machine, or with a
-board, or from several places, is made of it.
+The template is a hexapod whose legs one camera observes from one station. Sessions of other
+machines, with a board, or with several stations are derived from it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TO_FILL = {
     "joints.csv": "write one row of readings for each configuration into it",
     "board.yaml": "write down which board it is, and measure its squares",
 }
-"""What a person still has to do in each file."""
+"""Task that remains for the user in each file."""
 STARTER_PLACE_NAMES = ("front", "left", "right", "back")
 OBSERVE_ENTRY_VALUES = {"legs": "legs", "board": "board", "both": "[legs, board]"}
 STARTER_BOARD_TEXT = """\
@@ -44,7 +44,7 @@ dictionary: DICT_5X5_100
 tolerance: 0.1 %          # how well you measured: paper changes its size by as much
 """
 STARTER_SQUARE_SIDE, STARTER_SQUARE_CHOICES = 30, range(8, 31)
-"""mm, of the board's squares as they are, and as they can be asked for."""
+"""Side of the board's squares, mm: the default and the values that can be chosen."""
 ON_PLATFORM = """\
 
 board:
@@ -62,7 +62,7 @@ READINGS_ALONE_TEXT = """\
 # Spread the configurations over all that it reaches.
 """
 EXAMPLE_UNIT_FACTORS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
-"""Units of example readings by the mark in a column's head."""
+"""Factors from SI units to those named in the headers of example readings."""
 LEGS_TEXT = " - The machine stands still."
 BOARD_TEXT = """\
  - The machine stands still. The board sharp, whole in the picture, neither white nor black, and
@@ -80,19 +80,19 @@ def write_session(
     what: ObservedChoice | None = None,
     places: int = 1,
 ) -> tuple[str, ...]:
-    """Write a session into a new or empty folder; returns its files.
+    """Write a starter session into a new or empty folder; returns the names of its files.
 
-    machine : a built-in machine's name or a mechanism file; without one a hexapod to be changed.
-    what : what the camera sees of it; the legs unless told, or a board where the drawing gives them
-    no cylinders, or nothing where readings alone tell the geometry. places : that the camera stands
-    in, one after another. Raises InputError for a folder that is not empty, and for legs that
-    cannot be seen.
+    machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
+    what : what the camera observes; by default the legs, or a board if the nominal model has no
+    tubes, or nothing if readings alone determine the geometry.
+    places : number of stations of the camera.
+    Raises InputError for a folder that is not empty, and for legs without tubes.
     """
     return write_texts(folder, session_texts(machine, what, places))
 
 
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
-    """Write a session's files, by their names, into a new or empty folder, whole or not at all."""
+    """Write a session's files, by name, into a new or empty folder, atomically."""
     folder = Path(folder)
     if entries(folder):
         raise InputError(
@@ -111,7 +111,7 @@ def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
 def session_texts(
     machine: str | None = None, what: ObservedChoice | None = None, places: int = 1
 ) -> dict[str, str]:
-    """The session's files by their names, as of :func:`write_session`."""
+    """Texts of a session's files by name; arguments as for :func:`write_session`."""
     files = sorted(path for path in SESSION_TEMPLATE_FOLDER.rglob("*") if path.is_file())
     texts = {
         path.relative_to(SESSION_TEMPLATE_FOLDER).as_posix(): path.read_text("utf-8")
@@ -149,11 +149,12 @@ def session_texts(
 
 
 def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
-    """board.yaml of the example, with squares of so many millimetres."""
+    """Text of the example board.yaml. square : mm."""
     return STARTER_BOARD_TEXT.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
 
 
 def _places(count: int) -> list[str]:
+    """Names of the stations."""
     return [
         *STARTER_PLACE_NAMES,
         *(f"place{k + 1}" for k in range(len(STARTER_PLACE_NAMES), count)),
@@ -161,12 +162,14 @@ def _places(count: int) -> list[str]:
 
 
 def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> str:
-    """Two rows of joints.csv: the home pose's, and one's beside it. heads : of the columns, such as
-    ``stepper_a [mm]``, in mm or degrees where they say so; the joints' names unless told.
+    """Two rows of joints.csv: readings of the home pose, and of a pose beside it.
+
+    heads : headers of the columns, such as ``stepper_a [mm]``, with values in mm or degrees if they
+    name these; by default the joints' names.
     """
     poses = np.repeat(machine.home()[None], 2, axis=0)
     lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
-    # along the last of its motions that is no turn, by a part of its size
+    # Shift the second pose along the motion's last translation, by a part of the machine's size.
     motions = MOTION_DIRECTIONS[machine.document.motion]
     slide = next(c for c in motions.T[::-1] if not c[:3].any())[3:]
     poses[1, :3, 3] += slide * np.abs(lengths).max() / 30
@@ -184,7 +187,7 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
 
 
 def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
-    """The starter session.yaml for another machine, another thing that is seen, more places."""
+    """Text of session.yaml for another machine, another observation, or more stations."""
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
         text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
@@ -204,7 +207,7 @@ def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
-    """Warnings about the files of a session that are still as `write_session` left them."""
+    """Warnings about files of a session that are still as `write_session` wrote them."""
     return tuple(
         doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
@@ -213,12 +216,14 @@ def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
 
 
 def _untouched(path: Path, name: str) -> bool:
-    """Compared by lines: an editor may change the line ends of a file that it only looked at."""
+    """Whether a file equals any starter text, compared by lines because editors may change line
+    ends.
+    """
     try:
         lines = path.read_text("utf-8").splitlines() if path.is_file() else []
     except (OSError, UnicodeDecodeError):
         return False
-    # readings of a machine in motion are many: only examples have two rows
+    # of readings, only examples have two rows
     if not lines or (name == "joints.csv" and len(lines) != 3):
         return False
     examples = _examples(name)
@@ -228,17 +233,17 @@ def _untouched(path: Path, name: str) -> bool:
 
 
 def _of_the_drawing(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
-    """The example readings of a folder's own drawing, where it can be read."""
+    """Example readings of the folder's own machine; none if its file is invalid."""
     try:
         machine = load_mechanism(folder / "mechanism.yaml")
         return (example_readings(machine, heads),) if len(heads) == machine.n_joints else ()
-    except PkmcalError:  # told elsewhere, with its line
+    except PkmcalError:  # reported when the session is loaded
         return ()
 
 
 @cache
 def _examples(name: str) -> tuple[str, ...]:
-    """Every text that a file of a new session can begin as."""
+    """All texts that a file of a starter session can have."""
     if name == "board.yaml":
         return tuple(board_text(square) for square in STARTER_SQUARE_CHOICES)
     template = (SESSION_TEMPLATE_FOLDER / name).read_text("utf-8")
