@@ -182,7 +182,7 @@ class Detection:
     ids : (n,) corners detected.
     pixels : (n, 2).
     sigma : (n,) px, standard deviation of a coordinate from noise and sharpness of the image; 0 if
-    unknown.
+        unknown.
     reason : why no corner is used; empty if the board was detected.
     weak : ids of corners located but not fitted: half occluded, in shadow or at the image's border.
     mirrored : whether the image is mirrored; only boards with markers show this.

@@ -77,7 +77,7 @@ class CameraCalibration:
     weight : (V, N) IRLS weights, 0 to 1.
     noise : px, corners' noise beyond their own sigma, per coordinate.
     rms, held_out : px, root mean square of the residuals' lengths, on the views used, and on views
-    held out of the estimate of the camera (their poses are fitted).
+        held out of the estimate of the camera (their poses are fitted).
     compared : all candidate models and sets of coefficients.
     """
 

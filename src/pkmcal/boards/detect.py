@@ -236,7 +236,7 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
     """Description of the board in an image if it is not `board`; None if there is none.
 
     part : whether a part of the described chessboard counts as another board, not as a partial
-    detection.
+        detection.
     """
     if board.type == "chessboard":
         # Markers first: one search, where chessboards need one for each size.

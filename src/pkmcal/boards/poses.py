@@ -251,7 +251,7 @@ class Standing:
     covariance : (6, 6), left perturbation, from the corners alone.
     agreed : (F,) images used, of those that show the board.
     scatter : px, rms over the board and these images of the distance from the mean; nan for one
-    image.
+        image.
     noise : px rms beyond the corners' noise that the mean leaves unexplained.
     rejected : images that disagree.
     """

@@ -121,11 +121,11 @@ class HeldOut:
     """Errors on held-out views.
 
     residuals : (V, N, 2) px; the pose of each view is fitted, the camera is estimated from other
-    views.
+        views.
     rms : px, of the residuals' lengths.
     by_view : (V,) px, the same by view.
     straightness : px, rms distance of corners from the great circle of their board line, in rays of
-    the camera from other views; it depends on no pose.
+        the camera from other views; it depends on no pose.
     """
 
     residuals: Array
@@ -234,7 +234,7 @@ class Candidate:
 
     parameters : number of free intrinsics.
     rms : px, root mean square length of the residuals, over the corners in use by the best
-    candidate.
+        candidate.
     left_out : px, the same for views left out of the fit, to first order.
     robust : px, the same as left_out over all corners, each bounded by the best candidate's noise.
     by_view : (V,) px^2, squares of ``robust`` by view.

@@ -95,7 +95,7 @@ class Boards:
         """Poses of the stations, with unknown ones derived through a board on the base.
 
         T_camera_base : (4, 4) each, None if unknown. At least one station with a known pose must
-        observe the board.
+            observe the board.
 
         T_camera_base = T_camera_board T_board_other T_other_base, [A] 3.3.
         """

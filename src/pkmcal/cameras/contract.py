@@ -93,7 +93,7 @@ class Camera(ABC):
 
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and center,
-    dimensionless otherwise. Pixel centres are at integers, as in OpenCV.
+        dimensionless otherwise. Pixel centres are at integers, as in OpenCV.
     covariance : (n, n) of the parameters from the camera's calibration, or None.
     own : fields of the model's file between ``center`` and ``distortion``.
     odd : names of the parameters that change sign when the image is rotated by 180 degrees.

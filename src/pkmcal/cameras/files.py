@@ -65,7 +65,7 @@ def written_camera(file: str) -> str:
     degrees as its images were.
 
     file : the camera's file as the session names it. cameras/front.yaml becomes camera-front.yaml;
-    other folders, and a #, become hyphens.
+        other folders, and a #, become hyphens.
     """
     parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
     return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"

@@ -65,7 +65,7 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
     cos m - sin u x m ([B] eq. 3).
 
     u, m : (..., 3) direction and moment of the axes in the camera frame, as :func:`line_through`
-    returns them.
+        returns them.
     radius : (...,) m.
     sign : (...,) of SIDE_SIGNS.
     Returns NaN where the centre of projection is inside the cylinder.
@@ -84,7 +84,7 @@ class LineSilhouettes(NamedTuple):
     m : (..., 3) unit moment, along ``a x u``.
     w : (..., 3) ``u x m``, towards the line's nearest point.
     distance, length, before, behind : (...) m, with ``a = distance w + before u`` and
-    ``b = distance w + behind u``.
+        ``b = distance w + behind u``.
     """
 
     u: Array

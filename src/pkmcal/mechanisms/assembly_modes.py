@@ -42,13 +42,13 @@ class AssemblyModes:
     internal : (k, n) hinge angles of an articulated platform, rad.
     mode_numbers : (k,) number of starts that led to each mode.
     sign : (k,) 1 if the Jacobian's determinant has the sign it has at home, -1 if not: such a mode
-    cannot be reached from home without crossing a singular pose, others may be. 0 without a
-    determinant.
+        cannot be reached from home without crossing a singular pose, others may be. 0 without a
+        determinant.
     starts, closed : number of starts, and of those that led to any pose.
     missing : upper bound, with 99.9 percent probability, of the share of closed starts that lead to
-    a mode not listed; 1 if no start closed.
+        a mode not listed; 1 if no start closed.
     complete : whether each mode was found RAREST_MODE_FINDS times; False if the number of starts
-    ended the search.
+        ended the search.
     """
 
     poses: Array

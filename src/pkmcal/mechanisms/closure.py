@@ -485,7 +485,7 @@ def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
     nominal directions.
 
     drawing : (P,) nominal values; see
-    :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
+        :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
     """
     axes = np.concatenate(layout.turning)
     if not axes.size:

@@ -138,7 +138,7 @@ class Follower:
     :meth:`pkmcal.mechanisms.Machine.follower`.
 
     T_base_platform : the last pose. A call raises GeometryError if the machine cannot be closed at
-    the readings; the last pose then stays.
+        the readings; the last pose then stays.
     """
 
     def __init__(self, layout: LimbLayout, theta: Array, start: Array) -> None:

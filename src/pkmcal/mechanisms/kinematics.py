@@ -225,8 +225,8 @@ class ForwardResult:
 
     T_base_platform : (..., 4, 4).
     converged : (...). An overdetermined machine (more rows than unknowns) is closed by least
-    squares, and has converged if the residual can be due to errors of readings and geometry, see
-    OTHER_MACHINE_GAP.
+        squares, and has converged if the residual can be due to errors of readings and geometry,
+        see OTHER_MACHINE_GAP.
     error : (...) largest closure error, m.
     internal : (..., n) hinge angles of an articulated platform, rad; n = 0 for a rigid one.
     layout, theta, readings : the machine, and the readings at which it was closed.

@@ -26,7 +26,7 @@ class CarrierGroup:
 
     legs : (g,) leg indices from 0.
     index : (g, n) indices of their parameters, P for numbers that are not parameters, whose values
-    are in ``constants`` (g, n).
+        are in ``constants`` (g, n).
     silent : (g, n) where ``index`` is P.
     """
 
@@ -61,12 +61,12 @@ class LimbLayout:
     internal : (L,) column of the platform carrier's internal coordinate, -1 without one.
     rod_reads : (L,) whether the reading is the rod's own length, not the carrier's motion.
     scale : (L,) index of each reading's scale, P if it is exact; then ``exact_scale`` (L,) holds
-    its value, 1 for a leg without a reading.
+        its value, 1 for a leg without a reading.
     base_axis, platform_axis : (L, 3) indices of the axes' parameters, -1 for an axis that is not a
-    parameter.
+        parameter.
     angles : the axes' equations.
     turning : indices (n, 3) of all direction vectors among the parameters, in the base frame and in
-    the platform frame.
+        the platform frame.
     radius : (tubes,) indices of the radii, for each leg.
     motion : (6, d) directions in which the platform moves.
     n_parameters : P.

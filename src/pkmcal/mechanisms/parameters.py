@@ -27,11 +27,12 @@ class ParameterTable:
     """All parameters of a machine, in a fixed order.
 
     names, units, kinds : P entries. Units are m, rad, 1 for components of directions, empty for
-    ratios. ``kinds`` are names of prior sigmas: center, offset, radius, axis, arm, angle, scale.
+        ratios. ``kinds`` are names of prior sigmas: center, offset, radius, axis, arm, angle,
+        scale.
     labels : names for people, without the leg: ``base centre z``.
     parts : part of the leg that a parameter changes: its ``base`` or ``platform`` joint, its
-    ``rod``, the ``zero`` or the ``lead`` of its reading, or a part named by its carrier; empty for
-    a tube's radius, which is no part of the mechanism.
+        ``rod``, the ``zero`` or the ``lead`` of its reading, or a part named by its carrier; empty
+        for a tube's radius, which is no part of the mechanism.
     drawing, tolerance : (P,) nominal values and their prior sigmas.
     fixed : names that keep their nominal value.
     tied : groups of names that change by the same amount.

@@ -28,7 +28,7 @@ class ReadingHypothesis:
 
     motors : columns that differ.
     constant : for a reversed motor, the sum (m or rad) of a reading and its true value; 0 for a
-    wrong sign alone.
+        wrong sign alone.
     """
 
     code: Literal["readings.reversed", "readings.exchanged", "readings.renumbered"]

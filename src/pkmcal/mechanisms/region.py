@@ -39,8 +39,8 @@ class Region:
 
     x, y, z : lowest and highest coordinate in the base frame, m; None for the machine's full reach.
     turn : largest rotation from home's orientation about any axis of the motion, rad. None for no
-    rotation; but if constant rods or axes do not allow all translations without rotation (a 3-RPS),
-    for the machine's full reach.
+        rotation; but if constant rods or axes do not allow all translations without rotation (a
+        3-RPS), for the machine's full reach.
     Raises InputError for invalid intervals or rotations.
     """
 

@@ -116,14 +116,14 @@ class Amplification:
     cranks; for a machine with both, 1 m/s counts as 1 rad/s.
 
     fastest, slowest : (...) largest and smallest speed of the point, m/s per unit of joint speed,
-    over the directions of the file's motion; 0 if the motors cannot move it in some of them.
+        over the directions of the file's motion; 0 if the motors cannot move it in some of them.
     quickest_turn, slowest_turn : (...) the same for rotation, rad/s. Zero if the machine does not
-    rotate.
+        rotate.
     force : (..., m) largest force of each motor, N (torque of a crank, N m), for 1 N on the point
-    in any direction.
+        in any direction.
     torque : (..., m) the same for a moment of 1 N m about the point.
     condition : (...) ratio of largest to smallest speed over the machine's own freedoms, with
-    rotations scaled by the platform's radius to speeds of its joints; 1 is best.
+        rotations scaled by the platform's radius to speeds of its joints; 1 is best.
     """
 
     fastest: Array

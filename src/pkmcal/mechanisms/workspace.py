@@ -74,7 +74,7 @@ class Reach:
     too_short, too_long : (..., m) whether the reading is below or above its range.
     off : (...) closure error of the rows that no motor moves, m.
     forbidden : (...) whether ``off`` is more than a micrometre, or the pose is outside the file's
-    motion.
+        motion.
     singularity : (...) as in forward kinematics.
     singular : (...) whether it is too small.
     crossed : (...) whether the determinant's sign differs from home's: a singular pose is between.
@@ -220,7 +220,7 @@ class Grid:
     """Workspace on a grid of positions with one orientation.
 
     axes : coordinates along each direction, m from the middle pose, (a,) (b,) and, for a volume,
-    (c,).
+        (c,).
     inside : (a, b[, c]) reachable poses that are connected to the middle pose through neighbours.
     singularity : (a, b[, c]), NaN out of reach.
     size : area (m^2) or volume (m^3) inside, by counting cells.
@@ -243,9 +243,9 @@ def extents(
     reach, a singular pose.
 
     directions : (k, 3) along the base's axes, or (k, 6) twists (omega, tau), whose multiples are
-    the distances: a twist of 1 rad about an axis gives rad.
+        the distances: a twist of 1 rad about an axis gives rad.
     most : end of the search, in the same units; by default half a turn or twice a rod's length,
-    whichever comes first.
+        whichever comes first.
 
     On machines whose rods and axes constrain some freedoms, paths follow the admissible poses next
     to the straight line.
@@ -348,7 +348,7 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
 
     directions : (2, 3) or (3, 3) orthogonal, base frame, for a section or a volume.
     count : number of points along the longest side. The grid spans the reach of straight paths
-    along and between the directions, and a tenth more.
+        along and between the directions, and a tenth more.
     Raises InputError if ``middle`` is outside the workspace, and if the machine cannot move along
     one of the directions without rotation.
     """

@@ -47,7 +47,7 @@ def find_photographs(
     folder : the session's folder.
     pattern : relative to `folder`, or absolute.
     names : configurations in joints.csv. A file is paired with its row by name only, never by
-    order, so one missing image cannot shift the others.
+        order, so one missing image cannot shift the others.
     where : location of the pattern in session.yaml, for messages.
     needed : whether finding no file is an error.
     Returns images sorted by configuration and repeat; configurations may be without an image.

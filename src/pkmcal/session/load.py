@@ -84,7 +84,7 @@ class Station:
     from_exif : whether only the EXIF focal length of the camera is known.
     response : encoding of light in the images.
     response_given : whether the response is stated in session.yaml or was determined from edges;
-    otherwise it is the usual one for the type of file.
+        otherwise it is the usual one for the type of file.
     """
 
     name: str

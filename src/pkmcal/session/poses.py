@@ -46,7 +46,7 @@ class PoseTable:
     kind : code of the kind of measurement.
     configuration : (N,) rows of the session's readings.
     T : (N, 4, 4) T_tracker_target. The rotation of a point, and all but z of a height, are
-    placeholders.
+        placeholders.
     position, rotation : standard deviations, m and rad.
     level : whether the tracker's z axis is exactly the base's.
     """

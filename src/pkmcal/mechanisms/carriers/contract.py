@@ -85,8 +85,8 @@ class ParameterKind(NamedTuple):
     otherwise : value if the file omits the field, which is then no parameter.
     label : name for people, if side and path are not clear enough.
     part : part of the leg that the parameter changes, if not simply the joint on its side: ``zero``
-    of the reading (added to it), or an ``arm``, a ``hinge``, any word for a piece that can slip or
-    be exchanged by itself.
+        of the reading (added to it), or an ``arm``, a ``hinge``, any word for a piece that can slip
+        or be exchanged by itself.
     """
 
     path: str
@@ -102,8 +102,8 @@ class NamedMotion(NamedTuple):
 
     columns : (n, m) changes of the carrier's n parameters.
     one, several : text for one leg and for several legs; together : for all legs, if only some
-    combinations are unidentifiable. Sentences without a full stop, with the placeholders of
-    :class:`pkmcal.identify.motions.NamedChanges`.
+        combinations are unidentifiable. Sentences without a full stop, with the placeholders of
+        :class:`pkmcal.identify.motions.NamedChanges`.
     """
 
     columns: Array
@@ -136,12 +136,12 @@ class Chain(NamedTuple):
     """Elementary joint that carries a limb's end, for programs that model bodies and joints.
 
     motion : motion of the arm by the reading (base side) or by the platform (platform side):
-    ``fixed`` to its body, ``slide`` along the axis, ``turn`` about it by the right-hand rule,
-    ``float`` with a constant direction while the platform rotates.
+        ``fixed`` to its body, ``slide`` along the axis, ``turn`` about it by the right-hand rule,
+        ``float`` with a constant direction while the platform rotates.
     point : (..., 3) m, foot of the arm, on the axis if there is one; body's frame.
     axis : (..., 3) unit, body's frame; zeros without an axis.
     arm : (..., 3) m, from the point to the limb's end at reading or internal coordinate zero;
-    body's frame, for ``float`` along the base frame's axes.
+        body's frame, for ``float`` along the base frame's axes.
     """
 
     motion: Literal["fixed", "slide", "turn", "float"]
@@ -161,7 +161,7 @@ class Carrier(ABC):
     held_in_plane : fields that are fixed on a planar machine, which they would tilt.
     side : of the leg.
     ways : fields of three lengths that are differences of points. Other fields of three lengths are
-    points, those without a unit directions.
+        points, those without a unit directions.
 
     Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
     :mod:`pkmcal.identify.gauge`.
@@ -332,7 +332,7 @@ class PlatformCarrier(Carrier, ABC):
 
     body : name of the field with the number of the body of an articulated platform.
     turns : whether B also rotates about a hinge, by an internal coordinate of the pose without a
-    reading; legs on the same body share it.
+        reading; legs on the same body share it.
     floats : whether ``center`` is along the base frame's axes.
     most_turn : largest rotation of the platform about z to either side, rad.
     obstacle : text that states what limits this rotation.

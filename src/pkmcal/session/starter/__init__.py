@@ -84,7 +84,7 @@ def write_session(
 
     machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
     what : what the camera observes; by default the legs, or a board if the nominal model has no
-    tubes, or nothing if readings alone determine the geometry.
+        tubes, or nothing if readings alone determine the geometry.
     places : number of stations of the camera.
     Raises InputError for a folder that is not empty, and for legs without tubes.
     """
@@ -165,7 +165,7 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
     """Two rows of joints.csv: readings of the home pose, and of a pose beside it.
 
     heads : headers of the columns, such as ``stepper_a [mm]``, with values in mm or degrees if they
-    name these; by default the joints' names.
+        name these; by default the joints' names.
     """
     poses = np.repeat(machine.home()[None], 2, axis=0)
     lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
