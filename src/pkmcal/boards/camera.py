@@ -228,12 +228,12 @@ def calibrate_camera(
 
 def _check_model_name(model: str) -> None:
     """Raise InputError for an unknown camera model."""
-    reference_values = ("auto", *DISTORTION_CANDIDATES)
-    if model not in reference_values:
+    models = ("auto", *DISTORTION_CANDIDATES)
+    if model not in models:
         raise InputError(
             "no such camera model",
             found=model,
-            expected=closest(model, reference_values) or listed(reference_values),
+            expected=closest(model, models) or listed(models),
         )
 
 
@@ -314,13 +314,13 @@ def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
     corners are rejected.
     """
     check_numbering(fit.residuals, views.pixels, board, "the board file")
-    in_view = views.visible
-    lost = 1 - float((in_view & (fit.weight >= 0.5)).sum()) / max(int(in_view.sum()), 1)
-    if lost <= MOST_CORNERS_LOST:
+    visible = views.visible
+    rejected = 1 - float((visible & (fit.weight >= 0.5)).sum()) / max(int(visible.sum()), 1)
+    if rejected <= MOST_CORNERS_LOST:
         return
     raise ResultError(
         "too many of the board's corners do not fit the rest",
-        found=f"{lost:.0%} of them ({fit.camera.model} fits best)",
+        found=f"{rejected:.0%} of them ({fit.camera.model} fits best)",
         expected=f"{MOST_CORNERS_LOST:.0%} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",

@@ -100,13 +100,13 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
 def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: Board) -> None:
     """Raise `InputError` if some or all images show a board other than `board`."""
     missed = [f for f, d in zip(files, detections, strict=True) if not d.success]
-    visible = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
-    display = [path for path, _ in visible]
+    detected = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
+    with_board = [path for path, _ in detected]
     size = detections[0].image_size
     other: str | None = None
     if board.type == "aruco_grid":
-        _check_grid([path for path, _ in visible[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
-    for path, detection in visible[:BOARD_PHOTOGRAPHS_EXAMINED]:
+        _check_grid([path for path, _ in detected[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
+    for path, detection in detected[:BOARD_PHOTOGRAPHS_EXAMINED]:
         # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
@@ -119,17 +119,17 @@ def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: 
         if other is None:
             break
     if other is not None:
-        raise _another(display[0], other, board)
+        raise _another(with_board[0], other, board)
     for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
-        other = other_board(decode(path, size, path.name), board, part=not display)
-        if other is not None and not display:
+        other = other_board(decode(path, size, path.name), board, part=not with_board)
+        if other is not None and not with_board:
             raise _another(path, other, board)
         if other is not None:
             raise InputError(
                 "photographs of two boards are mixed",
                 where=path.name,
                 found=other,
-                expected=f"{board.described}, as in {listed([f.name for f in display], 3)}",
+                expected=f"{board.described}, as in {listed([f.name for f in with_board], 3)}",
                 next_step="Calibrate with the photographs of one board",
             )
 
@@ -162,8 +162,10 @@ def _another(path: Path, other: str, board: Board) -> InputError:
 
 def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> None:
     """Raise `InputError` if the layout of a grid's markers contradicts its file."""
-    words = dictionary(board.document["dictionary"])
-    layout = marker_layout([detect_markers(decode(p, size, p.name), words) for p in paths])
+    aruco_dictionary = dictionary(board.document["dictionary"])
+    layout = marker_layout(
+        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths]
+    )
     if layout is None:
         return
     other = another_grid(layout, board)
@@ -348,8 +350,8 @@ def _charuco_corners(
     marker_corners = [corner[None].astype(np.float32) for corner in corners]
     marker_ids = ids.astype(np.int32)[:, None]
     detector: Any = charuco_detector(data)
-    value: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
-    count = 0 if value is None else len(value)
+    corner_ids: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    count = 0 if corner_ids is None else len(corner_ids)
     columns, rows = data["squares"]
     return count, count / ((columns - 1) * (rows - 1))
 

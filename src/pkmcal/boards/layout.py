@@ -74,13 +74,13 @@ class _Neighbours(NamedTuple):
     pitch: Array
 
 
-def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
+def marker_layout(images: Sequence[Markers]) -> MarkerLayout | None:
     """Layout of the markers in images; None if there are too few neighbours or they disagree."""
-    results = [part for markers in photographs if (part := _neighbours(markers)) is not None]
-    if not results:
+    neighbours = [part for markers in images if (part := _neighbours(markers)) is not None]
+    if not neighbours:
         return None
-    ids = np.concatenate([part.ids for part in results])
-    step = np.concatenate([part.step for part in results])
+    ids = np.concatenate([part.ids for part in neighbours])
+    step = np.concatenate([part.step for part in neighbours])
     difference = ids[:, 1] - ids[:, 0]
     along = _usual(difference[step[:, 0] == 1])
     down = _usual(difference[step[:, 1] == 1])
@@ -90,7 +90,7 @@ def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
     return MarkerLayout(
         along,
         down,
-        float(np.median(np.concatenate([part.pitch for part in results]))) - 1,
+        float(np.median(np.concatenate([part.pitch for part in neighbours]))) - 1,
         Counter((i, j) for i, j in rows),
         frozenset(int(number) for number in ids.flat),
     )
@@ -125,9 +125,9 @@ def _usual(differences: Array) -> int | None:
     """Most frequent difference of ids; None if LEAST_AGREEMENT of the pairs do not share it."""
     if len(differences) < LEAST_NEIGHBOURS:
         return None
-    values, counts = np.unique(differences, return_counts=True)
+    steps, counts = np.unique(differences, return_counts=True)
     best = int(np.argmax(counts))
-    return int(values[best]) if counts[best] >= LEAST_AGREEMENT * len(differences) else None
+    return int(steps[best]) if counts[best] >= LEAST_AGREEMENT * len(differences) else None
 
 
 def _neighbours(markers: Markers) -> _Neighbours | None:

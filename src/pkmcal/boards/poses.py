@@ -155,18 +155,27 @@ def board_views(
     Raises `InputError` if the corners contradict the board file or the camera file.
     """
     _check_sides(board, detections)
-    visible = np.flatnonzero([detection.success for detection in detections])
+    with_board = np.flatnonzero([detection.success for detection in detections])
     views = views_of([detection for detection in detections if detection.success], board)
     poses = board_poses(camera, views)
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
     usable = (used >= LEAST_CORNERS_WEIGHED) & _one_tilt(camera, views, poses)
-    in_view = BoardViews(
-        station, camera, board, configuration, tuple(detections), visible, views, poses, rms, usable
+    station_views = BoardViews(
+        station,
+        camera,
+        board,
+        configuration,
+        tuple(detections),
+        with_board,
+        views,
+        poses,
+        rms,
+        usable,
     )
-    _check_explained(in_view)
-    return in_view
+    _check_explained(station_views)
+    return station_views
 
 
 def pose_set(
@@ -268,11 +277,11 @@ class Standing:
         move.
         """
         row = views.configuration[views.numbers[self.agreed]][:1]
-        actual_names = pose_set(
+        poses = pose_set(
             views.station, row, mount, self.T_camera_board[None], self.covariance[None]
         )
         by = views.poses.by_intrinsics[self.agreed].mean(axis=0)[None]
-        return replace(actual_names, by_intrinsics=by)
+        return replace(poses, by_intrinsics=by)
 
 
 def standing_board(views: BoardViews) -> Standing | None:
@@ -445,22 +454,22 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     delta = pose_difference(T, T[groups.first[groups.member]])
     off = _deviation(delta - groups.median(delta)[groups.member], covariance)
     # With two repeats the outlier is unknown: both stay, and their scatter increases sigma.
-    several = groups.count[groups.member] > 2
-    usual = float(np.median(off[several])) if several.any() else 1.0
-    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~several
-    retained = groups_of(configuration[used])
+    repeated = groups.count[groups.member] > 2
+    usual = float(np.median(off[repeated])) if repeated.any() else 1.0
+    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~repeated
+    groups_used = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
-    mean, stated = retained.mean(delta), retained.mean(covariance_used)
-    alone = (1 - common) * stated
-    rest = delta - mean[retained.member]
-    freedom = float(np.sum(retained.count - 1))
+    mean, stated = groups_used.mean(delta), groups_used.mean(covariance_used)
+    independent = (1 - common) * stated
+    residual = delta - mean[groups_used.member]
+    freedom = float(np.sum(groups_used.count - 1))
     spread = 1.0
     if freedom:
-        size = np.sum(_deviation(rest, alone[retained.member]) ** 2)
+        size = np.sum(_deviation(residual, independent[groups_used.member]) ** 2)
         spread = max(float(size) / freedom, 1.0)
-    total = common * stated + spread * alone / retained.count[:, None, None]
-    first = np.flatnonzero(used)[retained.first]
-    reference = T[groups.first[groups.member]][used][retained.first]
+    total = common * stated + spread * independent / groups_used.count[:, None, None]
+    first = np.flatnonzero(used)[groups_used.first]
+    reference = T[groups.first[groups.member]][used][groups_used.first]
     return MeanPoses(first, perturb(reference, mean), total, used, off)
 
 
@@ -474,25 +483,25 @@ def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[R
     """Measurements of a board on the platform, one for each configuration, and rejections of
     outlying repeats.
     """
-    retained_rows = np.flatnonzero(views.usable)
-    rows = views.configuration[views.numbers[retained_rows]]
-    if not len(retained_rows):
+    usable = np.flatnonzero(views.usable)
+    rows = views.configuration[views.numbers[usable]]
+    if not len(usable):
         return PoseSet.empty(), ()
     sigma2 = float(np.median(views.views.sigma[views.views.visible]) ** 2)
     noise2 = views.poses.noise**2
     common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
-    value = mean_poses(
+    means = mean_poses(
         rows,
-        views.poses.T_camera_board[retained_rows],
-        views.poses.covariance[retained_rows],
+        views.poses.T_camera_board[usable],
+        views.poses.covariance[usable],
         common,
     )
     odd = tuple(
-        views.rejection(int(views.numbers[retained_rows[k]]), ODD_BOARD_REASON.format(value.off[k]))
-        for k in np.flatnonzero(~value.used)
+        views.rejection(int(views.numbers[usable[k]]), ODD_BOARD_REASON.format(means.off[k]))
+        for k in np.flatnonzero(~means.used)
     )
-    poses = pose_set(views.station, rows[value.first], mount, value.pose, value.covariance)
-    by = groups_of(rows[value.used]).mean(views.poses.by_intrinsics[retained_rows[value.used]])
+    poses = pose_set(views.station, rows[means.first], mount, means.pose, means.covariance)
+    by = groups_of(rows[means.used]).mean(views.poses.by_intrinsics[usable[means.used]])
     return replace(poses, by_intrinsics=by), odd
 
 

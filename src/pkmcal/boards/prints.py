@@ -6,6 +6,7 @@ millimetre unless "fit to page" is active; rulers of known length beside the boa
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -104,8 +105,8 @@ def _modules(name: str, number: int) -> Booleans:
     """Modules of a marker with its black border, (bits + 2, bits + 2)."""
     import cv2
 
-    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
-    return np.asarray(picture) < 128
+    image = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
+    return np.asarray(image) < 128
 
 
 def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
@@ -143,7 +144,7 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
         *_ruler(np.array([corner[0], below]), np.array([ruler, 0.0]), on_page),
         *_ruler(np.array([left, corner[1] + size[1]]), np.array([0.0, -ruler]), on_page),
     ]
-    words = [
+    captions = [
         f"{1e3 * ruler:.0f} mm here, along the ruler at the left as well: print in actual size"
         " (100 %), not fitted to the page.",
         f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, and correct board.yaml"
@@ -155,7 +156,8 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
         f"BT /F {PRINTED_LETTER_POINTS} Tf"
         f" {on_page(min(corner[0], LETTERING_STRIP_WIDTH), below + 0.005)} Td 10 TL"
     ]
-    text += [f"({_escaped(line)}) Tj T*" for line in words] + ["ET"]
+    escaped = [re.sub(r"([\\()])", r"\\\1", line) for line in captions]
+    text += [f"({line}) Tj T*" for line in escaped] + ["ET"]
     # One path for all rectangles: antialiasing viewers draw seams between separate ones.
     content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])
     return _document(page / PDF_POINT, content), name
@@ -215,11 +217,6 @@ def _described(board: Board) -> str:
     ]
     lettering = [data["dictionary"]] if "dictionary" in data else []
     return f"pkmcal: {board.described}, {', '.join(lengths + lettering)}"
-
-
-def _escaped(line: str) -> str:
-    """Text escaped for a PDF string."""
-    return line.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
 
 
 def _document(size: Array, content: str) -> bytes:

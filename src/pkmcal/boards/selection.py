@@ -108,12 +108,12 @@ def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
     names = kind.parameter_names
     for scale in np.geomspace(*FOCAL_RANGES[model], FOCALS_TRIED):
         for xi in XIS_TRIED if "xi" in names else (0.0,):
-            values = dict.fromkeys(names, 0.0)
-            values["focal.x"] = values["focal.y"] = float(scale) * width * (1 + xi)
-            values["center.x"], values["center.y"] = (width - 1) / 2, (height - 1) / 2
+            parameters = dict.fromkeys(names, 0.0)
+            parameters["focal.x"] = parameters["focal.y"] = float(scale) * width * (1 + xi)
+            parameters["center.x"], parameters["center.y"] = (width - 1) / 2, (height - 1) / 2
             if "xi" in names:
-                values["xi"] = xi
-            yield kind(image_size, np.array([values[name] for name in names]))
+                parameters["xi"] = xi
+            yield kind(image_size, np.array([parameters[name] for name in names]))
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,8 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
 
 def leave_one_out_residuals(fit: CameraFit, views: Views) -> Array:
     """Residuals (V, N, 2) px of each view under the camera estimated without it, to first order."""
-    shifted, rows, _ = _without_each(fit, views)
-    change = (rows @ shifted[..., None])[..., 0].reshape(*views.visible.shape, 2)
+    changes, rows, _ = _without_each(fit, views)
+    change = (rows @ changes[..., None])[..., 0].reshape(*views.visible.shape, 2)
     scale = fit.problem(views).scale[0][..., None]
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
 
@@ -204,10 +204,10 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     The jackknife's covariance is (V - 1) / V times the sum of squares of the changes when a view is
     left out. Returns 1 if chance explains the ratio.
     """
-    shifted, _, normal = _without_each(fit, views)
-    off = shifted - shifted.mean(axis=0)
-    count = len(shifted)
-    jackknife = (count - 1) / count * off.T @ off
+    changes, _, normal = _without_each(fit, views)
+    deviation = changes - changes.mean(axis=0)
+    count = len(changes)
+    jackknife = (count - 1) / count * deviation.T @ deviation
     ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
     return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
 
@@ -224,8 +224,8 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     normals = rows.mT @ rows
     whole = normals.sum(axis=0)
     right = rows.mT @ linear.value[0][..., None]
-    shifted = np.stack([inverted(whole - part) for part in normals]) @ right
-    return shifted[..., 0], rows, whole
+    changes = np.stack([inverted(whole - part) for part in normals]) @ right
+    return changes[..., 0], rows, whole
 
 
 @dataclass(frozen=True)
@@ -275,10 +275,12 @@ def camera_candidates(
         return ()
     # Compare all candidates on the same corners, rejected ones included. Each squared residual is
     # bounded by the rejection limit of the best fit, so no model wins by rejecting more.
-    usual = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
-    most = NO_WEIGHT_DISTANCE**2 * (usual**2 + views.sigma**2)
-    off = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
-    bounded = [np.minimum(_squares(remainder, views.visible), most) for remainder in off]
+    sigma = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
+    limit = NO_WEIGHT_DISTANCE**2 * (sigma**2 + views.sigma**2)
+    held_out_residuals = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
+    bounded = [
+        np.minimum(_squares(residuals, views.visible), limit) for residuals in held_out_residuals
+    ]
     best = int(np.argmin([np.sum(squares) for squares in bounded]))
     used = (fits[best][2].weight > 0.5) & views.visible
     pool = [
@@ -287,12 +289,14 @@ def camera_candidates(
             terms=terms,
             parameters=len(fit.free),
             rms=_rms(fit.residuals, used),
-            left_out=_rms(remainder, used),
+            left_out=_rms(residuals, used),
             robust=float(np.sqrt(np.sum(squares) / max(int(views.visible.sum()), 1))),
             by_view=np.sum(squares, axis=1) / np.maximum(views.visible.sum(axis=1), 1),
             fit=fit,
         )
-        for (model, terms, fit), remainder, squares in zip(fits, off, bounded, strict=True)
+        for (model, terms, fit), residuals, squares in zip(
+            fits, held_out_residuals, bounded, strict=True
+        )
     ]
     return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
@@ -328,8 +332,8 @@ def thinned(views: Views) -> Views:
     # One random set of corners for all views keeps arrays small and has no pattern of rows.
     order = np.random.default_rng(0).permutation(len(views.points))
     used = order[: max(len(order) * MOST_CORNERS // total, LEAST_OF_VIEW)]
-    for in_view in views.visible:
-        mine = order[in_view[order]]
+    for visible in views.visible:
+        mine = order[visible[order]]
         used = np.union1d(used, mine[:LEAST_OF_VIEW])
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 

@@ -32,23 +32,25 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
     board = board_of(session)
     if board is None:
         return Boards()
-    results: dict[int, StationBoard] = {}
+    boards: dict[int, StationBoard] = {}
     by_hand: dict[str, list[tuple[Path, Detection]]] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         if not station.handheld:
-            results[number] = station_board(session, board, number, images[number])
+            boards[number] = station_board(session, board, number, images[number])
             continue
         # Hand-held images need not all show the board.
-        one, views = _board_by_hand(session, board, number, images[number])
-        by_hand.setdefault(station.entry, []).append((station.photographs[0].path, one))
+        detection, views = _board_by_hand(session, board, number, images[number])
+        path = station.photographs[0].path
+        by_hand.setdefault(station.entry, []).append((path, detection))
         if views is not None:
-            results[number] = views
-    for entry, photographs in by_hand.items():
-        _check_another(board, entry, *zip(*photographs, strict=True))
-        _check_visible(entry, board, [detection for _, detection in photographs])
-    return Boards(results, session.board_body, board.tolerance)
+            boards[number] = views
+    for entry, detected in by_hand.items():
+        paths, detections = zip(*detected, strict=True)
+        _check_another(board, entry, paths, detections)
+        _check_visible(entry, board, detections)
+    return Boards(boards, session.board_body, board.tolerance)
 
 
 def board_of(session: Session) -> Board | None:

@@ -82,12 +82,12 @@ class Boards:
 
     def of(self, stations: Integers) -> Boards:
         """Boards of a subset of the stations, renumbered in their order."""
-        retained = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
+        selected = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
         return replace(
             self,
             stations={
                 new: replace(one, views=replace(one.views, station=new))
-                for new, one in retained.items()
+                for new, one in selected.items()
             },
         )
 
@@ -100,10 +100,8 @@ class Boards:
         T_camera_base = T_camera_board T_board_other T_other_base, [A] 3.3.
         """
         stood = {k: s.stood.T_camera_board for k, s in self.stations.items() if s.stood}
-        reference_values = (
-            (k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood
-        )
-        T_board_base = next((inverse(stood[k]) @ T for k, T in reference_values), None)
+        posed = ((k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood)
+        T_board_base = next((inverse(stood[k]) @ T for k, T in posed), None)
         if T_board_base is None:
             return list(T_camera_base)
         return [

@@ -133,10 +133,10 @@ class Camera(ABC):
         version, in the precision of the points.
         """
         by_point = self.project_jacobians(points)[0]
-        shifted = (
+        derivatives = (
             of_components(*(dot(by_point[..., k, :], d) for k in (0, 1))) for d in directions
         )
-        return self.project(points), *shifted
+        return self.project(points), *derivatives
 
     @abstractmethod
     def ray(self, pixels: Array) -> Array:

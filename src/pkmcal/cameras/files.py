@@ -50,7 +50,11 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)
-    cameras = [key for key, value in document.data.items() if _is_kalibr(value)]
+    cameras = [
+        key
+        for key, entry in document.data.items()
+        if isinstance(entry, dict) and "camera_model" in entry  # Kalibr's format
+    ]
     if cameras:
         return _from_kalibr(document, cameras, camera)
     if camera is not None:
@@ -108,10 +112,10 @@ def camera_from_document(document: Document) -> Camera:
     if fields.covariance is None:
         return camera
     where = document.where("covariance")
-    return replace(camera, covariance=_checked(fields.covariance, camera, where))
+    return replace(camera, covariance=_checked_covariance(fields.covariance, camera, where))
 
 
-def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
+def _checked_covariance(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
     """Covariance (n, n) of the camera's parameters, checked for size, symmetry and negative
     variances.
     """
@@ -124,8 +128,10 @@ def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) ->
             expected=f"{n} rows of {n}, for {', '.join(camera.parameter_names)}",
         )
     matrix = np.array(rows)
-    values = np.linalg.eigvalsh((matrix + matrix.T) / 2)
-    if not np.allclose(matrix, matrix.T, rtol=1e-6) or values[0] < -1e-9 * abs(values[-1]):
+    eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2)
+    if not np.allclose(matrix, matrix.T, rtol=1e-6) or eigenvalues[0] < -1e-9 * abs(
+        eigenvalues[-1]
+    ):
         raise InputError("the covariance is not symmetric, or has negative variances", where=where)
     return matrix
 
@@ -197,11 +203,13 @@ def _from_opencv(text: str, label: str) -> Camera:
 
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        results: dict[str, Any] = {
+        numbers: dict[str, Any] = {
             key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
         }
-        flag = storage.getNode("fisheye_model")
-        fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
+        flag, model_name = (storage.getNode(n) for n in ("fisheye_model", "distortion_model"))
+        fisheye = (not flag.empty() and flag.real() != 0) or (
+            not model_name.empty() and model_name.isString() and "fisheye" in model_name.string()
+        )
         storage.release()
     except (cv2.error, SystemError):  # SystemError: its constructor met invalid YAML
         raise InputError(
@@ -210,12 +218,12 @@ def _from_opencv(text: str, label: str) -> Camera:
             next_step="Write it again with cv2.FileStorage",
         ) from None
     for key in ("matrix", "width", "height"):
-        if results[key] is None:
+        if numbers[key] is None:
             raise InputError(
                 f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
             )
     for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
-        values = results[key]
+        values = numbers[key]
         if values is not None and (len(values) != count or not np.all(np.isfinite(values))):
             raise InputError(
                 f"the camera's {key} is not what it should be",
@@ -223,17 +231,13 @@ def _from_opencv(text: str, label: str) -> Camera:
                 found=quoted(values.tolist()),
                 expected=count_of(count, "finite number"),
             )
-    size = (round(float(results["width"][0])), round(float(results["height"][0])))
-    k = results["distortion"] if results["distortion"] is not None else np.zeros(0)
-    xi = results["xi"]
+    size = (round(float(numbers["width"][0])), round(float(numbers["height"][0])))
+    k = numbers["distortion"] if numbers["distortion"] is not None else np.zeros(0)
+    xi = numbers["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
-    return _made(model, size, results["matrix"], k, None if xi is None else float(xi[0]), label)
-
-
-def _word(storage: Any) -> str:
-    """Name of the distortion model in an OpenCV file; empty if absent."""
-    node = storage.getNode("distortion_model")
-    return node.string() if not node.empty() and node.isString() else ""
+    return _camera_from_numbers(
+        model, size, numbers["matrix"], k, None if xi is None else float(xi[0]), label
+    )
 
 
 def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
@@ -256,15 +260,15 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 
     form = cv2.FileStorage_FORMAT_XML if xml else cv2.FileStorage_FORMAT_YAML
     storage = cv2.FileStorage("", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY | form)
-    values = _named(camera)
+    parameters = _parameters_by_name(camera)
     storage.write("image_width", int(camera.image_size[0]))
     storage.write("image_height", int(camera.image_size[1]))
-    storage.write("camera_matrix", _matrix(values))
+    storage.write("camera_matrix", _matrix(parameters))
     storage.write("distortion_coefficients", np.array(camera.document()["distortion"])[:, None])
     if camera.model == "fisheye":
         storage.write("fisheye_model", 1)
     if camera.model == "unified":
-        storage.write("xi", np.array([[values["xi"]]]))
+        storage.write("xi", np.array([[parameters["xi"]]]))
     return storage.releaseAndGetString()
 
 
@@ -273,13 +277,13 @@ def _from_ros(document: Document) -> Camera:
     word = document.data.get("distortion_model", "plumb_bob")
     if not isinstance(word, str) or word not in _ROS:
         value = word if isinstance(word, str) else quoted(word)
-        raise _not_ours(document.where("distortion_model"), value, _ROS)
+        raise _unsupported(document.where("distortion_model"), value, _ROS)
     size = _size(document, ("image_width",), ("image_height",))
     matrix = _numbers(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
     if "distortion_coefficients" in document.data:
         k = _numbers(document, ("distortion_coefficients", "data"), range(15))
-    return _made(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
+    return _camera_from_numbers(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
 
 
 def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
@@ -293,7 +297,7 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
             expected="pinhole or fisheye",
             next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
         )
-    matrix = _matrix(_named(camera))
+    matrix = _matrix(_parameters_by_name(camera))
     k = camera.document()["distortion"]
     projection = np.concatenate([matrix, np.zeros((3, 1))], axis=1)
 
@@ -313,11 +317,6 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
     }
 
 
-def _is_kalibr(value: Any) -> bool:
-    """Whether an entry of a document is a camera in Kalibr's format."""
-    return isinstance(value, dict) and "camera_model" in value
-
-
 def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
     """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     if wanted is None and len(cameras) > 1:
@@ -333,42 +332,42 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     data = document.data[key]
     pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:
-        reference_values = ["-".join(names) for names in _KALIBR]
-        raise _not_ours(document.where(key, "camera_model"), "-".join(pair), reference_values)
+        models = ["-".join(names) for names in _KALIBR]
+        raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
     model = _KALIBR[pair]
     count = 5 if model == "unified" else 4
-    values = _numbers(document, (key, "intrinsics"), (count,))
+    intrinsics = _numbers(document, (key, "intrinsics"), (count,))
     size = _size(document, (key, "resolution", 0), (key, "resolution", 1))
     k = np.zeros(0)
     if pair[1] != "none":
         k = _numbers(document, (key, "distortion_coeffs"), (4,))
-    fu, fv, pu, pv = values[-4:].tolist()
+    fu, fv, pu, pv = intrinsics[-4:].tolist()
     matrix = np.array([fu, 0, pu, 0, fv, pv, 0, 0, 1])
-    xi = float(values[0]) if model == "unified" else None
-    return _made(model, size, matrix, k, xi, document.where(key, "intrinsics"))
+    xi = float(intrinsics[0]) if model == "unified" else None
+    return _camera_from_numbers(model, size, matrix, k, xi, document.where(key, "intrinsics"))
 
 
 def _kalibr_data(camera: Camera) -> dict[str, Any]:
     """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
-    values, k = _named(camera), camera.document()["distortion"]
+    parameters, k = _parameters_by_name(camera), camera.document()["distortion"]
     if any(k[4:]):
         raise InputError(
             "Kalibr's radtan distortion has no third radial term",
             found=f"k3 = {k[4]:g}",
             next_step="Calibrate without k3, or write the camera for OpenCV or ROS",
         )
-    four = [values[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
+    four = [parameters[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
     mirror = camera.model == "unified"
     return {
         "camera_model": "omni" if mirror else "pinhole",
-        "intrinsics": [values["xi"], *four] if mirror else four,
+        "intrinsics": [parameters["xi"], *four] if mirror else four,
         "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
         "distortion_coeffs": list(k[:4]),
         "resolution": [int(n) for n in camera.image_size],
     }
 
 
-def _made(
+def _camera_from_numbers(
     model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
 ) -> Camera:
     """Camera from another program's numbers, validated like pkmcal's own files.
@@ -407,17 +406,17 @@ def _made(
     return camera_from_document(Document(Path(where), where, fields, {}))
 
 
-def _named(camera: Camera) -> dict[str, float]:
+def _parameters_by_name(camera: Camera) -> dict[str, float]:
     """Parameters of a camera by name."""
     return dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
 
 
-def _matrix(values: dict[str, float]) -> Array:
+def _matrix(parameters: dict[str, float]) -> Array:
     """Camera matrix (3, 3)."""
     return np.array(
         [
-            [values["focal.x"], 0, values["center.x"]],
-            [0, values["focal.y"], values["center.y"]],
+            [parameters["focal.x"], 0, parameters["center.x"]],
+            [0, parameters["focal.y"], parameters["center.y"]],
             [0, 0, 1.0],
         ]
     )
@@ -469,12 +468,12 @@ def _size(
     return out[0], out[1]
 
 
-def _not_ours(where: str, text: str, reference_values: Any) -> InputError:
+def _unsupported(where: str, text: str, models: Any) -> InputError:
     """Error about a camera or lens model that pkmcal does not support."""
     return InputError(
         "this model of camera or lens is not known here",
         where=where,
         found=text,
-        expected=listed(list(reference_values)),
+        expected=listed(list(models)),
         next_step="Calibrate again from photographs of a board: pkmcal camera",
     )

@@ -94,14 +94,14 @@ def in_pixels(parameters: Array, good: Booleans, distorted: Array) -> Array:
         )
 
 
-def moved_in_pixels(parameters: Array, shifted: Sequence[Array], by_xy: Array | None) -> Array:
+def moved_in_pixels(parameters: Array, change: Sequence[Array], by_xy: Array | None) -> Array:
     """Changes of pixels (..., 2) from changes of the undistorted x and y, each (...).
 
     by_xy : (..., 2, 2) derivative of :func:`distort` at the points, None without distortion.
     """
-    x, y = shifted
+    x, y = change
     if by_xy is not None:
-        x, y = (by_xy[..., k, 0] * shifted[0] + by_xy[..., k, 1] * shifted[1] for k in (0, 1))
+        x, y = (by_xy[..., k, 0] * change[0] + by_xy[..., k, 1] * change[1] for k in (0, 1))
     focal = parameters[:2].tolist()
     return of_components(focal[0] * x, focal[1] * y)
 
@@ -191,12 +191,12 @@ class Pinhole(Camera):
         """Pixels and directional derivatives from one evaluation of the distortion."""
         good, z, xy, distorted, by_xy = self._imaged(points)
         z = np.where(good, z, np.nan)
-        shifted: list[Array] = []
+        derivatives: list[Array] = []
         for d in directions:
             # x/z and y/z change by (dx - x/z dz) / z
             own = [(d[..., k] - xy[..., k] * d[..., 2]) / z for k in (0, 1)]
-            shifted.append(moved_in_pixels(self.parameters, own, by_xy))
-        return in_pixels(self.parameters, good, distorted), *shifted
+            derivatives.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *derivatives
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters

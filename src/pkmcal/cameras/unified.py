@@ -69,13 +69,13 @@ class Unified(Camera):
         (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
         depth = np.where(good, depth, np.nan)
         bend = self.xi / distance
-        shifted: list[Array] = []
+        derivatives: list[Array] = []
         for d in directions:
             # x / w changes by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
             dw = bend * dot(points, d) + d[..., 2]
             own = [(d[..., k] - xy[..., k] * dw) / depth for k in (0, 1)]
-            shifted.append(moved_in_pixels(self.parameters, own, by_xy))
-        return in_pixels(self.parameters, good, distorted), *shifted
+            derivatives.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *derivatives
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters

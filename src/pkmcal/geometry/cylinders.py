@@ -115,8 +115,8 @@ class LineSilhouettes(NamedTuple):
         and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) / length + v
         ((before n.db - behind n.da) / length - dR) / distance``.
         """
-        value = edge_planes(self.distance, radius, SIDE_SIGNS[side])
-        sine, cosine = (x[..., None] for x in value)
+        planes = edge_planes(self.distance, radius, SIDE_SIGNS[side])
+        sine, cosine = (x[..., None] for x in planes)
         turn = (self.w + (sine / cosine) * self.m) / self.distance[..., None]
         shift = self.u / self.length[..., None]
         by_a = shift - (self.behind / self.length)[..., None] * turn

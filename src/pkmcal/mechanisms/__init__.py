@@ -21,7 +21,7 @@ from pkmcal.files import (
     validated_document,
     yaml_text,
 )
-from pkmcal.mechanisms.document import DocumentModel, MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import listed
@@ -82,12 +82,19 @@ def load_mechanism(
             found=str(source),
             expected=guess or f"a mechanism file, or {listed(sorted(built_in), len(built_in))}",
         )
-    document, checked = _drawing(path, label) if str(source) in built_in else _read(path, label)
+    document, checked = _built_in(path, label) if str(source) in built_in else _read(path, label)
     if model is not None:
-        try:
-            chosen = _model(checked, model)
-        except InputError as error:
-            raise error.located(document.label) from None
+        if model not in checked.models:
+            names = sorted(checked.models)
+            raise InputError(
+                what=f"mechanism {checked.name!r} has no model of this name",
+                where=document.label,
+                found=model,
+                expected=closest(model, names) or (listed(names) if names else "no model at all"),
+                next_step="name a model under models in the mechanism file, with what it fixes and"
+                " ties",
+            )
+        chosen = checked.models[model]
         if chosen.mechanism is not None:
             beside = path.parent / chosen.mechanism
             return load_mechanism(chosen.mechanism if chosen.mechanism in built_in else beside)
@@ -101,7 +108,7 @@ def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
     return document, validated_document(document, MechanismDocument)
 
 
-_drawing = cache(_read)
+_built_in = cache(_read)
 """:func:`_read` for built-in machines, cached because the package's own files do not change."""
 
 
@@ -174,19 +181,6 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
         return repr(name) in sentence or (bool(name) and name.removeprefix("-") in sentence)
 
     return next((keys for keys, name in entries if is_named(name)), ())
-
-
-def _model(document: MechanismDocument, name: str) -> DocumentModel:
-    """Model of a machine by name; raises InputError."""
-    if name in document.models:
-        return document.models[name]
-    names = sorted(document.models)
-    raise InputError(
-        what=f"mechanism {document.name!r} has no model of this name",
-        found=name,
-        expected=closest(name, names) or (listed(names) if names else "no model at all"),
-        next_step="name a model under models in the mechanism file, with what it fixes and ties",
-    )
 
 
 def mechanism_text(machine: Machine) -> str:

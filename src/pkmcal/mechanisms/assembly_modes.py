@@ -138,19 +138,19 @@ def _of_coordinates(modes: Array) -> tuple[Array, Array]:
     return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
 
 
-def _counted(modes: Array, value: Integers, more: Array) -> tuple[Array, Integers]:
+def _counted(modes: Array, count: Integers, closed: Array) -> tuple[Array, Integers]:
     """Modes (k, c) and their counts (k,), updated with the coordinates (n, c) of further closed
     starts.
     """
-    remainder = more
-    retained, counts = list(modes), list(value)
+    unassigned = closed
+    distinct, counts = list(modes), list(count)
     k = 0
-    while len(remainder):  # one round for each mode, not for each start
-        if k == len(retained):
-            retained.append(remainder[0])
+    while len(unassigned):  # one round for each mode, not for each start
+        if k == len(distinct):
+            distinct.append(unassigned[0])
             counts.append(0)
-        same: Booleans = np.abs(remainder - retained[k]).max(axis=-1) < SAME_MODE_DISTANCE
+        same: Booleans = np.abs(unassigned - distinct[k]).max(axis=-1) < SAME_MODE_DISTANCE
         counts[k] += int(np.count_nonzero(same))
-        remainder = remainder[~same]
+        unassigned = unassigned[~same]
         k += 1
-    return np.array(retained).reshape(len(retained), modes.shape[1]), np.array(counts, dtype=int)
+    return np.array(distinct).reshape(len(distinct), modes.shape[1]), np.array(counts, dtype=int)

@@ -210,8 +210,8 @@ def scales(layout: LimbLayout, theta: Array) -> Array:
     """Scale of each leg's reading, (..., L), or (L,) if all are exact."""
     if not layout.some_scales_unsure:
         return layout.exact_scale
-    reference_values = theta[..., layout.scale_or_first]
-    return np.where(layout.unsure_scales, reference_values, layout.exact_scale)
+    estimated = theta[..., layout.scale_or_first]
+    return np.where(layout.unsure_scales, estimated, layout.exact_scale)
 
 
 def rod_rates(layout: LimbLayout, theta: Array) -> Array:
@@ -353,12 +353,12 @@ class Closure(LimbEnds):
     @cached_property
     def by_reading(self) -> Array:
         """Derivatives (..., E) by the reading of each row's leg, zero without one."""
-        layout, shifted = self.layout, self.base.by_reading
-        by = -dot(self.rows.u, shifted) - rod_rates(layout, self.theta)
+        layout, by_own_reading = self.layout, self.base.by_reading
+        by = -dot(self.rows.u, by_own_reading) - rod_rates(layout, self.theta)
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
-        angles = -dot(self.rows.w, shifted[..., layout.angles.leg, :])
+        angles = -dot(self.rows.w, by_own_reading[..., layout.angles.leg, :])
         return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property

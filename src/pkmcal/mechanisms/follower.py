@@ -120,14 +120,14 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
 
 def _chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
     """Elementary joint of each leg; None if any leg has none."""
-    results: dict[int, Chain] = {}
+    chains: dict[int, Chain] = {}
     for group in groups:
         chain = group.carrier.chain(group.of(theta))
         if chain is None:
             return None
         for k, leg in enumerate(group.legs.tolist()):
-            results[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
-    return results
+            chains[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+    return chains
 
 
 class Follower:
@@ -201,20 +201,23 @@ class Follower:
         for _ in range(MOST_FOLLOWER_STEPS):
             b = now[:3].dot(rods.on_body)
             line = b + off
-            remainder = self._ones.dot(line * line)
-            remainder -= square
-            error = float(remainder.dot(remainder))
+            residual = self._ones.dot(line * line)
+            residual -= square
+            error = float(residual.dot(residual))
             if not error < before:
                 return False
             if factors is None or (error > REUSED_FACTORS_SHRINK * before and before < np.inf):
                 factors = self._factors_at(b, line)
                 self._enough = 4 * FOLLOWED_CLOSURE_ERROR**2 * float(square.min())
             if error <= self._enough:
-                self._pose, self._factors = now, factors
-                self._rest()
+                self._factors, self._since = factors, self._since + 1
+                if self._since == POSES_BETWEEN_SQUARINGS:
+                    # Remove the rounding of many steps from the rotation.
+                    self._since, now = 0, pose(nearest_rotation(now[:3, :3]), now[:3, 3])
+                self._pose = now
                 return True
             before = error
-            twist[self._free] = self._solved(*factors, remainder)[0]
+            twist[self._free] = self._solved(*factors, residual)[0]
             now = _moved_back(now, twist)
         return False
 
@@ -225,15 +228,6 @@ class Follower:
         rows[:3] -= b[SECOND_CROSS_COMPONENTS] * line[FIRST_CROSS_COMPONENTS]
         rows[3:] = line
         return self._factored(rows[self._free].T)[:2]
-
-    def _rest(self) -> None:
-        """Orthonormalise the rotation after POSES_BETWEEN_SQUARINGS poses."""
-        self._since += 1
-        if self._since == POSES_BETWEEN_SQUARINGS:
-            self._since, self._pose = (
-                0,
-                pose(nearest_rotation(self._pose[:3, :3]), self._pose[:3, 3]),
-            )
 
 
 FIRST_CROSS_COMPONENTS, SECOND_CROSS_COMPONENTS = np.array([1, 2, 0]), np.array([2, 0, 1])

@@ -43,14 +43,14 @@ def _equations(leg: Leg) -> list[Equation]:
     """Angle equations of a leg."""
     base = base_carriers()[leg.base.joint].axis_role(leg.base)
     platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
-    results: list[Equation] = []
+    kinds: list[Equation] = []
     if base == "square":
-        results.append("revolute base")
+        kinds.append("revolute base")
     if platform == "square":
-        results.append("revolute platform")
+        kinds.append("revolute platform")
     if base == platform == "twist":
-        results.append("torsion")
-    return results
+        kinds.append("torsion")
+    return kinds
 
 
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
@@ -99,9 +99,9 @@ def angle_layout(document: MechanismDocument, base: Integers, platform: Integers
 
     base, platform : (L, 3) indices of the axes' parameters, -1 for none.
     """
-    values = equations(document)
-    leg = np.array([j for j, _ in values], dtype=int)
-    kinds = np.array([kind for _, kind in values], dtype=object)
+    pairs = equations(document)
+    leg = np.array([j for j, _ in pairs], dtype=int)
+    kinds = np.array([kind for _, kind in pairs], dtype=object)
     on_base = np.isin(kinds, ["revolute base", "torsion"])
     on_platform = np.isin(kinds, ["revolute platform", "torsion"])
     return AngleLayout(

@@ -166,7 +166,12 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
         # Rejected steps increase the damping, or end a row that cannot improve.
         stuck = done | (~better & ((damping > HOPELESS_DAMPING) | (now.worst < task.rounding)))
         damping = np.where(better, np.maximum(damping * 0.05, 1e-14), damping * 30)
-        now = _chosen(better, trial, now)
+        now = _State(
+            *(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(trial, now, strict=True)
+            )
+        )
     _write(task, now, out)
 
 
@@ -189,14 +194,6 @@ def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
         delta[...] = 0.0
         np.negative(step[:, :d], out=delta[:, layout.freedoms])
     return stepped(now.poses, delta), now.internal - step[:, d:]
-
-
-def _chosen(better: Booleans, trial: _State, now: _State) -> _State:
-    """Trial state for the rows where it is better, else the present one."""
-    out: list[Array] = []
-    for new, old in zip(trial, now, strict=True):
-        out.append(np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old))
-    return _State(*out)
 
 
 def _picked(task: _Task, rows: Integers) -> _Task:
@@ -454,16 +451,11 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
         return np.stack([pose(rotation(np.array([0, 0, a])), p) for a in angles for p in places])
     flat = float(np.linalg.norm((b + shift - a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
-    sides = (-1, 1) if _hangs(layout, theta, a) else (1, -1)
-    return np.stack([pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides])
-
-
-def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
-    """Whether the cranks' ends A (L, 3) are below their axes on average, so that the platform is
-    below the base.
-    """
+    # Cranks whose ends are below their axes on average carry a platform below the base.
     drops = [(a[g.legs] - g.of(theta)[..., :3])[..., 2] for g in layout.base if g.carrier.driven]
-    return bool(drops) and float(np.concatenate(drops).mean()) < 0
+    hangs = bool(drops) and float(np.concatenate(drops).mean()) < 0
+    sides = (-1, 1) if hangs else (1, -1)
+    return np.stack([pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides])
 
 
 def typical_reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
@@ -497,15 +489,17 @@ def on_manifold(
     every = theta if theta.ndim == 1 else np.broadcast_to(theta, (*shape, theta.shape[-1]))
     every = every if theta.ndim == 1 else every.reshape(-1, theta.shape[-1])
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
-    remaining, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
+    remaining, out_of_reach = np.arange(len(current)), np.zeros(len(current), dtype=int)
     for _ in range(steps if free else 0):
         own = every if every.ndim == 1 else every[remaining]
         c = closure_at(layout, own, current[remaining])
         value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
-        lost[remaining] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[remaining] + 1)
+        out_of_reach[remaining] = np.where(
+            np.isfinite(c.readings).all(axis=-1), 0, out_of_reach[remaining] + 1
+        )
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
-        more &= lost[remaining] < STEPS_OUT_OF_REACH
+        more &= out_of_reach[remaining] < STEPS_OUT_OF_REACH
         remaining = remaining[more]
         if not remaining.size:
             break
@@ -531,8 +525,8 @@ def undriven(c: Closure) -> tuple[Array, Array]:
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
         drives = c.by_reading[..., None] * layout.of_motor
-        shifted = np.concatenate([drives, c.rows.by_internal], axis=-1)
-        shifted = np.nan_to_num(shifted)
-        q = np.linalg.qr(shifted, mode="complete")[0]
-        blind = q[..., shifted.shape[-1] :].mT
+        by_driven = np.concatenate([drives, c.rows.by_internal], axis=-1)
+        by_driven = np.nan_to_num(by_driven)
+        q = np.linalg.qr(by_driven, mode="complete")[0]
+        blind = q[..., by_driven.shape[-1] :].mT
     return (blind @ c.rows.value[..., None])[..., 0], blind

@@ -45,8 +45,8 @@ class CarrierGroup:
         """Parameters (..., g, n) of the group from all parameters (..., P)."""
         if self.complete:
             return theta[..., self.index]
-        reference_values = theta[..., np.where(self.silent, 0, self.index)]
-        return np.where(self.silent, self.constants, reference_values)
+        parameters = theta[..., np.where(self.silent, 0, self.index)]
+        return np.where(self.silent, self.constants, parameters)
 
 
 @dataclass(frozen=True)
@@ -341,11 +341,11 @@ def _groups(
         legs = np.flatnonzero([k is kind for k in kinds])
         names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
         index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
-        indices = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
+        numbers = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
         constants = np.array(
             [
                 [p.otherwise if v is None else v for p, v in zip(kind.parameters, row, strict=True)]
-                for row in indices
+                for row in numbers
             ]
         )
         groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))

@@ -54,8 +54,8 @@ class _Row(NamedTuple):
     kind: str
     label: str
     part: str
-    drawing: float
-    tolerance: float
+    nominal: float
+    prior_sigma: float
 
 
 @dataclass(frozen=True)
@@ -419,8 +419,8 @@ class Machine:
         """Points along each leg's arm on the base at readings (..., m), for drawings; see
         :func:`~pkmcal.mechanisms.closure.skeletons`.
         """
-        shifted = joint_values(self.layout, self.values, joints)
-        return skeletons(self.layout, self.values, shifted)
+        motions = joint_values(self.layout, self.values, joints)
+        return skeletons(self.layout, self.values, motions)
 
     def _ends(self) -> tuple[Array, Array]:
         """Ends of all limbs at mid-range readings, each in the frame of its body, (L, 3) m."""
@@ -448,8 +448,8 @@ def machine_from_document(
         kinds=tuple(row.kind for row in rows),
         labels=tuple(row.label for row in rows),
         parts=tuple(row.part for row in rows),
-        drawing=np.array([row.drawing for row in rows]),
-        tolerance=np.array([row.tolerance for row in rows]),
+        drawing=np.array([row.nominal for row in rows]),
+        tolerance=np.array([row.prior_sigma for row in rows]),
     ).with_roles((*held, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(table.names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())

@@ -141,8 +141,8 @@ class ParameterTable:
         elif len({name for m in members for name, _ in m}) < sum(len(m) for m in members):
             what = "a parameter is tied to itself"
         if what:
-            value = ", ".join(group)
-            raise InputError(what, found=value, expected="entries of one kind, each once")
+            text = ", ".join(group)
+            raise InputError(what, found=text, expected="entries of one kind, each once")
         if True in axes:
             self._check_parallel(group, members)
         return [list(tie) for tie in zip(*members, strict=True)]
@@ -252,14 +252,14 @@ class ParameterTable:
 
     def free_names(self) -> tuple[str, ...]:
         """Name of each free unknown; rotations of an axis are numbered."""
-        names, names_so_far = list[str](), dict[str, int]()
+        names, counts = list[str](), dict[str, int]()
         for k in self.first_of_free():
             name = self.names[k]
             if self.kinds[k] == "axis":
                 whole = self.names[self.axes[np.any(self.axes == k, axis=1)][0, 0]]
                 whole = whole.rpartition(".")[0]
-                names_so_far[whole] = names_so_far.get(whole, 0) + 1
-                name = f"{whole} ({names_so_far[whole]})"
+                counts[whole] = counts.get(whole, 0) + 1
+                name = f"{whole} ({counts[whole]})"
             names.append(name)
         return tuple(names)
 

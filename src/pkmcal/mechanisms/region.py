@@ -138,7 +138,12 @@ def within_reach(limits: Limits, region: Region) -> Within:
             low[k], high[k] = np.clip((low[k], high[k]), *side)
     if region.turn is not None:
         return Within(low, high, region.turn)
-    return Within(low, high, _turn(limits) if moves < len(free) else 0.0)
+    if moves == len(free):
+        return Within(low, high, 0.0)
+    # Translation needs rotation: as far as the platform rotates at home about any axis.
+    axes = np.eye(6)[:3][limits.layout.free[:3]]
+    turns = extents(limits, np.concatenate([axes, -axes]), limits.home).distance
+    return Within(low, high, float(turns.max()))
 
 
 def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array:
@@ -152,19 +157,19 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     Raises InputError if the machine can take none of the candidates.
     """
     within = within_reach(limits, region)
-    retained: list[Array] = []
-    value = tried = 0
+    batches: list[Array] = []
+    accepted = tried = 0
     most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
-    while value < count and tried < most:
+    while accepted < count and tried < most:
         more = min(max(count, tried), REGION_POSES_AT_ONCE)
         poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
         closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
         poses = poses[reachable(limits, poses).inside]
-        retained.append(poses)
-        value, tried = value + len(poses), tried + more
-    if not value:
+        batches.append(poses)
+        accepted, tried = accepted + len(poses), tried + more
+    if not accepted:
         home = ", ".join(f"{x:.0f}" for x in np.round(1e3 * limits.home[:3, 3]) + 0.0)
         raise InputError(
             what="the machine can take no pose of the workspace that was asked for",
@@ -172,13 +177,7 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
             expected=f"a part of the machine's own, which is about home, [{home}] mm",
             next_step="widen the workspace, or check the ranges in the mechanism file",
         )
-    return np.concatenate(retained)[:count]
-
-
-def _turn(limits: Limits) -> float:
-    """Largest rotation of the platform at home about any axis of its motion, rad."""
-    axes = np.eye(6)[:3][limits.layout.free[:3]]
-    return float(extents(limits, np.concatenate([axes, -axes]), limits.home).distance.max())
+    return np.concatenate(batches)[:count]
 
 
 def _candidates(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:

@@ -144,11 +144,11 @@ def reachable(limits: Limits, poses: Array) -> Reach:
     """Check poses T_base_platform (..., 4, 4) against the limits."""
     with np.errstate(divide="ignore", invalid="ignore"):  # a joint B on its A
         c = closure_at(limits.layout, limits.theta, poses)
-        remainder = undriven(c)[0]
+        residual = undriven(c)[0]
     readings, scaled = c.readings, scaled_rows(c)
     singularity = singularity_of(limits.layout, scaled)
     lost = np.isnan(readings)
-    off = np.where(lost.any(axis=-1), 0.0, np.abs(remainder).max(axis=-1, initial=0.0))
+    off = np.where(lost.any(axis=-1), 0.0, np.abs(residual).max(axis=-1, initial=0.0))
     sign, least = limits.at_home
     own = sign_of(scaled)
     return Reach(
@@ -170,8 +170,8 @@ def _elsewhere(limits: Limits, poses: Array) -> Booleans:
     held = ~limits.layout.free
     if not held.any():
         return np.zeros(poses.shape[:-2], dtype=bool)
-    shifted = np.abs(pose_difference(poses, limits.home)[..., held])
-    return np.asarray(shifted.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
+    deviation = np.abs(pose_difference(poses, limits.home)[..., held])
+    return np.asarray(deviation.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
 
 
 @dataclass(frozen=True)
@@ -259,22 +259,28 @@ def extents(
             next_step="begin at the home pose, or check the ranges in the mechanism file",
         )
     twists = _twists(directions)
-    farthest = _farthest(limits, twists) if most is None else np.full(len(twists), most)
+    if most is not None:
+        farthest = np.full(len(twists), most)
+    else:
+        # Half a turn, or twice a rod's length.
+        turn, move = (np.linalg.norm(part, axis=-1) for part in (twists[:, :3], twists[:, 3:]))
+        with np.errstate(divide="ignore"):  # without rotation, or translation
+            farthest = np.minimum(np.pi / turn, 2 * _reach(limits) / move)
     # Bracket the first obstacle of each path, in batches that stop with the path.
-    direction = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
-    still = np.zeros(direction.shape, dtype=bool)
-    ahead: Integers = np.arange(len(direction))
+    distances = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
+    inside_so_far = np.zeros(distances.shape, dtype=bool)
+    ahead: Integers = np.arange(len(distances))
     for first in range(0, effort.steps + 1, PATH_POSES_AHEAD):
         at = slice(first, first + PATH_POSES_AHEAD)
-        inside = _along(limits, start, twists[ahead, None], direction[ahead, at], effort)[1].inside
-        still[ahead, at] = np.logical_and.accumulate(inside, axis=1)
+        inside = _along(limits, start, twists[ahead, None], distances[ahead, at], effort)[1].inside
+        inside_so_far[ahead, at] = np.logical_and.accumulate(inside, axis=1)
         ahead = ahead[inside.all(axis=1)]
         if not ahead.size:
             break
     # Bisect between the last reachable pose and the next.
-    last = still.sum(axis=1) - 1
+    last = inside_so_far.sum(axis=1) - 1
     rows = np.arange(len(twists))
-    low, high = direction[rows, last], direction[rows, np.minimum(last + 1, effort.steps)]
+    low, high = distances[rows, last], distances[rows, np.minimum(last + 1, effort.steps)]
     for _ in range(effort.halvings):
         middle = (low + high) / 2
         good = _along(limits, start, twists, middle, effort)[1].inside
@@ -283,13 +289,6 @@ def extents(
     beyond = _along(limits, start, twists, high, effort)[1]
     why = tuple(() if last[k] == effort.steps else beyond.why(k) for k in range(len(twists)))
     return Extents(low, poses, why)
-
-
-def _farthest(limits: Limits, twists: Array) -> Array:
-    """End of the search along twists (k, 6), (k,)."""
-    turn, move = (np.linalg.norm(part, axis=-1) for part in (twists[:, :3], twists[:, 3:]))
-    with np.errstate(divide="ignore"):  # without rotation, or translation
-        return np.minimum(np.pi / turn, 2 * _reach(limits) / move)
 
 
 def _reach(limits: Limits) -> float:
@@ -312,17 +311,17 @@ def _twists(directions: Array) -> Array:
 
 
 def _along(
-    limits: Limits, start: Array, twists: Array, direction: Array, effort: Effort
+    limits: Limits, start: Array, twists: Array, distances: Array, effort: Effort
 ) -> tuple[Array, Reach]:
     """Poses (..., 4, 4) at distances (...,) along twists (..., 6), and their obstacles."""
-    poses = perturb(start, twists * direction[..., None])
+    poses = perturb(start, twists * distances[..., None])
     if limits.layout.row_motor.min(initial=0) < 0 or limits.layout.shares_motors:
-        poses = _settled(limits, start, twists, direction, poses, effort)
+        poses = _settled(limits, start, twists, distances, poses, effort)
     return poses, reachable(limits, poses)
 
 
 def _settled(
-    limits: Limits, start: Array, twists: Array, direction: Array, poses: Array, effort: Effort
+    limits: Limits, start: Array, twists: Array, distances: Array, poses: Array, effort: Effort
 ) -> Array:
     """Poses (..., 4, 4) projected onto those that rods and axes allow, at their distance along the
     twists.
@@ -333,14 +332,14 @@ def _settled(
     size = np.sum(twists * twists, axis=-1)
     settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
     for _ in range(effort.rounds):
-        behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * direction):
+        behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * distances):
             break
         ahead = perturb(settled, twists * behind[..., None])
         settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
-    behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-    retained_rows = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * direction
-    return np.where(retained_rows[..., None, None], settled, poses)
+    behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+    reached = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * distances
+    return np.where(reached[..., None, None], settled, poses)
 
 
 def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
@@ -352,6 +351,8 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
     Raises InputError if ``middle`` is outside the workspace, and if the machine cannot move along
     one of the directions without rotation.
     """
+    from scipy.ndimage import label
+
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     low, high = straight_path_spans(limits, middle, unit)
     _refuse_flat(limits, unit, high - low)
@@ -365,8 +366,11 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
     positions = middle[:3, 3] + points.reshape(-1, len(unit)) @ unit
     inside, singular = _at_positions(limits, middle, positions)
     shape = points.shape[:-1]
+    # Keep the component that contains the middle pose.
+    parts: Integers = np.zeros(shape, dtype=np.int32)
+    label(inside.reshape(shape), output=parts)
     start = tuple(int(np.argmin(np.abs(axis))) for axis in axes)
-    connected = _connected(inside.reshape(shape), start)
+    connected = np.asarray((parts == parts[start]) & inside.reshape(shape))
     size = float(np.count_nonzero(connected)) * cell ** len(unit)
     return Grid(axes, connected, singular.reshape(shape), size)
 
@@ -403,15 +407,6 @@ def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Bool
         reach = reachable(limits, pose(middle[:3, :3], positions[rows]))
         inside[rows], singular[rows] = reach.inside, reach.singularity
     return inside, singular
-
-
-def _connected(inside: Booleans, start: tuple[int, ...]) -> Booleans:
-    """Component of a grid that contains one of its points."""
-    from scipy.ndimage import label
-
-    parts: Integers = np.zeros(inside.shape, dtype=np.int32)
-    label(inside, output=parts)
-    return np.asarray((parts == parts[start]) & inside)
 
 
 LOOKS_A_PATH_STEP = 8

@@ -34,16 +34,16 @@ DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1, "p1": 1e-3, "p2": 1e-3, "k3": 0.1}
 which most telephones have already removed."""
 
 
-def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
+def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
     """Pinhole camera from the EXIF data of images, with a covariance for everything that EXIF does
     not state.
 
-    photographs : paths of the images, and their names in messages.
+    images : paths, and names in messages.
     Raises InputError if an image has no focal length, or if focal lengths or sizes differ.
     """
-    entries: dict[tuple[float, tuple[int, int]], str] = {}
+    labels: dict[tuple[float, tuple[int, int]], str] = {}
     sizes: list[tuple[int, int]] = []
-    for path, label in photographs:
+    for path, label in images:
         width, height = photograph_header(path, label)
         with path.open("rb") as stream:
             focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
@@ -56,9 +56,9 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
                 next_step="Calibrate the camera with pkmcal camera, and name its file",
             )
         sizes.append((width, height))
-        entries.setdefault((focal, (max(width, height), min(width, height))), label)
-    if len(entries) > 1:
-        (one, first), (other, second) = list(entries.items())[:2]
+        labels.setdefault((focal, (max(width, height), min(width, height))), label)
+    if len(labels) > 1:
+        (one, first), (other, second) = list(labels.items())[:2]
         raise InputError(
             "the photographs of one camera tell different focal lengths or sizes",
             where=second,
@@ -67,7 +67,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
             next_step="Give photographs by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # the others are rotated by 90 degrees
-    return _camera(next(iter(entries))[0] / FILM_DIAGONAL * hypot(*size), size)
+    return _pinhole(next(iter(labels))[0] / FILM_DIAGONAL * hypot(*size), size)
 
 
 def _described(focal: float, size: tuple[int, int]) -> str:
@@ -75,7 +75,7 @@ def _described(focal: float, size: tuple[int, int]) -> str:
     return f"{focal:g} mm at {size[0]}x{size[1]}"
 
 
-def _camera(focal: float, size: tuple[int, int]) -> Camera:
+def _pinhole(focal: float, size: tuple[int, int]) -> Camera:
     """Pinhole camera without distortion, with its prior covariance. focal : px."""
     kind = camera_models()["pinhole"]
     middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]

@@ -58,7 +58,7 @@ def find_photographs(
     rows = {name: row for row, name in enumerate(names)}
     lengths = sorted({len(name) for name in names}, reverse=True)
 
-    def above_limit(path: str) -> re.Match[str] | None:
+    def matched(path: str) -> re.Match[str] | None:
         """Match of a path with the pattern for any configuration, longest names first."""
         # Only names that occur in the path: an alternation of thousands is matched one by one.
         within = (path[at : at + n] for n in lengths for at in range(len(path) - n + 1))
@@ -71,25 +71,25 @@ def find_photographs(
         path
         for path in (Path(name).as_posix() for name in matches)
         # A folder or pipe with an image's name is kept, and refused when its header is read.
-        if (folder / path).is_file() or above_limit(path)
+        if (folder / path).is_file() or matched(path)
     ]
     if not files and not needed:
         return ()
     if not files:
         raise _no_images_error(folder, wildcard, pattern, where)
-    results: list[Photograph] = []
-    strangers: list[str] = []
+    images: list[Photograph] = []
+    unknown: list[str] = []
     for name in sorted(files):
-        match = above_limit(name)
+        match = matched(name)
         if match is None:
-            strangers.append(name)
+            unknown.append(name)
             continue
         fields = match.groupdict()
         row = rows[fields["configuration"]]
-        results.append(Photograph(row, fields.get("repeat"), folder / name))
-    if strangers:
-        raise _stranger(strangers, parts, names, where)
-    return tuple(sorted(results, key=lambda photo: (photo.configuration, photo.repeat or "")))
+        images.append(Photograph(row, fields.get("repeat"), folder / name))
+    if unknown:
+        raise _unknown_configuration(unknown, parts, names, where)
+    return tuple(sorted(images, key=lambda photo: (photo.configuration, photo.repeat or "")))
 
 
 def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
@@ -163,15 +163,15 @@ def _regex(parts: Sequence[tuple[str, str | None]], configuration: str) -> str:
     configuration : expression for the configuration's name.
     """
     bodies = {"configuration": configuration, "repeat": "[^/]+?"}
-    names_so_far: set[str] = set()
+    used: set[str] = set()
     text = ""
     for literal, field in parts:
         if field is None:
             text += re.escape(literal)
-        elif field in names_so_far:
+        elif field in used:
             text += f"(?P={field})"
         else:
-            names_so_far.add(field)
+            used.add(field)
             text += f"(?P<{field}>{bodies[field]})"
     return text
 
@@ -180,25 +180,25 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
     """Error about a pattern without files, with the content of its folder and other suffixes of
     images there.
     """
-    place = folder / wildcard
-    while "*" in str(place):
-        place = place.parent
-    value = f"no folder {place}"
+    parent = folder / wildcard
+    while "*" in str(parent):
+        parent = parent.parent
+    content = f"no folder {parent}"
     try:
-        standing = place.is_dir()
+        exists = parent.is_dir()
     except OSError:  # e.g. an invalid folder name
-        standing = False
-    if standing:
-        entries = sorted(entry.name for entry in place.iterdir())
+        exists = False
+    if exists:
+        entries = sorted(entry.name for entry in parent.iterdir())
         others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
-        value = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
+        content = f"{others} {entries[0]} in {parent}" if entries else f"nothing in {parent}"
     ending = Path(pattern).suffix
     same = Counter(_endings(folder, wildcard.removesuffix(ending)))
     others = [other for other, _ in same.most_common() if other != ending]
     return InputError(
         "there is no photograph under this pattern",
         where=where,
-        found=value,
+        found=content,
         expected=f"files {pattern}",
         next_step=f"Photographs there end in {others[0]}: write"
         f" {pattern.removesuffix(ending)}{others[0]}"
@@ -216,14 +216,14 @@ def _endings(folder: Path, wildcard: str) -> list[str]:
     return [ending for name in names if (ending := Path(name).suffix).lower() in IMAGE_FILE_ENDINGS]
 
 
-def _stranger(
+def _unknown_configuration(
     files: Sequence[str], parts: Sequence[tuple[str, str | None]], names: Sequence[str], where: str
 ) -> InputError:
     """Error about an image whose configuration has no joint readings."""
     match = re.fullmatch(_regex(parts, "[^/]+?"), files[0])
     name = match["configuration"] if match else files[0]
     more = f" (one of {len(files)} such files)" if len(files) > 1 else ""
-    short = {reference_values.lstrip("0"): reference_values for reference_values in names}
+    short = {entry.lstrip("0"): entry for entry in names}
     next_step = "Add its readings to the table, or move the photograph away"
     if name.lstrip("0") in short:
         next_step = (

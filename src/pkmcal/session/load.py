@@ -294,21 +294,21 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     board = _board(folder, document, schema)
     findings += _of_little_use(document, schema)
     stations = tuple(
-        made
+        camera_station
         for name, station in schema.cameras.items()
-        for made in _stations(folder, document, name, station, table.names, measured)
+        for camera_station in _stations(folder, document, name, station, table.names, measured)
     )
     findings += _turned(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
-        given, keys = station.tracker, ("stations", name, "tracker", "poses")
-        noise = given.noise.position, given.noise.rotation
-        if measured or (folder / given.poses).exists():
-            path = _existing(folder, document, given.poses, keys)
-            read = read_poses(path, given.poses, table.names, *noise, name, level=given.level)
+        tracker, keys = station.tracker, ("stations", name, "tracker", "poses")
+        noise = tracker.noise.position, tracker.noise.rotation
+        if measured or (folder / tracker.poses).exists():
+            path = _existing(folder, document, tracker.poses, keys)
+            read = read_poses(path, tracker.poses, table.names, *noise, name, level=tracker.level)
             trackers.append(read)
         else:
-            trackers.append(PoseTable.to_come(name, given.poses, *noise))
+            trackers.append(PoseTable.to_come(name, tracker.poses, *noise))
     links = _links(folder, document, schema, table.names, machine) if measured else ()
     if measured:
         _check_paths(document, schema, table)
@@ -317,7 +317,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and (schema.stations or links):
-        findings += _unphotographed(table, stations, tuple(trackers), links)
+        findings += _unmeasured(table, stations, tuple(trackers), links)
     return Session(
         folder=folder,
         machine=machine,
@@ -548,18 +548,18 @@ def _stations(
     """Stations of an entry: one, or one for each image of a hand-held camera."""
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
-    photographs = find_photographs(folder, station.images, names, where, needed=measured)
+    images = find_photographs(folder, station.images, names, where, needed=measured)
     from_exif = station.camera == EXIF_CAMERA_WORD
     if from_exif:
         label = document.where(*keys, "camera")
-        camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in photographs], label)
+        camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in images], label)
         camera_file = f"exif/{name}.yaml"
     else:
         camera_file = station.camera
         _, inside = camera_path(folder / camera_file)
         _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
-    endings = {photo.path.suffix.lower() for photo in photographs}
+    endings = {image.path.suffix.lower() for image in images}
     usual: Response = "srgb" if endings and endings <= JPEG_FILE_ENDINGS else "linear"
     T_camera_base = None
     if station.handheld:
@@ -579,16 +579,16 @@ def _stations(
         except InputError as error:
             raise error.located(document.where(*keys, "pose")) from None
     whole = Station(
-        name, camera, camera_file, T_camera_base, photographs, station.observe, name,
+        name, camera, camera_file, T_camera_base, images, station.observe, name,
         station.handheld, from_exif, station.response or usual, station.response is not None,
     )  # fmt: skip
     if not station.handheld:
         return [whole]
-    check_count(len(photographs), MOST_HANDHELD_IMAGES, "photographs by hand", where)
+    check_count(len(images), MOST_HANDHELD_IMAGES, "photographs by hand", where)
     return [
-        replace(whole, name="-".join(filter(None, called)), photographs=(photo,))
-        for photo in photographs
-        for called in [(name, names[photo.configuration], photo.repeat)]
+        replace(whole, name="-".join(filter(None, called)), photographs=(image,))
+        for image in images
+        for called in [(name, names[image.configuration], image.repeat)]
     ]
 
 
@@ -617,9 +617,9 @@ def _turned(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
     image whose size differs from its camera's.
     """
     turned: list[str] = []
-    for station, photo in ((s, photo) for s in stations for photo in s.photographs):
-        label, wanted = label_of(folder, photo.path), tuple(station.camera.image_size)
-        width, height = size = photograph_header(photo.path, label)
+    for station, image in ((s, image) for s in stations for image in s.photographs):
+        label, wanted = label_of(folder, image.path), tuple(station.camera.image_size)
+        width, height = size = photograph_header(image.path, label)
         if wanted not in (size, (height, width)):
             raise InputError(
                 "the photograph has another size than its camera",
@@ -642,14 +642,14 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
     """
     owners: dict[tuple[str, str], str] = {}
     for station in stations:
-        for photo in station.photographs:
-            path = os.path.realpath(photo.path)
+        for image in station.photographs:
+            path = os.path.realpath(image.path)
             others = {owners.setdefault((path, w), station.name) for w in station.observe}
             for other in others - {station.name}:
                 raise InputError(
                     f"station {station.name} has the photographs of station {other}",
                     where=document.where("stations", station.name, "images"),
-                    found=photo.path.name,
+                    found=image.path.name,
                     expected="its own photographs; a station is one camera in one place",
                 )
 
@@ -671,7 +671,7 @@ def _check_tables_distinct(folder: Path, document: Document, schema: SessionDocu
 
 def _check_noise(document: Document, schema: SessionDocument, machine: Machine) -> None:
     """Refuse standard deviations of lengths that are not smaller than the machine's parts."""
-    places: list[tuple[tuple[str, ...], float]] = [
+    noises: list[tuple[tuple[str, ...], float]] = [
         (("stations", name, "tracker", "noise", "position"), station.tracker.noise.position)
         for name, station in schema.trackers.items()
     ]
@@ -679,11 +679,11 @@ def _check_noise(document: Document, schema: SessionDocument, machine: Machine) 
         kind = kinds_of(LinkKind)[code]
         noise = kind.noise(node)
         if noise is not None and kind.unit == "m":
-            places.append(((kind.key, "noise"), noise))
+            noises.append(((kind.key, "noise"), noise))
     if "m" in machine.joint_units:
-        places.append((("joints", "noise"), schema.joints.noise))
-    for keys, value in places:
-        check_plausible(value, machine, document.where(*keys), "a standard deviation")
+        noises.append((("joints", "noise"), schema.joints.noise))
+    for keys, sigma in noises:
+        check_plausible(sigma, machine, document.where(*keys), "a standard deviation")
 
 
 def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:
@@ -722,7 +722,7 @@ def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) 
         )
 
 
-def _unphotographed(
+def _unmeasured(
     table: CsvTable,
     stations: tuple[Station, ...],
     trackers: tuple[PoseTable, ...],
@@ -731,19 +731,19 @@ def _unphotographed(
     """Warning about configurations without measurements; raises InputError if fewer than two have
     any.
     """
-    taken = {photo.configuration for station in stations for photo in station.photographs}
-    taken |= {int(k) for tracker in trackers for k in tracker.configuration}
-    taken |= {int(k) for one in links for k in one.configuration.ravel()}
-    if len(taken) < 2:
+    measured = {photo.configuration for station in stations for photo in station.photographs}
+    measured |= {int(k) for tracker in trackers for k in tracker.configuration}
+    measured |= {int(k) for one in links for k in one.configuration.ravel()}
+    if len(measured) < 2:
         raise InputError(
             "only one configuration was measured"
             if trackers or links
             else "only one configuration has photographs",
             where=table.label,
-            found=table.names[min(taken)],
+            found=table.names[min(measured)],
             expected="two at least; one cannot tell a joint's place from its offset",
         )
-    missing = [name for row, name in enumerate(table.names) if row not in taken]
+    missing = [name for row, name in enumerate(table.names) if row not in measured]
     if not missing:
         return []
     return [
@@ -771,7 +771,7 @@ def _resolved(
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
-        files = [label_of(folder, photo.path) for photo in station.photographs]
+        files = [label_of(folder, image.path) for image in station.photographs]
         entry["photographs"] = entry.get("photographs", []) + files
     return document
 
@@ -780,9 +780,9 @@ def digests(session: Session) -> dict[str, list[str]]:
     """Short digests of the image files, by configuration."""
     out: dict[str, list[str]] = {}
     for station in session.stations:
-        for photo in station.photographs:
-            name = session.configurations[photo.configuration]
-            digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
+        for image in station.photographs:
+            name = session.configurations[image.configuration]
+            digest = blake2b(image.path.read_bytes(), digest_size=8).hexdigest()
             out.setdefault(name, []).append(digest)
     return out
 
@@ -796,7 +796,7 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     The digest is of values, not of the files' bytes (board and images excepted): comments and the
     user's notes do not change it.
     """
-    words = {name: value for name, value in session.document.items() if name != "notes"}
+    entries = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
         s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
         for s in session.stations
@@ -804,6 +804,13 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
     tables += [[one.configuration, one.value, one.sigma] for one in session.links]
     board = session.board.read_bytes() if session.board else b""
-    all_of_it = [words, session.machine.to_document(), session.model, cameras, tables, photographs]
+    all_of_it = [
+        entries,
+        session.machine.to_document(),
+        session.model,
+        cameras,
+        tables,
+        photographs,
+    ]
     text = json_text(all_of_it) + blake2b(board).hexdigest()
     return blake2b(text.encode("utf-8"), digest_size=8).hexdigest()

@@ -141,8 +141,8 @@ def read_poses(
             expected=f"{kind.fewest_rows} at least",
         )
     column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
-    nothing = np.zeros(len(rows))
-    t = np.stack([column.get(axis, nothing) for axis in POINT_COLUMNS], axis=-1)
+    zeros = np.zeros(len(rows))
+    t = np.stack([column.get(axis, zeros) for axis in POINT_COLUMNS], axis=-1)
     T = pose(_turn(table, column), t)
     if level and not kind.levels:
         raise InputError(
@@ -157,18 +157,18 @@ def read_poses(
 
 def _kind(table: CsvTable) -> type[TargetKind]:
     """Kind of measurement, from the table's header."""
-    actual_names, kinds = set(table.columns), kinds_of(TargetKind)
+    header, kinds = set(table.columns), kinds_of(TargetKind)
     for kind in kinds.values():
-        if any(actual_names == set(columns) for columns in kind.headers):
+        if any(header == set(columns) for columns in kind.headers):
             return kind
     headers = sorted((h for kind in kinds.values() for h in kind.headers), key=len, reverse=True)
     names = sorted({name for columns in headers for name in columns})
-    strange = [name for name in table.columns if name not in names]
-    guess = closest(strange[0], names) if strange else None
+    unknown = [name for name in table.columns if name not in names]
+    guess = closest(unknown[0], names) if unknown else None
     raise InputError(
-        "this column is not known" if strange else "these columns together mean nothing",
+        "this column is not known" if unknown else "these columns together mean nothing",
         where=f"{table.label}, line 1",
-        found=strange[0] if strange else listed(table.columns, 12),
+        found=unknown[0] if unknown else listed(table.columns, 12),
         expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in headers),
     )
 
@@ -208,16 +208,16 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
 
     T_base_platform : (K, 4, 4) nominal poses, NaN where the nominal model has no solution.
     """
-    there = T_base_platform[table.configuration, :3, 3]
-    shifted = float(np.nanmax(np.nanstd(there, axis=0)))
+    nominal = T_base_platform[table.configuration, :3, 3]
+    motion = float(np.nanmax(np.nanstd(nominal, axis=0)))
     measured = table.target.lengths(table.T)
     spread = float(np.max(np.std(measured, axis=0)))
-    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(shifted, 1e-6):
+    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(motion, 1e-6):
         return
     raise InputError(
         "the table's lengths look like millimetres",
         where=table.label,
         found=f"positions that vary by {spread:.4g}",
-        expected=f"metres; the platform itself moves by {shifted:.3g} by its readings",
+        expected=f"metres; the platform itself moves by {motion:.3g} by its readings",
         next_step="Divide x, y and z by 1000, or head them x [mm], y [mm], z [mm]",
     )

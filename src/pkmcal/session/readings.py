@@ -67,17 +67,17 @@ def check_readings(
 
 def _check_columns(table: CsvTable, n_joints: int) -> None:
     """Check number and order of the columns."""
-    names = len(table.columns)
-    if names != n_joints:
+    n_columns = len(table.columns)
+    if n_columns != n_joints:
         raise InputError(
             "another number of joint columns than the machine has actuated legs",
             where=f"{table.label}, line 1",
-            found=f"{names} ({', '.join(table.columns)})",
+            found=f"{n_columns} ({', '.join(table.columns)})",
             expected=str(n_joints),
         )
     numbers = [re.fullmatch(r"leg(\d+)", name) for name in table.columns]
     order = [int(match[1]) for match in numbers if match]
-    if len(order) == names and order != sorted(order):
+    if len(order) == n_columns and order != sorted(order):
         raise InputError(
             "the columns are not in the order of the machine's legs",
             where=f"{table.label}, line 1",
@@ -135,20 +135,20 @@ def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
     """Refuse readings of all joints, or of some, that are mostly out of range and all in range
     after one constant shift: another zero point.
     """
-    inside, loosely = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
-    if loosely.all():
+    inside, near = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
+    if near.all():
         return
-    few = inside.mean(axis=0) < 0.5
+    outside = inside.mean(axis=0) < 0.5
     for unit in dict.fromkeys(units):
         same = np.array(units) == unit
-        for which in (same, same & few):
-            if not which.any() or inside[:, which].mean() > 0.5 or not loosely[:, ~which].all():
+        for which in (same, same & outside):
+            if not which.any() or inside[:, which].mean() > 0.5 or not near[:, ~which].all():
                 continue
             low, high = ranges[which].T
-            values, slack = table.values[:, which], _MARGIN * (high - low)
+            readings, slack = table.values[:, which], _MARGIN * (high - low)
             # fmax and fmin ignore NaN: an unknown range allows any shift
-            least = float(np.fmax.reduce(low - slack - values.min(axis=0)))
-            most = float(np.fmin.reduce(high + slack - values.max(axis=0)))
+            least = float(np.fmax.reduce(low - slack - readings.min(axis=0)))
+            most = float(np.fmin.reduce(high + slack - readings.max(axis=0)))
             if least <= most:
                 raise _shifted(table, ranges, which, (least, most), unit)
 
@@ -299,7 +299,7 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
         )
     if not still.any():
         return []
-    names = [name for name, similar in zip(table.columns, still, strict=True) if similar]
+    names = [name for name, is_still in zip(table.columns, still, strict=True) if is_still]
     return [doubtful("readings.unmoved", table.label, columns=names)]
 
 

@@ -164,8 +164,8 @@ class SessionDocument(Schema):
 
     def links(self) -> dict[str, Schema]:
         """Entries of measurements that depend on two configurations, by kind, if present."""
-        results = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
-        return {code: node for code, node in results.items() if node is not None}
+        nodes = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
+        return {code: node for code, node in nodes.items() if node is not None}
 
 
 @cache

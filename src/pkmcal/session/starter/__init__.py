@@ -119,32 +119,32 @@ def session_texts(
     }
     turns = False
     if machine is not None:
-        drawn = load_mechanism(machine)
-        visible = any(leg.tubes for leg in drawn.document.legs)
-        if not visible and what in ("legs", "both"):
+        model = load_mechanism(machine)
+        has_tubes = any(leg.tubes for leg in model.document.legs)
+        if not has_tubes and what in ("legs", "both"):
             raise InputError(
-                f"the drawing of {drawn.name} has no cylinders that a camera could see",
+                f"the drawing of {model.name} has no cylinders that a camera could see",
                 where=machine,
                 expected="a board on the platform, or tubes on its legs",
                 next_step="Ask for a board alone, or give the legs of a copy of the drawing tubes",
             )
-        if what is None and not visible:
-            what = "readings" if drawn.redundancy > 0 else "board"
+        if what is None and not has_tubes:
+            what = "readings" if model.redundancy > 0 else "board"
         texts["mechanism.yaml"] = read_text(catalogue().get(machine, Path(machine)))
-        texts["joints.csv"] = example_readings(drawn)
-        turns = set(drawn.joint_units) == {"rad"}
+        texts["joints.csv"] = example_readings(model)
+        turns = set(model.joint_units) == {"rad"}
     what = what or "legs"
     texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, what, places)
     if what in ("board", "both"):
         texts["board.yaml"] = board_text()
-    where_to = texts.pop("images/front/README.txt")
+    readme = texts.pop("images/front/README.txt")
     if what == "board":
-        where_to = where_to[: where_to.index(LEGS_TEXT)] + BOARD_TEXT
+        readme = readme[: readme.index(LEGS_TEXT)] + BOARD_TEXT
     if what == "readings":
         del texts["cameras/front.yaml"]
         return texts
     for name in _places(places):
-        texts[f"images/{name}/README.txt"] = where_to.replace('"front"', f'"{name}"')
+        texts[f"images/{name}/README.txt"] = readme.replace('"front"', f'"{name}"')
     return texts
 
 
@@ -197,13 +197,13 @@ def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places
     first = f"    observe: {OBSERVE_ENTRY_VALUES[what]}\n"
     if what == "legs":
         first += text[start:end].partition("\n")[2]
-    shifted = [
+    further = [
         MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[what])
         for n in _places(places)[1:]
     ]
     rest = text[end:] if places == 1 and what == "legs" and hexapod else ""
     board = "" if what == "legs" else ON_PLATFORM
-    return text[:start] + first + "".join(shifted) + rest + board
+    return text[:start] + first + "".join(further) + rest + board
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
@@ -228,11 +228,11 @@ def _untouched(path: Path, name: str) -> bool:
         return False
     examples = _examples(name)
     if name == "joints.csv":
-        examples = (*examples, *_of_the_drawing(path.parent, lines[0].split(",")[1:]))
+        examples = (*examples, *_readings_of_machine(path.parent, lines[0].split(",")[1:]))
     return any(lines == text.splitlines() for text in examples)
 
 
-def _of_the_drawing(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
+def _readings_of_machine(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
     """Example readings of the folder's own machine; none if its file is invalid."""
     try:
         machine = load_mechanism(folder / "mechanism.yaml")
