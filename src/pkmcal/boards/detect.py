@@ -57,12 +57,14 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     files = [Path(path) for path in paths]
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
-        detections = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
+        detections = list(
+            pool.map(lambda path: _detect_in_file(path, size, board, quick=True), files)
+        )
         if not any(detection.success for detection in detections):
             # Check for another board before the slow methods run on all images.
             check_boards(files, detections, board)
         missed = [k for k, detection in enumerate(detections) if not detection.success]
-        again = pool.map(lambda k: _detect(files[k], size, board, quick=False), missed)
+        again = pool.map(lambda k: _detect_in_file(files[k], size, board, quick=False), missed)
         for k, detection in zip(missed, again, strict=True):
             detections[k] = detection
     check_any(detections, board)  # a different board was reported above
@@ -70,7 +72,7 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     return tuple(detections)
 
 
-def _detect(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
+def _detect_in_file(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
     """Detection in one image file."""
     return detect_board(decode(path, size, path.name), board, path.name, quick)
 
@@ -110,20 +112,20 @@ def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: 
         # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
-            other = _larger(image, board)
+            other = _larger_chessboard(image, board)
         else:
             markers = detect_markers(image, dictionary(board.document["dictionary"]))
-            other = _beyond(image, board, markers)
+            other = _markers_beyond(image, board, markers)
             if other is None and board.type == "charuco":
                 _check_size(markers, board, detection, path)
         if other is None:
             break
     if other is not None:
-        raise _another(with_board[0], other, board)
+        raise _other_board_error(with_board[0], other, board)
     for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
         other = other_board(decode(path, size, path.name), board, part=not with_board)
         if other is not None and not with_board:
-            raise _another(path, other, board)
+            raise _other_board_error(path, other, board)
         if other is not None:
             raise InputError(
                 "photographs of two boards are mixed",
@@ -147,7 +149,7 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
         )
 
 
-def _another(path: Path, other: str, board: Board) -> InputError:
+def _other_board_error(path: Path, other: str, board: Board) -> InputError:
     """Error about images of another board than the one described."""
     grid = board.type == "aruco_grid"
     first = f" with first_id: {board.document.get('first_id', 0)}" if grid else ""
@@ -170,7 +172,7 @@ def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> N
         return
     other = another_grid(layout, board)
     if other is not None:
-        raise _another(paths[0], other, board)
+        raise _other_board_error(paths[0], other, board)
     marker, gap = board.document["marker"], board.document["gap"]
     if abs((1 + layout.gap) * marker / (marker + gap) - 1) <= OTHER_MARKER:
         return
@@ -251,7 +253,7 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
     return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
 
 
-def _larger(image: Integers, board: Board) -> str | None:
+def _larger_chessboard(image: Integers, board: Board) -> str | None:
     """Description of a larger chessboard that contains the described one; None if there is none."""
     columns, rows = board.counts
     for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
@@ -260,7 +262,7 @@ def _larger(image: Integers, board: Board) -> str | None:
     return None
 
 
-def _beyond(image: Integers, board: Board, markers: Markers) -> str | None:
+def _markers_beyond(image: Integers, board: Board, markers: Markers) -> str | None:
     """Description of detected markers that the described board does not have; None without at least
     two.
     """
@@ -364,7 +366,7 @@ def _other_markers(image: Integers, mine: str) -> str | None:
     wanted = [
         n
         for n in dictionaries()
-        if _size_of(n) in (LARGEST_FAMILY_DICTIONARY, NO_SIZE) or n == mine
+        if _dictionary_size(n) in (LARGEST_FAMILY_DICTIONARY, NO_SIZE) or n == mine
     ]
     # some names differ only in case
     names = list({name.lower(): name for name in wanted}.values())
@@ -373,15 +375,15 @@ def _other_markers(image: Integers, mine: str) -> str | None:
     count = len(ids[best])
     if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
         return None
-    if _size_of(best) == NO_SIZE:
+    if _dictionary_size(best) == NO_SIZE:
         return f"{count} markers of {best}"
     family = best.rpartition("_")[0]
-    sizes = [_size_of(n) for n in dictionaries() if n.rpartition("_")[0] == family]
+    sizes = [_dictionary_size(n) for n in dictionaries() if n.rpartition("_")[0] == family]
     size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
     return f"{count} markers of {family}_{size}"
 
 
-def _size_of(name: str) -> int:
+def _dictionary_size(name: str) -> int:
     """Number of markers in a dictionary by its name, DICT_5X5_100; NO_SIZE without a number."""
     last = name.rpartition("_")[2]
     return int(last) if last.isdigit() else NO_SIZE

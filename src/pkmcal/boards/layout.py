@@ -82,8 +82,8 @@ def marker_layout(images: Sequence[Markers]) -> MarkerLayout | None:
     ids = np.concatenate([part.ids for part in neighbours])
     step = np.concatenate([part.step for part in neighbours])
     difference = ids[:, 1] - ids[:, 0]
-    along = _usual(difference[step[:, 0] == 1])
-    down = _usual(difference[step[:, 1] == 1])
+    along = _common_step(difference[step[:, 0] == 1])
+    down = _common_step(difference[step[:, 1] == 1])
     if along is None or down is None:
         return None
     rows = ids[(step[:, 0] == 1) & (difference == along)].tolist()
@@ -121,7 +121,7 @@ def another_grid(layout: MarkerLayout, board: Board) -> str | None:
     return f"markers {', '.join(map(str, beyond[:4]))} beyond its {count}" if beyond else None
 
 
-def _usual(differences: Array) -> int | None:
+def _common_step(differences: Array) -> int | None:
     """Most frequent difference of ids; None if LEAST_AGREEMENT of the pairs do not share it."""
     if len(differences) < LEAST_NEIGHBOURS:
         return None

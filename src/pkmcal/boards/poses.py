@@ -161,7 +161,7 @@ def board_views(
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
-    usable = (used >= LEAST_CORNERS_WEIGHED) & _one_tilt(camera, views, poses)
+    usable = (used >= LEAST_CORNERS_WEIGHED) & _tilt_is_unique(camera, views, poses)
     station_views = BoardViews(
         station,
         camera,
@@ -192,7 +192,7 @@ def pose_set(
     )
 
 
-def _one_tilt(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
+def _tilt_is_unique(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
     """Whether the corners exclude the second local minimum of the pose, the board tilted the other
     way, (V,).
     """
@@ -291,14 +291,14 @@ def standing_board(views: BoardViews) -> Standing | None:
     """
     if not views.usable.any():
         return None
-    there, noise = _places(views)
-    agreed = _agreed(there, noise, views.usable)
+    there, noise = _projected_corners(views)
+    agreed = _consistent_images(there, noise, views.usable)
     odd = views.usable & ~agreed
     _check_still(views, there, agreed)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
     scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
-    distance = _distance(there, there[agreed].mean(axis=0))
+    distance = _rms_distance(there, there[agreed].mean(axis=0))
     return Standing(
         T_camera_board,
         covariance,
@@ -315,7 +315,7 @@ def standing_board(views: BoardViews) -> Standing | None:
     )
 
 
-def _places(views: BoardViews) -> tuple[Array, Array]:
+def _projected_corners(views: BoardViews) -> tuple[Array, Array]:
     """Projected corners (F, N, 2) px by each image's pose, and their standard deviation, rms over
     the board, (F,) px.
     """
@@ -327,16 +327,16 @@ def _places(views: BoardViews) -> tuple[Array, Array]:
     return views.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
 
 
-def _agreed(there: Array, noise: Array, usable: Booleans) -> Booleans:
+def _consistent_images(there: Array, noise: Array, usable: Booleans) -> Booleans:
     """Images (F,) that agree with the image that has the most agreement."""
     limit = np.sqrt(
         STILL_BOARD_DIFFERENCE**2 + MOVED_BOARD_DEVIATIONS**2 * (noise[:, None] ** 2 + noise**2)
     )
-    agree = (_distance(there[:, None], there) <= limit) & usable & usable[:, None]
+    agree = (_rms_distance(there[:, None], there) <= limit) & usable & usable[:, None]
     return agree[int(np.argmax(agree.sum(axis=1)))]
 
 
-def _distance(there: Array, other: Array) -> Array:
+def _rms_distance(there: Array, other: Array) -> Array:
     """Root mean square over the board of the distances of corners (..., N, 2) px."""
     return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
 
@@ -371,7 +371,7 @@ def _movement_error(
     movement.
     """
     names, poses = views.names, views.poses.T_camera_board
-    pixels = float(_distance(there[before[-1]], there[after[0]]))
+    pixels = float(_rms_distance(there[before[-1]], there[after[0]]))
     middle = views.board.points.mean(axis=0)
     metres = float(np.linalg.norm(np.diff(apply(poses[[before[-1], after[0]]], middle), axis=0)))
     turn = float(np.linalg.norm(pose_difference(poses[after[0]], poses[before[-1]])[:3]))
@@ -405,11 +405,15 @@ def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array,
     noise = np.sqrt(np.sum(off**2) / freedom) if freedom > 0 else single
     sigma = noise / np.sqrt(np.maximum(count, 1))
     mean = board_poses(board_views.camera, Views(views.points, pixels[None], sigma[None]))
-    covariance = mean.covariance[0] + _wandering(board_views, agreed, mean.T_camera_board[0], noise)
+    covariance = mean.covariance[0] + _common_motion_covariance(
+        board_views, agreed, mean.T_camera_board[0], noise
+    )
     return mean.T_camera_board[0], covariance, mean.noise
 
 
-def _wandering(views: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array) -> Array:
+def _common_motion_covariance(
+    views: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array
+) -> Array:
     """Covariance (6, 6) of the mean pose from movements of the whole board between images (a
     shaking floor), beyond the corners' noise; zero if there are none.
     """

@@ -118,7 +118,7 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
     """
     printed = Print.of(board)
     size = np.array([printed.x[-1] - printed.x[0], printed.y[-1] - printed.y[0]])
-    name, page = _page(size, paper)
+    name, page = _paper_for(size, paper)
     corner = (
         np.array([LETTERING_STRIP_WIDTH, UNPRINTABLE_EDGE_WIDTH])
         + (page - size - LETTERING_STRIP_WIDTH - UNPRINTABLE_EDGE_WIDTH) / 2
@@ -149,7 +149,7 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
         " (100 %), not fitted to the page.",
         f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, and correct board.yaml"
         " by what you found. Fix it to something stiff and flat.",
-        f"{_described(board)}.",
+        f"{_description(board)}.",
     ]
     # Text begins left of a small board, which is narrower than a line.
     text = [
@@ -163,7 +163,7 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
     return _document(page / PDF_POINT, content), name
 
 
-def _page(size: Array, paper: str | None) -> tuple[str, Array]:
+def _paper_for(size: Array, paper: str | None) -> tuple[str, Array]:
     """Name of the paper and its width and height, m, in portrait or landscape format."""
     if paper is not None and paper.lower() not in PAPER_SIZES:
         raise InputError(
@@ -209,7 +209,7 @@ def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
     return out
 
 
-def _described(board: Board) -> str:
+def _description(board: Board) -> str:
     """Description of the board for the printed page."""
     data = board.document
     lengths = [

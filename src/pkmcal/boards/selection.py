@@ -75,7 +75,7 @@ def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers
 def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFit | None:
     """Best fit without distortion; None if no starting value gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
-    for camera in _tries(model, image_size):
+    for camera in _starting_cameras(model, image_size):
         rays = camera.ray(views.pixels)
         if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < LEAST_RAYS:
             continue  # this camera has no rays for the corners, and so no initial poses
@@ -91,7 +91,7 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
     for _, camera, poses in scored[:CAMERA_STARTS_REFINED]:
         settled = settled_poses(camera, views, poses)
         fit = fit_camera(camera, positions(camera, ()), views, settled, CAMERA_START_ROUNDS)
-        if best is None or _level(fit) < _level(best):
+        if best is None or _median_residual(fit) < _median_residual(best):
             best = fit
     return best
 
@@ -101,7 +101,7 @@ def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
     return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
 
 
-def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+def _starting_cameras(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
     """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     width, height = image_size
     kind = camera_models()[model]
@@ -191,7 +191,7 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
 
 def leave_one_out_residuals(fit: CameraFit, views: Views) -> Array:
     """Residuals (V, N, 2) px of each view under the camera estimated without it, to first order."""
-    changes, rows, _ = _without_each(fit, views)
+    changes, rows, _ = _jackknife_changes(fit, views)
     change = (rows @ changes[..., None])[..., 0].reshape(*views.visible.shape, 2)
     scale = fit.problem(views).scale[0][..., None]
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
@@ -204,7 +204,7 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     The jackknife's covariance is (V - 1) / V times the sum of squares of the changes when a view is
     left out. Returns 1 if chance explains the ratio.
     """
-    changes, _, normal = _without_each(fit, views)
+    changes, _, normal = _jackknife_changes(fit, views)
     deviation = changes - changes.mean(axis=0)
     count = len(changes)
     jackknife = (count - 1) / count * deviation.T @ deviation
@@ -212,7 +212,7 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
 
 
-def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
+def _jackknife_changes(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     """Changes of the free intrinsics (V, k) when each view is left out, to first order; the rows
     with poses eliminated (V, r, k); and the normal matrix of all views (k, k).
 
@@ -265,8 +265,8 @@ def camera_candidates(
         for terms in DISTORTION_CANDIDATES[model]:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            if "k2" in terms and _level(fit) > HOPELESS_MODEL_RATIO * min(
-                _level(f) for _, _, f in fits
+            if "k2" in terms and _median_residual(fit) > HOPELESS_MODEL_RATIO * min(
+                _median_residual(f) for _, _, f in fits
             ):
                 break
             # a larger set starts from this fit
@@ -275,7 +275,7 @@ def camera_candidates(
         return ()
     # Compare all candidates on the same corners, rejected ones included. Each squared residual is
     # bounded by the rejection limit of the best fit, so no model wins by rejecting more.
-    sigma = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
+    sigma = min(_median_residual(fit) for _, _, fit in fits) / MEDIAN_LENGTH
     limit = NO_WEIGHT_DISTANCE**2 * (sigma**2 + views.sigma**2)
     held_out_residuals = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
     bounded = [
@@ -338,7 +338,7 @@ def thinned(views: Views) -> Views:
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 
 
-def _level(fit: CameraFit) -> float:
+def _median_residual(fit: CameraFit) -> float:
     """Median length of the residuals, px."""
     return float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1)))
 

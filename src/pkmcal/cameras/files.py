@@ -278,11 +278,11 @@ def _from_ros(document: Document) -> Camera:
     if not isinstance(word, str) or word not in _ROS:
         value = word if isinstance(word, str) else quoted(word)
         raise _unsupported(document.where("distortion_model"), value, _ROS)
-    size = _size(document, ("image_width",), ("image_height",))
-    matrix = _numbers(document, ("camera_matrix", "data"), (9,))
+    size = _size_at(document, ("image_width",), ("image_height",))
+    matrix = _numbers_at(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
     if "distortion_coefficients" in document.data:
-        k = _numbers(document, ("distortion_coefficients", "data"), range(15))
+        k = _numbers_at(document, ("distortion_coefficients", "data"), range(15))
     return _camera_from_numbers(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
 
 
@@ -336,11 +336,11 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
         raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
     model = _KALIBR[pair]
     count = 5 if model == "unified" else 4
-    intrinsics = _numbers(document, (key, "intrinsics"), (count,))
-    size = _size(document, (key, "resolution", 0), (key, "resolution", 1))
+    intrinsics = _numbers_at(document, (key, "intrinsics"), (count,))
+    size = _size_at(document, (key, "resolution", 0), (key, "resolution", 1))
     k = np.zeros(0)
     if pair[1] != "none":
-        k = _numbers(document, (key, "distortion_coeffs"), (4,))
+        k = _numbers_at(document, (key, "distortion_coeffs"), (4,))
     fu, fv, pu, pv = intrinsics[-4:].tolist()
     matrix = np.array([fu, 0, pu, 0, fv, pv, 0, 0, 1])
     xi = float(intrinsics[0]) if model == "unified" else None
@@ -422,7 +422,7 @@ def _matrix(parameters: dict[str, float]) -> Array:
     )
 
 
-def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
+def _value_at(document: Document, keys: tuple[str | int, ...]) -> Any:
     """Value under a path of keys; raises InputError if absent."""
     value: Any = document.data
     for key in keys:
@@ -433,9 +433,9 @@ def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
     return value
 
 
-def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
+def _numbers_at(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
     """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
-    values = _value(document, keys)
+    values = _value_at(document, keys)
     numeric = isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in values
     )
@@ -450,13 +450,13 @@ def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -
     )
 
 
-def _size(
+def _size_at(
     document: Document, width: tuple[str | int, ...], height: tuple[str | int, ...]
 ) -> tuple[int, int]:
     """Image size (width, height) from two paths of keys, px."""
     out: list[int] = []
     for keys in (width, height):
-        value = _value(document, keys)
+        value = _value_at(document, keys)
         if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
             raise InputError(
                 "this is no size in pixels",

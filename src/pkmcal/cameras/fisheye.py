@@ -48,9 +48,9 @@ class Fisheye(Camera):
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
         angle, across = _angle(points)
-        ratio = _over(self._radius(angle), across, points)
+        ratio = _radius_ratio(self._radius(angle), across, points)
         focal, center = self.parameters[:2], self.parameters[2:4]
-        good = self._reaches(angle, points)[..., None]
+        good = self._in_field(angle, points)[..., None]
         return np.where(good, focal * (points[..., :2] * ratio[..., None]) + center, np.nan)
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
@@ -58,7 +58,7 @@ class Fisheye(Camera):
         (..., 2, 8).
         """
         angle, across = _angle(points)
-        ratio = _over(self._radius(angle), across, points)
+        ratio = _radius_ratio(self._radius(angle), across, points)
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         s2 = across**2
         far = np.where(s2 + z**2 > 0, s2 + z**2, 1.0)
@@ -76,7 +76,7 @@ class Fisheye(Camera):
         unit = points[..., :2] / np.where(across > 0, across, 1.0)[..., None]
         powers = angle[..., None] ** _POWERS
         by_parameters[..., 4:] = (focal * unit)[..., :, None] * powers[..., None, :]
-        bad = ~self._reaches(angle, points)[..., None, None]
+        bad = ~self._in_field(angle, points)[..., None, None]
         return (
             np.where(bad, np.nan, focal[:, None] * by_point),
             np.where(bad, np.nan, by_parameters),
@@ -103,7 +103,7 @@ class Fisheye(Camera):
         rays = np.concatenate([np.sin(angle)[..., None] * unit, np.cos(angle)[..., None]], axis=-1)
         return np.where(good[..., None], rays, np.nan)
 
-    def _reaches(self, angle: Array, points: Array) -> Booleans:
+    def _in_field(self, angle: Array, points: Array) -> Booleans:
         """Whether points with these angles from the axis are inside the field of view; (...)."""
         return (angle < self._limit()) & np.any(points != 0, axis=-1)
 
@@ -133,7 +133,7 @@ def _angle(points: Array) -> tuple[Array, Array]:
     return np.arctan2(across, points[..., 2]), across
 
 
-def _over(radius: Array, across: Array, points: Array) -> Array:
+def _radius_ratio(radius: Array, across: Array, points: Array) -> Array:
     """Ratio of image radius to distance from the axis, (...), with its limit 1 / z on the axis."""
     z = points[..., 2]
     on_axis = across <= _ON_AXIS * np.abs(z)

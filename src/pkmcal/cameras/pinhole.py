@@ -184,12 +184,12 @@ class Pinhole(Camera):
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold of the
         distortion.
         """
-        good, _, _, distorted, _ = self._imaged(points)
+        good, _, _, distorted, _ = self._projection(points)
         return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
         """Pixels and directional derivatives from one evaluation of the distortion."""
-        good, z, xy, distorted, by_xy = self._imaged(points)
+        good, z, xy, distorted, by_xy = self._projection(points)
         z = np.where(good, z, np.nan)
         derivatives: list[Array] = []
         for d in directions:
@@ -202,7 +202,7 @@ class Pinhole(Camera):
         """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
         (..., 2, 9).
         """
-        good, z, xy, distorted, by_xy = self._imaged(points)
+        good, z, xy, distorted, by_xy = self._projection(points)
         by_parameters = np.zeros((*points.shape[:-1], 2, 9))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
@@ -232,7 +232,7 @@ class Pinhole(Camera):
             row[2] = scale * -dot(by_xy[..., own, :], xy)
         return np.moveaxis(out, (0, 1), (-2, -1))
 
-    def _imaged(self, points: Array) -> tuple[Booleans, Array, Array, Array, Array | None]:
+    def _projection(self, points: Array) -> tuple[Booleans, Array, Array, Array, Array | None]:
         """Intermediate values of the projection of points (..., 3).
 
         Returns whether each point has an image (...), z with 1 for points behind the camera (...),

@@ -61,12 +61,12 @@ class Unified(Camera):
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
-        distorted, good = self._imaged(points)[2:4]
+        distorted, good = self._projection(points)[2:4]
         return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
         """Pixels and directional derivatives from one evaluation of the distortion."""
-        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        (distance, depth), xy, distorted, good, by_xy = self._projection(points)
         depth = np.where(good, depth, np.nan)
         bend = self.xi / distance
         derivatives: list[Array] = []
@@ -81,7 +81,7 @@ class Unified(Camera):
         """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
         (..., 2, 9).
         """
-        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        (distance, depth), xy, distorted, good, by_xy = self._projection(points)
         by_xy = np.eye(2) if by_xy is None else by_xy
         focal = self.parameters[:2, None]
         # d(x / w) = (dx - (x / w) dw) / w with w = z + xi r and dw = (xi X / r + e_z) . dX
@@ -105,7 +105,9 @@ class Unified(Camera):
 
     def ray(self, pixels: Array) -> Array:
         """Unit viewing rays (..., 3) of pixels (..., 2); NaN outside the image of the mirror."""
-        xy = undistort((pixels - self.parameters[2:4]) / self.parameters[:2], self._five())
+        xy = undistort(
+            (pixels - self.parameters[2:4]) / self.parameters[:2], self._five_coefficients()
+        )
         r2 = np.sum(xy * xy, axis=-1)
         with np.errstate(invalid="ignore"):
             root = np.sqrt(1 + (1 - self.xi**2) * r2)
@@ -114,11 +116,11 @@ class Unified(Camera):
         z = (root - self.xi * r2) / (1 + r2)
         return np.concatenate([scale[..., None] * xy, z[..., None]], axis=-1)
 
-    def _five(self) -> Array:
+    def _five_coefficients(self) -> Array:
         """Distortion coefficients (5,) in the pinhole model's order, with k3 = 0."""
         return np.append(self.parameters[5:], 0.0)
 
-    def _imaged(
+    def _projection(
         self, points: Array
     ) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array | None]:
         """Intermediate values of the projection of points (..., 3).
@@ -139,6 +141,6 @@ class Unified(Camera):
         if not self.parameters[5:].any():
             return (distance, depth), xy, xy, inside & np.isfinite(xy[..., 0] + xy[..., 1]), None
         with np.errstate(over="ignore", invalid="ignore"):  # points at the border of the field
-            distorted, by_xy = distort(xy, self._five())
-            good = inside & before_image_fold(xy, by_xy, self._five())
+            distorted, by_xy = distort(xy, self._five_coefficients())
+            good = inside & before_image_fold(xy, by_xy, self._five_coefficients())
         return (distance, depth), xy, distorted, good, by_xy

@@ -89,8 +89,8 @@ def stepped(poses: Array, delta: Array) -> Array:
     out = np.empty_like(poses)
     w, rot = delta[:, :3] / 2, poses[:, :3, :3]
     if is_batch_last(poses):
-        swung = _crossed(w, rot)
-        swung += _crossed(w, swung)
+        swung = _cross_columns(w, rot)
+        swung += _cross_columns(w, swung)
         size = dot(w, w)
     else:
         turn = skew(w)
@@ -104,7 +104,7 @@ def stepped(poses: Array, delta: Array) -> Array:
     return out
 
 
-def _crossed(w: Array, matrix: Array) -> Array:
+def _cross_columns(w: Array, matrix: Array) -> Array:
     """Cross products of w (n, 3) with each column of matrices (n, 3, 3)."""
     out = np.empty_like(matrix)
     for k, (i, j) in enumerate(CYCLIC_PAIRS):
@@ -121,7 +121,7 @@ def damped_step(jac: Array, value: Array, damping: Array) -> Array:
     damping : (...), relative to the square of each column.
     """
     if is_batch_last(jac):
-        return _eliminated(jac, value, damping)
+        return _elimination_step(jac, value, damping)
     transposed = jac.mT
     normal = transposed @ jac
     d = jac.shape[-1]
@@ -131,7 +131,7 @@ def damped_step(jac: Array, value: Array, damping: Array) -> Array:
     return np.linalg.solve(normal, transposed @ value[..., None])[..., 0]
 
 
-def _eliminated(jac: Array, value: Array, damping: Array) -> Array:
+def _elimination_step(jac: Array, value: Array, damping: Array) -> Array:
     """:func:`damped_step` by one elimination over the whole batch (n, E, d), with the batch axis
     fastest.
 

@@ -124,7 +124,7 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
     except InputError as error:
         if (error.where or "").startswith(document.label):
             raise
-        raise error.located(document.where(*keys, *_role(checked, str(error)))) from None
+        raise error.located(document.where(*keys, *_role_keys(checked, str(error)))) from None
     table = machine.parameters
     lengths = np.where(np.array(table.units) == "m", np.abs(table.drawing), 0.0)
     longest = int(np.argmax(lengths))
@@ -164,7 +164,7 @@ def check_plausible(value: float, machine: Machine, where: str, what: str) -> No
     )
 
 
-def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
+def _role_keys(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
     """Path of the entry under ``fixed`` or ``tied`` that an error's sentence names, empty if it
     names none.
     """

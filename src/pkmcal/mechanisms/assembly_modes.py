@@ -84,16 +84,16 @@ def assembly_modes(
     starts = closed = 0
     complete = False
     while not complete and starts < most:
-        begin, internal = _starts(layout, theta, readings, home, rng)
+        begin, internal = _random_starts(layout, theta, readings, home, rng)
         at = np.broadcast_to(readings, (STARTS_A_BATCH, readings.shape[-1]))
         result = close(layout, theta, at, begin, internal)
         good = _coordinates(result)[result.error < CONVERGED_CLOSURE_ERROR]
-        modes, count = _counted(modes, count, good)
+        modes, count = _count_by_mode(modes, count, good)
         starts, closed = starts + STARTS_A_BATCH, closed + len(good)
         complete = bool(count.size) and bool(count.min() >= RAREST_MODE_FINDS)
         if not closed and starts >= most // 10:
             break
-    poses, internal = _of_coordinates(modes)
+    poses, internal = _poses_of_coordinates(modes)
     near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
     poses, internal, count = poses[near], internal[near], count[near]
     own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
@@ -102,7 +102,7 @@ def assembly_modes(
     return AssemblyModes(poses, internal, count, sign, starts, closed, missing, complete)
 
 
-def _starts(
+def _random_starts(
     layout: LimbLayout, theta: Array, readings: Array, home: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Random poses (n, 4, 4) in the motion's freedoms, and random hinge angles (n, k).
@@ -131,14 +131,14 @@ def _coordinates(result: Closed) -> Array:
     return np.concatenate([result.poses[:, :3].reshape(-1, 12), np.cos(phi), np.sin(phi)], axis=-1)
 
 
-def _of_coordinates(modes: Array) -> tuple[Array, Array]:
+def _poses_of_coordinates(modes: Array) -> tuple[Array, Array]:
     """Poses (k, 4, 4) and hinge angles (k, n) of :func:`_coordinates`."""
     matrix = modes[:, :12].reshape(-1, 3, 4)
     cos, sin = np.split(modes[:, 12:], 2, axis=1)
     return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
 
 
-def _counted(modes: Array, count: Integers, closed: Array) -> tuple[Array, Integers]:
+def _count_by_mode(modes: Array, count: Integers, closed: Array) -> tuple[Array, Integers]:
     """Modes (k, c) and their counts (k,), updated with the coordinates (n, c) of further closed
     starts.
     """

@@ -81,8 +81,8 @@ def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
     """Base side of the limbs at readings (..., m), m or rad."""
     q = joint_values(layout, theta, readings)
     placed = [g.carrier.place(g.of(theta), q[..., g.legs]) for g in layout.base]
-    a, by_value = (_gathered(layout.base, side) for side in zip(*placed, strict=True))
-    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _lengths(layout, theta, q))
+    a, by_value = (_leg_points(layout.base, side) for side in zip(*placed, strict=True))
+    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _rod_lengths(layout, theta, q))
 
 
 def platform_ends(
@@ -103,7 +103,7 @@ def platform_ends(
         g.carrier.place(own, at_legs, own_internal(layout, g, internal))
         for g, own in zip(layout.platform, parameters, strict=True)
     ]
-    b, arm = (_gathered(layout.platform, side) for side in zip(*placed, strict=True))
+    b, arm = (_leg_points(layout.platform, side) for side in zip(*placed, strict=True))
     if not layout.n_internal:
         return PlatformEnds(b, arm, b[..., None][..., :0])
     by_internal = fresh(b, (*b.shape, layout.n_internal))
@@ -230,16 +230,16 @@ def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
 
     NaN for passive rods, whose length is unknown.
     """
-    return _lengths(layout, theta, joint_values(layout, theta, readings))
+    return _rod_lengths(layout, theta, joint_values(layout, theta, readings))
 
 
-def _lengths(layout: LimbLayout, theta: Array, joint_value: Array) -> Array:
+def _rod_lengths(layout: LimbLayout, theta: Array, joint_value: Array) -> Array:
     """Length of each rod (..., L), m, from the motions (..., L) of the legs' motors."""
     own = np.where(layout.closing, theta[..., layout.rod], np.nan)
     return own + np.where(layout.rod_reads, joint_value, 0.0)
 
 
-def _gathered(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
+def _leg_points(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
     """Points of groups (..., g, 3) in the order of the legs, (..., L, 3)."""
     if len(groups) == 1:
         return points[0]
@@ -325,7 +325,7 @@ class LimbEnds:
         layout, theta = self.layout, self.theta
         q = joint_values(layout, theta, self.readings)
         by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
-        padded = _padded_to(layout.n_legs, layout.base, by)
+        padded = _leg_derivatives(layout.n_legs, layout.base, by)
         if not layout.scales_move_a:
             return padded
         raw = _leg_readings(layout, self.readings) / scales(layout, theta)
@@ -341,7 +341,7 @@ class LimbEnds:
             )
             for g in layout.platform
         ]
-        return _padded_to(layout.n_legs, layout.platform, by)
+        return _leg_derivatives(layout.n_legs, layout.platform, by)
 
 
 @dataclass(frozen=True)
@@ -420,7 +420,9 @@ def limb_ends(
     return LimbEnds(layout, theta, readings, poses, internal, base, platform)
 
 
-def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]) -> Array:
+def _leg_derivatives(
+    n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
+) -> Array:
     """Carriers' derivatives in the order of the legs (..., L, 3, n), padded with zeros to the
     largest number of parameters.
     """

@@ -29,7 +29,7 @@ from pkmcal.mechanisms.carriers.contract import (
 from pkmcal.mechanisms.parameters import EVERY_LEG
 
 
-def _increasing(value: tuple[float, float]) -> tuple[float, float]:
+def _check_increasing(value: tuple[float, float]) -> tuple[float, float]:
     """Validate a range of lengths."""
     if not 0 < value[0] < value[1]:
         raise ValueError("should be two increasing positive lengths [min, max]")
@@ -43,7 +43,7 @@ class ActuatedLength(Schema):
 
     actuated: Literal[True]
     offset: Metres = 0.0
-    range: Annotated[tuple[Metres, Metres], AfterValidator(_increasing)] | None = None
+    range: Annotated[tuple[Metres, Metres], AfterValidator(_check_increasing)] | None = None
 
 
 class ConstantLength(Schema):
@@ -112,7 +112,7 @@ class _OneOfTheCarriers:
 
     def adapter(self) -> TypeAdapter[Any]:
         """Adapter for the union of the carriers' schemas."""
-        return _union(tuple(dict.fromkeys(c.schema for c in self.carriers().values())))
+        return _union_adapter(tuple(dict.fromkeys(c.schema for c in self.carriers().values())))
 
     def read(self, value: Any) -> Any:
         """Validated field, from a file's content or from another machine's document."""
@@ -132,7 +132,7 @@ class _OneOfTheCarriers:
 
 
 @cache
-def _union(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
+def _union_adapter(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
     """Adapter for a union of schemas, discriminated by ``joint``."""
     one: Any = reduce(or_, schemas)
     if len(schemas) > 1:
@@ -196,7 +196,7 @@ class Home(Schema):
     rotation_vector: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
 
 
-def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+def _check_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     """Validate the number of legs and that one is actuated."""
     if len(legs) < 2:
         raise ValueError("a parallel machine has at least two legs")
@@ -206,7 +206,7 @@ def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     return legs
 
 
-def _several(group: tuple[str, ...]) -> tuple[str, ...]:
+def _check_members(group: tuple[str, ...]) -> tuple[str, ...]:
     """Validate that a tie has at least two members; an entry for all legs counts as several."""
     if len(group) < 2 and not any(EVERY_LEG in entry for entry in group):
         counts = {"field_type": "Tuple", "min_length": 2, "actual_length": len(group)}
@@ -214,7 +214,7 @@ def _several(group: tuple[str, ...]) -> tuple[str, ...]:
     return group
 
 
-Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_several)], ...]
+Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_check_members)], ...]
 
 
 class DocumentModel(Schema):
@@ -236,7 +236,7 @@ class MechanismDocument(Schema):
     name: Annotated[str, Field(max_length=LONGEST_NAME)]
     motion: PlatformMotion
     legs: Annotated[
-        tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_some_legs)
+        tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_check_legs)
     ]
     tolerance: DrawingTolerance = DrawingTolerance()
     home: Home | None = None

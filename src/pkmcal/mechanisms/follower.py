@@ -80,7 +80,7 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     square = layout.n_equations == layout.motion.shape[1]
     if not square or len(layout.angles) or layout.n_internal:
         return None
-    base, platform = (_chains(groups, theta) for groups in (layout.base, layout.platform))
+    base, platform = (_leg_chains(groups, theta) for groups in (layout.base, layout.platform))
     if base is None or platform is None:
         return None
     n = layout.n_legs
@@ -118,7 +118,7 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     )
 
 
-def _chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
+def _leg_chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
     """Elementary joint of each leg; None if any leg has none."""
     chains: dict[int, Chain] = {}
     for group in groups:
@@ -146,9 +146,9 @@ class Follower:
 
         self._layout, self._theta, self._rods = layout, theta, rods_of(layout, theta)
         functions: Any = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
-        self._factored, self._solved = functions
+        self._getrf, self._getrs = functions
         self._ones, self._twist, self._free = np.ones(3), np.zeros(6), layout.freedoms
-        self._put(np.array(start, dtype=float))
+        self._reset(np.array(start, dtype=float))
 
     @property
     def T_base_platform(self) -> Array:
@@ -164,11 +164,11 @@ class Follower:
                 found=str(readings.shape),
                 expected=f"({self._layout.n_readings},): one configuration at a time",
             )
-        if self._rods is None or not self._followed(self._rods, readings):
+        if self._rods is None or not self._newton(self._rods, readings):
             self._search(readings)
         return self._pose.copy()
 
-    def _put(self, T_base_platform: Array) -> None:
+    def _reset(self, T_base_platform: Array) -> None:
         """Set the pose, orthonormalised, and drop the factors."""
         self._pose = pose(nearest_rotation(T_base_platform[:3, :3]), T_base_platform[:3, 3])
         self._factors: tuple[Array, Array] | None = None
@@ -184,9 +184,9 @@ class Follower:
                 expected="readings that the machine can reach, near those before them",
                 next_step="check the readings, or begin anew with a start near the pose",
             )
-        self._put(fk.T_base_platform)
+        self._reset(fk.T_base_platform)
 
-    def _followed(self, rods: Rods, readings: Array) -> bool:
+    def _newton(self, rods: Rods, readings: Array) -> bool:
         """Newton steps from the last pose; returns False, with no state changed, if they do not
         converge.
 
@@ -217,8 +217,8 @@ class Follower:
                 self._pose = now
                 return True
             before = error
-            twist[self._free] = self._solved(*factors, residual)[0]
-            now = _moved_back(now, twist)
+            twist[self._free] = self._getrs(*factors, residual)[0]
+            now = _retracted_half_back(now, twist)
         return False
 
     def _factors_at(self, b: Array, line: Array) -> tuple[Array, Array]:
@@ -227,14 +227,14 @@ class Follower:
         rows[:3] = b[FIRST_CROSS_COMPONENTS] * line[SECOND_CROSS_COMPONENTS]
         rows[:3] -= b[SECOND_CROSS_COMPONENTS] * line[FIRST_CROSS_COMPONENTS]
         rows[3:] = line
-        return self._factored(rows[self._free].T)[:2]
+        return self._getrf(rows[self._free].T)[:2]
 
 
 FIRST_CROSS_COMPONENTS, SECOND_CROSS_COMPONENTS = np.array([1, 2, 0]), np.array([2, 0, 1])
 """Indices of the components in a cross product: a[FIRST] b[SECOND] - a[SECOND] b[FIRST]."""
 
 
-def _moved_back(T_base_platform: Array, twice: Array) -> Array:
+def _retracted_half_back(T_base_platform: Array, twice: Array) -> Array:
     """Pose (4, 4) moved from the left by minus half of (omega, tau), (6,).
 
     Cayley's map as in :func:`pkmcal.geometry.batches.stepped`, in plain Python numbers, which are

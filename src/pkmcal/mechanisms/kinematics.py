@@ -144,21 +144,24 @@ def base_batch_last(base: BaseEnds) -> BaseEnds:
 
 def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
     """Solve the rows of a task and write their results."""
-    now = _at(task, poses, internal)
+    now = _state_at(task, poses, internal)
     damping, stuck = np.full(len(poses), 1e-6), np.zeros(len(poses), dtype=bool)
     for _ in range(MAX_STEPS):
         # Write and remove finished rows once they are a quarter of the batch.
         done = stuck | (now.worst <= CONVERGED_CLOSURE_ERROR * 1e-2)
         if 4 * np.count_nonzero(done) >= len(done):
-            _write(task, now, out)
+            _write_results(task, now, out)
             remaining = np.flatnonzero(~done)
             if not remaining.size:
                 return
             if remaining.size < len(done):
-                task, now = _picked(task, remaining), _State(*(picked(x, remaining) for x in now))
+                task, now = (
+                    _task_rows(task, remaining),
+                    _State(*(picked(x, remaining) for x in now)),
+                )
                 damping, done = damping[remaining], done[remaining]
         step = damped_step(now.jac, now.value, damping)
-        trial = _at(task, *_moved(task.layout, now, step))
+        trial = _state_at(task, *_retracted(task.layout, now, step))
         better = trial.cost < now.cost
         if np.count_nonzero(better) == len(better):
             now, stuck, damping = trial, done, np.maximum(damping * 0.05, 1e-14)
@@ -172,10 +175,10 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
                 for new, old in zip(trial, now, strict=True)
             )
         )
-    _write(task, now, out)
+    _write_results(task, now, out)
 
 
-def _at(task: _Task, poses: Array, internal: Array) -> _State:
+def _state_at(task: _Task, poses: Array, internal: Array) -> _State:
     """State of the rows at poses (n, 4, 4) and internal coordinates."""
     platform = platform_ends(task.layout, task.theta, poses, internal, task.platform)
     rows = rows_between(task.layout, task.theta, task.base, platform, poses)
@@ -184,7 +187,7 @@ def _at(task: _Task, poses: Array, internal: Array) -> _State:
     return _State(poses, internal, rows.value, by_own(task.layout, rows), cost, worst)
 
 
-def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
+def _retracted(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
     """Poses and internal coordinates retracted along minus a step (n, d + n)."""
     d = layout.motion.shape[1]
     if d == 6:
@@ -196,7 +199,7 @@ def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
     return stepped(now.poses, delta), now.internal - step[:, d:]
 
 
-def _picked(task: _Task, rows: Integers) -> _Task:
+def _task_rows(task: _Task, rows: Integers) -> _Task:
     """Task restricted to some of its rows."""
     base = task.base
     a, by_reading = (picked(x, rows) if x.ndim > 2 else x for x in (base.a, base.by_reading))
@@ -210,7 +213,7 @@ def _picked(task: _Task, rows: Integers) -> _Task:
     )
 
 
-def _write(task: _Task, now: _State, out: Closed) -> None:
+def _write_results(task: _Task, now: _State, out: Closed) -> None:
     """Write the results of a task's rows into the output."""
     out.poses[task.number], out.internal[task.number] = now.poses, now.internal
     out.error[task.number] = np.where(np.isfinite(now.cost), now.worst, np.inf)
@@ -270,14 +273,14 @@ def inverse_result(
     :func:`readings_at_poses`.
     """
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
-    internal = _upright(layout, theta, poses, shape)
-    legs = _leg_inverse(layout, theta, poses, internal, near)
+    internal = _initial_internal(layout, theta, poses, shape)
+    legs = _leg_readings(layout, theta, poses, internal, near)
     if not layout.shares_motors:
         driven = np.flatnonzero(layout.actuated >= 0)
         return legs[..., driven[np.argsort(layout.actuated[driven], kind="stable")]], internal
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
     readings = legs @ (columns / columns.sum(axis=1, keepdims=True)).T
-    return _settled(layout, theta, poses, readings, internal)
+    return _least_squares_readings(layout, theta, poses, readings, internal)
 
 
 def closure_at(layout: LimbLayout, theta: Array, poses: Array) -> Closure:
@@ -286,7 +289,9 @@ def closure_at(layout: LimbLayout, theta: Array, poses: Array) -> Closure:
     return closure(layout, theta, readings, poses, internal)
 
 
-def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]) -> Array:
+def _initial_internal(
+    layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]
+) -> Array:
     """Approximate internal coordinates (..., n) that keep the bars' directions."""
     out = np.zeros((*shape, layout.n_internal))
     for group in layout.platform if layout.n_internal else ():
@@ -296,7 +301,7 @@ def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, .
     return out
 
 
-def _leg_inverse(
+def _leg_readings(
     layout: LimbLayout, theta: Array, poses: Array, internal: Array, readings: Array | None
 ) -> Array:
     """Reading of each leg (..., L), zero without one; the solution nearest to ``readings``
@@ -318,7 +323,7 @@ def _leg_inverse(
     return out / scale
 
 
-def _settled(
+def _least_squares_readings(
     layout: LimbLayout, theta: Array, poses: Array, readings: Array, internal: Array
 ) -> tuple[Array, Array]:
     """Readings and internal coordinates that close a machine with several rods for a motor by least
@@ -374,13 +379,13 @@ def forward(
     error = fk.error.reshape(shape)
     converged = error < CONVERGED_CLOSURE_ERROR
     if layout.overdetermined:
-        poses, inner, error = _at_least(layout, theta, readings, poses, inner)
+        poses, inner, error = _least_squares_poses(layout, theta, readings, poses, inner)
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
         converged = error < OTHER_MACHINE_GAP * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
 
 
-def _at_least(
+def _least_squares_poses(
     layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
 ) -> Closed:
     """Least-squares poses (..., 4, 4) of an overdetermined machine, from poses near the minimum.

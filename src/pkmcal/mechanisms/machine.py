@@ -239,7 +239,7 @@ class Machine:
         ``near`` (n, m), is returned. NaN if a limb cannot reach. Hinges of an articulated platform
         follow.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return kinematics.readings_at_poses(self.layout, self.values, poses, near)
 
     def forward(self, joints: Array, start: Array | None = None) -> Array:
@@ -264,8 +264,8 @@ class Machine:
         """Result of :meth:`forward` with convergence and singularity; raises nothing for failed
         rows.
         """
-        readings = _checked(joints, (self.n_joints,), "joints")
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        readings = _finite_array(joints, (self.n_joints,), "joints")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return kinematics.forward(self.layout, self.values, readings, begin)
 
     def follower(self, start: Array | None = None) -> Follower:
@@ -276,7 +276,7 @@ class Machine:
         """
         from pkmcal.mechanisms.follower import Follower
 
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return Follower(self.layout, self.values, begin)
 
     def inverse_jacobian(self, T_base_platform: Array) -> Array:
@@ -284,7 +284,7 @@ class Machine:
 
         The twist is (omega, tau), base frame; see :func:`velocities.inverse_jacobian`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return velocities.inverse_jacobian(self.layout, self.values, poses)
 
     def forward_jacobian(self, T_base_platform: Array) -> Array:
@@ -292,7 +292,7 @@ class Machine:
 
         NaN at singular poses; see :func:`velocities.forward_jacobian`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return velocities.forward_jacobian(self.layout, self.values, poses)
 
     def amplification(
@@ -301,8 +301,8 @@ class Machine:
         """Speeds, forces and condition numbers at poses (n, 4, 4), of a point (3,) of the platform,
         m; see :mod:`pkmcal.mechanisms.velocities`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        point = None if p_platform is None else _checked(p_platform, (3,), "p_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
+        point = None if p_platform is None else _finite_array(p_platform, (3,), "p_platform")
         return velocities.amplification(self.layout, self.values, poses, point)
 
     def limits(self) -> workspace.Limits:
@@ -322,7 +322,7 @@ class Machine:
 
     def reachable(self, T_base_platform: Array) -> workspace.Reach:
         """Whether the machine can take poses (n, 4, 4), and the obstacles where it cannot."""
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return workspace.reachable(self.limits(), poses)
 
     def extents(
@@ -332,8 +332,8 @@ class Machine:
         default home; see :func:`pkmcal.mechanisms.workspace.extents`.
         """
         axes = np.asarray(directions, dtype=float)
-        axes = _checked(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        axes = _finite_array(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return workspace.extents(self.limits(), axes.reshape(-1, axes.shape[-1]), begin, most)
 
     def grid(
@@ -344,15 +344,15 @@ class Machine:
         :func:`pkmcal.mechanisms.workspace.workspace_grid`.
         """
         own = np.eye(3)[self.layout.free[3:]]
-        axes = own if directions is None else _checked(directions, (3,), "directions")
-        begin = self._home if middle is None else _checked(middle, (4, 4), "middle")
+        axes = own if directions is None else _finite_array(directions, (3,), "directions")
+        begin = self._home if middle is None else _finite_array(middle, (4, 4), "middle")
         return workspace.workspace_grid(self.limits(), begin, axes, count)
 
     def check_path(self, T_base_platform: Array) -> workspace.PathCheck:
         """Whether a path of poses (n, 4, 4) stays in the workspace and crosses no singular pose,
         and where it fails.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return workspace.check_path(self.limits(), poses)
 
     def same_assembly(self, T_base_platform: Array, T_reference: Array | None = None) -> Booleans:
@@ -361,8 +361,10 @@ class Machine:
 
         False is certain, True is not; see :func:`pkmcal.mechanisms.velocities.same_assembly`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        other = self._home if T_reference is None else _checked(T_reference, (4, 4), "T_reference")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
+        other = (
+            self._home if T_reference is None else _finite_array(T_reference, (4, 4), "T_reference")
+        )
         return velocities.same_assembly(self.layout, self.values, poses, other)
 
     def assembly_modes(self, joints: Array, rng: np.random.Generator) -> Array:
@@ -377,7 +379,7 @@ class Machine:
         """
         from pkmcal.mechanisms.assembly_modes import assembly_modes
 
-        readings = _checked(joints, (self.n_joints,), "joints")
+        readings = _finite_array(joints, (self.n_joints,), "joints")
         return assembly_modes(self.layout, self.values, readings, self._home, rng, most)
 
     def middle_readings(self) -> Array:
@@ -472,12 +474,12 @@ def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
             kinds = carriers[node.joint].parameters + (
                 JOINT_AXIS_KINDS if (j, side) in axes else ()
             )
-            yield from _rows_of(f"{path}.{side}", node, kinds, usual)
+            yield from _part_rows(f"{path}.{side}", node, kinds, usual)
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET_KIND if isinstance(leg.length, ActuatedLength) else CONSTANT_LENGTH_KIND
-            yield from _rows_of(f"{path}.length", leg.length, (kind,), usual)
+            yield from _part_rows(f"{path}.length", leg.length, (kind,), usual)
         if scales[j] > 0:
-            yield from _rows_of(
+            yield from _part_rows(
                 path, leg, (READING_SCALE_KIND,), {READING_SCALE_KIND.tolerance: scales[j]}
             )
         for t, tube in enumerate(leg.tubes, start=1):
@@ -485,7 +487,7 @@ def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
             yield _Row(name, "m", "radius", label, "", tube.radius, usual["radius"])
 
 
-def _rows_of(
+def _part_rows(
     path: str, node: Any, kinds: tuple[ParameterKind, ...], tolerances: Mapping[str, float]
 ) -> Iterator[_Row]:
     """Rows for the parameters of one part of a document; constants and absent values have none."""
@@ -512,7 +514,7 @@ def field_of(document: Any, name: str) -> tuple[Any, Any]:
     return node, "xyz".index(last) if isinstance(node, list) else last
 
 
-def _checked(values: Array, tail: tuple[int, ...], name: str) -> Array:
+def _finite_array(values: Array, tail: tuple[int, ...], name: str) -> Array:
     """Finite array with trailing axes ``tail``; raises InputError."""
     array = np.asarray(values, dtype=float)
     if array.shape[-len(tail) :] != tail:

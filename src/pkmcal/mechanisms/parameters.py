@@ -83,8 +83,10 @@ class ParameterTable:
         value is zero: the axis then rotates orthogonally to it. Otherwise the axis is fixed as a
         whole.
         """
-        fixed = tuple(n for entry in fixed for e in self._of_all(entry) for n in self._members(e))
-        groups = [part for group in tied for part in self._together(group)]
+        fixed = tuple(
+            n for entry in fixed for e in self._for_all_legs(entry) for n in self._members(e)
+        )
+        groups = [part for group in tied for part in self._component_ties(group)]
         return replace(
             self,
             fixed=fixed,
@@ -92,18 +94,18 @@ class ParameterTable:
             opposed=tuple(tuple(name for name, sign in part if sign < 0) for part in groups),
         )
 
-    def _of_all(self, entry: str) -> tuple[str, ...]:
+    def _for_all_legs(self, entry: str) -> tuple[str, ...]:
         """Entries for which an entry with ``legs[*]`` stands."""
         if EVERY_LEG not in entry:
             return (entry,)
         first, _, rest = entry.partition(EVERY_LEG)
         legs = dict.fromkeys(n[: n.index("]") + 1] for n in self.names)
-        every = [f"{leg}{rest}" for leg in legs if self._whole(f"{leg}{rest}")]
+        every = [f"{leg}{rest}" for leg in legs if self._components(f"{leg}{rest}")]
         if first or not every:
             self.index(entry)  # raises the error about a name
         return tuple(every)
 
-    def _whole(self, entry: str) -> tuple[str, ...]:
+    def _components(self, entry: str) -> tuple[str, ...]:
         """Names of the parameters that an entry stands for, possibly none."""
         return tuple(n for n in self.names if n == entry or n.startswith(f"{entry}."))
 
@@ -111,7 +113,7 @@ class ParameterTable:
         """Names of the parameters that an entry under ``fixed`` or ``tied`` stands for; raises
         InputError.
         """
-        whole = self._whole(entry)
+        whole = self._components(entry)
         if len(whole) > 1:
             return whole
         k = self.index(entry)
@@ -122,14 +124,14 @@ class ParameterTable:
             )
         return (entry,)
 
-    def _together(self, group: tuple[str, ...]) -> list[list[tuple[str, int]]]:
+    def _component_ties(self, group: tuple[str, ...]) -> list[list[tuple[str, int]]]:
         """Ties that a group stands for, as names with signs; whole centres or axes are tied
         component by component.
         """
         entries = [
             (e, -1 if entry.startswith("-") else 1)
             for entry in group
-            for e in self._of_all(entry.removeprefix("-"))
+            for e in self._for_all_legs(entry.removeprefix("-"))
         ]
         members = [[(name, sign) for name in self._members(e)] for e, sign in entries]
         axes = {self.kinds[self.index(m[0][0])] == "axis" for m in members}

@@ -162,7 +162,7 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
     while accepted < count and tried < most:
         more = min(max(count, tried), REGION_POSES_AT_ONCE)
-        poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
+        poses = _candidate_poses(limits, within, np.arange(tried, tried + more), seed)
         closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
@@ -180,7 +180,7 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     return np.concatenate(batches)[:count]
 
 
-def _candidates(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:
+def _candidate_poses(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:
     """Members of a low-discrepancy sequence of poses in the box, (n, 4, 4), by their indices.
 
     Additive recurrence with powers of the generalised golden ratio, the root of phi^(d + 1) = phi +

@@ -47,7 +47,7 @@ def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     """
     c = closure_at(layout, theta, poses)
     if layout.shares_motors:
-        return _of_shared(c)
+        return _shared_motor_jacobian(c)
     rows = layout.driven_rows[np.argsort(layout.row_motor[layout.driven_rows])]
     legs = np.flatnonzero(layout.closing)[rows]
     gain = c.by_reading[..., rows]
@@ -74,7 +74,7 @@ def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     )
 
 
-def _of_shared(c: Closure) -> Array:
+def _shared_motor_jacobian(c: Closure) -> Array:
     """Inverse Jacobian (..., m, 6) of machines with several rods for a motor: least squares over
     all rows for the readings' and hinges' rates, as in inverse kinematics.
     """

@@ -101,9 +101,13 @@ class Reach:
 
     def why(self, *pose: int) -> tuple[str, ...]:
         """Obstacles to one pose, by its index in the batch, as text; empty for none."""
-        words = [text for j, u in enumerate(self.limits.units) for text in self._motor(pose, j, u)]
+        words = [
+            text
+            for j, u in enumerate(self.limits.units)
+            for text in self._motor_obstacles(pose, j, u)
+        ]
         if self.forbidden[pose]:
-            words.append(self._forbidden(pose))
+            words.append(self._constraint_obstacle(pose))
         if self.singular[pose]:
             words.append(
                 f"the pose is singular or nearly so: {float(self.singularity[pose]):.2g}, where at"
@@ -113,7 +117,7 @@ class Reach:
             words.append("the pose lies beyond a singular one, in another assembly than home")
         return tuple(words)
 
-    def _motor(self, pose: tuple[int, ...], motor: int, unit: str) -> list[str]:
+    def _motor_obstacles(self, pose: tuple[int, ...], motor: int, unit: str) -> list[str]:
         """Obstacle at one motor as text, at most one."""
         at, (low, high) = (*pose, motor), self.limits.ranges[motor]
         if self.lost[at]:
@@ -129,7 +133,7 @@ class Reach:
             where = f"above its range, which ends at {end:.4g} {unit}"
         return [f"motor {motor + 1} would stand at {reading:.4g} {unit}, {where}"]
 
-    def _forbidden(self, pose: tuple[int, ...]) -> str:
+    def _constraint_obstacle(self, pose: tuple[int, ...]) -> str:
         """Obstacle by constraints as text."""
         off = float(self.off[pose])
         if off > ALLOWED_CONSTRAINT_ERROR:
@@ -157,7 +161,7 @@ def reachable(limits: Limits, poses: Array) -> Reach:
         too_short=readings < limits.ranges[:, 0],
         too_long=readings > limits.ranges[:, 1],
         off=off,
-        forbidden=(off > ALLOWED_CONSTRAINT_ERROR) | _elsewhere(limits, poses),
+        forbidden=(off > ALLOWED_CONSTRAINT_ERROR) | _outside_motion(limits, poses),
         singularity=singularity,
         singular=~lost.any(axis=-1) & ~(singularity >= least),
         crossed=own * sign < 0,
@@ -165,7 +169,7 @@ def reachable(limits: Limits, poses: Array) -> Reach:
     )
 
 
-def _elsewhere(limits: Limits, poses: Array) -> Booleans:
+def _outside_motion(limits: Limits, poses: Array) -> Booleans:
     """Whether poses (..., 4, 4) are outside the motion that the file states."""
     held = ~limits.layout.free
     if not held.any():
@@ -272,7 +276,9 @@ def extents(
     ahead: Integers = np.arange(len(distances))
     for first in range(0, effort.steps + 1, PATH_POSES_AHEAD):
         at = slice(first, first + PATH_POSES_AHEAD)
-        inside = _along(limits, start, twists[ahead, None], distances[ahead, at], effort)[1].inside
+        inside = _reach_along(limits, start, twists[ahead, None], distances[ahead, at], effort)[
+            1
+        ].inside
         inside_so_far[ahead, at] = np.logical_and.accumulate(inside, axis=1)
         ahead = ahead[inside.all(axis=1)]
         if not ahead.size:
@@ -283,10 +289,10 @@ def extents(
     low, high = distances[rows, last], distances[rows, np.minimum(last + 1, effort.steps)]
     for _ in range(effort.halvings):
         middle = (low + high) / 2
-        good = _along(limits, start, twists, middle, effort)[1].inside
+        good = _reach_along(limits, start, twists, middle, effort)[1].inside
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    poses = _along(limits, start, twists, low, effort)[0]
-    beyond = _along(limits, start, twists, high, effort)[1]
+    poses = _reach_along(limits, start, twists, low, effort)[0]
+    beyond = _reach_along(limits, start, twists, high, effort)[1]
     why = tuple(() if last[k] == effort.steps else beyond.why(k) for k in range(len(twists)))
     return Extents(low, poses, why)
 
@@ -310,17 +316,17 @@ def _twists(directions: Array) -> Array:
     return np.concatenate([np.zeros_like(unit), unit], axis=-1)
 
 
-def _along(
+def _reach_along(
     limits: Limits, start: Array, twists: Array, distances: Array, effort: Effort
 ) -> tuple[Array, Reach]:
     """Poses (..., 4, 4) at distances (...,) along twists (..., 6), and their obstacles."""
     poses = perturb(start, twists * distances[..., None])
     if limits.layout.row_motor.min(initial=0) < 0 or limits.layout.shares_motors:
-        poses = _settled(limits, start, twists, distances, poses, effort)
+        poses = _projected(limits, start, twists, distances, poses, effort)
     return poses, reachable(limits, poses)
 
 
-def _settled(
+def _projected(
     limits: Limits, start: Array, twists: Array, distances: Array, poses: Array, effort: Effort
 ) -> Array:
     """Poses (..., 4, 4) projected onto those that rods and axes allow, at their distance along the
@@ -468,8 +474,8 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
             expected="(n, 4, 4)",
         )
     places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * LOOKS_A_PATH_STEP + 1)
-    reach = reachable(limits, _at(poses, places))
-    leaves, why = _leaving(limits, poses, places, reach)
+    reach = reachable(limits, _path_poses(poses, places))
+    leaves, why = _first_exit(limits, poses, places, reach)
     nearest = np.where(np.isfinite(reach.singularity), reach.singularity, np.inf)
     k = int(np.argmin(nearest))
     own = slice(None, None, LOOKS_A_PATH_STEP)
@@ -483,14 +489,14 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
     )
 
 
-def _at(poses: Array, places: Array) -> Array:
+def _path_poses(poses: Array, places: Array) -> Array:
     """Poses at places along a path."""
     first = np.minimum(places.astype(int), len(poses) - 2)
     step = pose_difference(poses[1:], poses[:-1])[first]
     return perturb(poses[first], (places - first)[:, None] * step)
 
 
-def _leaving(
+def _first_exit(
     limits: Limits, poses: Array, places: Array, reach: Reach
 ) -> tuple[float | None, tuple[str, ...]]:
     """First place outside the workspace, by bisection, and the obstacles there."""
@@ -502,9 +508,9 @@ def _leaving(
     low, high = places[outside[0] - 1], places[outside[0]]
     for _ in range(FINE_EFFORT.halvings):
         middle = (low + high) / 2
-        good = bool(reachable(limits, _at(poses, np.array([middle]))).inside[0])
+        good = bool(reachable(limits, _path_poses(poses, np.array([middle]))).inside[0])
         low, high = (middle, high) if good else (low, middle)
-    return float(high), reachable(limits, _at(poses, np.array([high]))).why(0)
+    return float(high), reachable(limits, _path_poses(poses, np.array([high]))).why(0)
 
 
 def _crossings(limits: Limits, poses: Array, places: Array, reach: Reach) -> tuple[float, ...]:
@@ -515,6 +521,6 @@ def _crossings(limits: Limits, poses: Array, places: Array, reach: Reach) -> tup
     low, high = places[at], places[at + 1]
     for _ in range(FINE_EFFORT.halvings if at.size else 0):
         middle = (low + high) / 2
-        same = reachable(limits, _at(poses, middle)).crossed == reach.crossed[at]
+        same = reachable(limits, _path_poses(poses, middle)).crossed == reach.crossed[at]
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return tuple(float(x) for x in high)

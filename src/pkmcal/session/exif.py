@@ -62,20 +62,20 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
         raise InputError(
             "the photographs of one camera tell different focal lengths or sizes",
             where=second,
-            found=f"{_described(*other)}, where {first} has {_described(*one)}",
+            found=f"{_description(*other)}, where {first} has {_description(*one)}",
             expected="one lens, not zoomed, and uncropped photographs",
             next_step="Give photographs by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # the others are rotated by 90 degrees
-    return _pinhole(next(iter(labels))[0] / FILM_DIAGONAL * hypot(*size), size)
+    return _pinhole_camera(next(iter(labels))[0] / FILM_DIAGONAL * hypot(*size), size)
 
 
-def _described(focal: float, size: tuple[int, int]) -> str:
+def _description(focal: float, size: tuple[int, int]) -> str:
     """Focal length and image size for a message."""
     return f"{focal:g} mm at {size[0]}x{size[1]}"
 
 
-def _pinhole(focal: float, size: tuple[int, int]) -> Camera:
+def _pinhole_camera(focal: float, size: tuple[int, int]) -> Camera:
     """Pinhole camera without distortion, with its prior covariance. focal : px."""
     kind = camera_models()["pinhole"]
     middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]

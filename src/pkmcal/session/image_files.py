@@ -53,7 +53,7 @@ def find_photographs(
     Returns images sorted by configuration and repeat; configurations may be without an image.
     Raises InputError for an invalid pattern and for images of unknown configurations.
     """
-    parts = _parts(pattern, where)
+    parts = _pattern_parts(pattern, where)
     wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
     rows = {name: row for row, name in enumerate(names)}
     lengths = sorted({len(name) for name in names}, reverse=True)
@@ -125,7 +125,7 @@ def label_of(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
+def _pattern_parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
     """Split a pattern into (text, None) and ("", placeholder); raises InputError for unknown or
     missing placeholders.
     """
@@ -193,7 +193,7 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
         others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
         content = f"{others} {entries[0]} in {parent}" if entries else f"nothing in {parent}"
     ending = Path(pattern).suffix
-    same = Counter(_endings(folder, wildcard.removesuffix(ending)))
+    same = Counter(_image_suffixes(folder, wildcard.removesuffix(ending)))
     others = [other for other, _ in same.most_common() if other != ending]
     return InputError(
         "there is no photograph under this pattern",
@@ -207,7 +207,7 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
     )
 
 
-def _endings(folder: Path, wildcard: str) -> list[str]:
+def _image_suffixes(folder: Path, wildcard: str) -> list[str]:
     """Suffixes of the images that match a pattern apart from its own suffix, such as .JPG."""
     try:
         names = glob.glob(f"{wildcard}.*", root_dir=folder)

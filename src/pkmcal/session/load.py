@@ -263,7 +263,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         A file is missing or invalid; the error names file, line and field.
 
     """
-    folder, document = _read(Path(folder))
+    folder, document = _session_document(Path(folder))
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
     if not measured and not schema.stations:
@@ -275,7 +275,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             " machine reaches",
         )
     if measured or (folder / schema.joints.file).exists():
-        path = _existing(folder, document, schema.joints.file, ("joints", "file"))
+        path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
         written = written_unit(document.data["joints"]["noise"])
         if written and written.kind not in machine.joint_units:
@@ -292,19 +292,19 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
         table, findings = CsvTable(schema.joints.file, columns, (), none, ()), list[Finding]()
     board = _board(folder, document, schema)
-    findings += _of_little_use(document, schema)
+    findings += _unused_board(document, schema)
     stations = tuple(
         camera_station
         for name, station in schema.cameras.items()
         for camera_station in _stations(folder, document, name, station, table.names, measured)
     )
-    findings += _turned(folder, stations)
+    findings += _rotated_images(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
         tracker, keys = station.tracker, ("stations", name, "tracker", "poses")
         noise = tracker.noise.position, tracker.noise.rotation
         if measured or (folder / tracker.poses).exists():
-            path = _existing(folder, document, tracker.poses, keys)
+            path = _regular_file(folder, document, tracker.poses, keys)
             read = read_poses(path, tracker.poses, table.names, *noise, name, level=tracker.level)
             trackers.append(read)
         else:
@@ -369,7 +369,7 @@ def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
     return pose(R_camera_base, -R_camera_base @ eye)
 
 
-def _read(folder: Path) -> tuple[Path, Document]:
+def _session_document(folder: Path) -> tuple[Path, Document]:
     """Folder and session.yaml of a session, its format version checked before its content."""
     if folder.name == SESSION_FILE_NAME and folder.is_file():
         folder = folder.parent
@@ -403,7 +403,7 @@ def _read(folder: Path) -> tuple[Path, Document]:
     return folder, document
 
 
-def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
+def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Path:
     """Path of a regular file named in session.yaml, relative to the session's folder; raises
     InputError.
     """
@@ -434,7 +434,7 @@ def _machine(
     """
     looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
     if looks_like_path or len(source) > LONGEST_NAME or (folder / source).is_file():
-        path = _existing(folder, document, source, ("mechanism",))
+        path = _regular_file(folder, document, source, ("mechanism",))
         return load_mechanism(path, label=source, model=model), path
     return load_mechanism(source, label=document.where("mechanism"), model=model), source
 
@@ -466,7 +466,7 @@ def _links(
     out: list[LinkSet] = []
     for code, node in schema.links().items():
         kind = kinds_of(LinkKind)[code]
-        path = _existing(folder, document, kind.table(node), (kind.key, "file"))
+        path = _regular_file(folder, document, kind.table(node), (kind.key, "file"))
         out.append(kind.read(node, path, names, machine))
     return tuple(out)
 
@@ -488,7 +488,7 @@ def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | 
         _check_base_board(document, schema, users)
     written = document.data["board"]
     keys: Keys = ("board",) if isinstance(written, str) else ("board", "file")
-    return _existing(folder, document, schema.board.file, keys)
+    return _regular_file(folder, document, schema.board.file, keys)
 
 
 def _check_base_board(document: Document, schema: SessionDocument, users: list[str]) -> None:
@@ -520,7 +520,7 @@ def _workspace(document: Document, schema: SessionDocument) -> Region | None:
         raise error.located(document.where("workspace")) from None
 
 
-def _of_little_use(document: Document, schema: SessionDocument) -> list[Finding]:
+def _unused_board(document: Document, schema: SessionDocument) -> list[Finding]:
     """Warnings about a board that has no effect: no station observes it, or it is on the base and
     only one fixed station does.
     """
@@ -557,7 +557,7 @@ def _stations(
     else:
         camera_file = station.camera
         _, inside = camera_path(folder / camera_file)
-        _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
+        _regular_file(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
     endings = {image.path.suffix.lower() for image in images}
     usual: Response = "srgb" if endings and endings <= JPEG_FILE_ENDINGS else "linear"
@@ -612,7 +612,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
 
 
-def _turned(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
+def _rotated_images(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
     """Warnings about images rotated by 90 degrees after they were taken; raises InputError for an
     image whose size differs from its camera's.
     """

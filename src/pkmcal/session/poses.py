@@ -143,7 +143,7 @@ def read_poses(
     column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
     zeros = np.zeros(len(rows))
     t = np.stack([column.get(axis, zeros) for axis in POINT_COLUMNS], axis=-1)
-    T = pose(_turn(table, column), t)
+    T = pose(_rotations(table, column), t)
     if level and not kind.levels:
         raise InputError(
             "only of heights can be said that the bed is level",
@@ -173,7 +173,7 @@ def _kind(table: CsvTable) -> type[TargetKind]:
     )
 
 
-def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
+def _rotations(table: CsvTable, column: dict[str, Array]) -> Array:
     """Rotations (N, 3, 3) of the rows; identity for points and heights."""
     if "qw" in column:
         q = np.stack([column[name] for name in QUATERNION_COLUMNS], axis=-1)

@@ -150,10 +150,10 @@ def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
             least = float(np.fmax.reduce(low - slack - readings.min(axis=0)))
             most = float(np.fmin.reduce(high + slack - readings.max(axis=0)))
             if least <= most:
-                raise _shifted(table, ranges, which, (least, most), unit)
+                raise _shift_error(table, ranges, which, (least, most), unit)
 
 
-def _shifted(
+def _shift_error(
     table: CsvTable, ranges: Array, which: Booleans, shift: tuple[float, float], unit: str
 ) -> InputError:
     """Error about joints ``which`` (m,) whose readings are in range after a shift (least, most)."""

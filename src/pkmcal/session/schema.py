@@ -35,7 +35,7 @@ class PoseDocument(Schema):
     up: Vector = (0.0, 0.0, 1.0)
 
 
-def _words(value: Any) -> tuple[str, ...]:
+def _observe_words(value: Any) -> tuple[str, ...]:
     """Normalise ``observe``: one word or a list, as a tuple in the order of OBSERVE_WORDS."""
     words: list[Any] = value if isinstance(value, list) else [value]
     if not words:
@@ -57,7 +57,7 @@ class StationDocument(Schema):
 
     camera: str = Field(description="the camera's file, for example cameras/front.yaml, or exif")
     images: str = Field(description="a pattern such as images/front/{configuration}.png")
-    observe: Annotated[tuple[str, ...], BeforeValidator(_words)] = Field(
+    observe: Annotated[tuple[str, ...], BeforeValidator(_observe_words)] = Field(
         description="legs, board, or [legs, board]"
     )
     pose: PoseDocument | None = None
@@ -94,7 +94,7 @@ class TrackerStationDocument(Schema):
     tracker: TrackerDocument
 
 
-def _station(value: Any) -> str:
+def _station_tag(value: Any) -> str:
     """Tag of an entry of ``stations``: with a tracker or with a camera."""
     tracker = "tracker" in value if isinstance(value, dict) else hasattr(value, "tracker")
     return "with a tracker" if tracker else "with a camera"
@@ -103,7 +103,7 @@ def _station(value: Any) -> str:
 AnyStation = Annotated[
     Annotated[StationDocument, Tag("with a camera")]
     | Annotated[TrackerStationDocument, Tag("with a tracker")],
-    Discriminator(_station),
+    Discriminator(_station_tag),
 ]
 
 
@@ -114,7 +114,7 @@ class BoardDocument(Schema):
     fixed_to: BoardBody = "platform"
 
 
-def _board(value: Any) -> Any:
+def _board_entry(value: Any) -> Any:
     """Normalise ``board``: a file name alone means a board on the platform."""
     return {"file": value} if isinstance(value, str) else value
 
@@ -141,7 +141,7 @@ class SessionDocument(Schema):
         max_length=MOST_STATIONS,
         description="one entry a camera, or a tracker, in one place",
     )
-    board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
+    board: Annotated[BoardDocument | None, BeforeValidator(_board_entry)] = None
     paths: dict[str, list[str]] | None = Field(
         default=None, description="straight paths by configurations, paths: {line: [c01, c02, c03]}"
     )

@@ -144,7 +144,7 @@ class Crank(BaseCarrier):
         """A, and its derivative: the arm's length times its direction of motion."""
         frame = _frame(parameters)
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, ahead = _turned(frame, parameters, readings)
+        out, ahead = _arm_directions(frame, parameters, readings)
         value = parameters[..., :3] + along * frame.v + radial * frame.e0 + arm * out
         return value, arm * ahead
 
@@ -154,7 +154,7 @@ class Crank(BaseCarrier):
         frame = _frame(parameters)
         v, e0, side = frame.v, frame.e0, frame.side
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, ahead = _turned(frame, parameters, readings)
+        out, ahead = _arm_directions(frame, parameters, readings)
         by_reading = arm * ahead
         # A change of v rotates the frame by the twist about v, and tilts e0 and side with v.
         swing = radial * side + by_reading
@@ -196,7 +196,9 @@ class Crank(BaseCarrier):
         them.
         """
         del f
-        out = np.array(np.broadcast_to(parameters, (*_lead(parameters, e), parameters.shape[-1])))
+        out = np.array(
+            np.broadcast_to(parameters, (*_leading_shape(parameters, e), parameters.shape[-1]))
+        )
         out[..., :3] = moved_point(parameters[..., :3], e)
         out[..., 3:6] = moved_direction(parameters[..., 3:6], e)
         carried, now = moved_direction(_frame(parameters).e0, e), _frame(out)
@@ -223,7 +225,7 @@ class Crank(BaseCarrier):
         before, after = _frame(parameters), _frame(Crank.reframed(parameters, e, f))
         rot = e[..., :3, :3]
         n = parameters.shape[-1]
-        shape = (*_lead(parameters, e), n, n)
+        shape = (*_leading_shape(parameters, e), n, n)
         out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), shape))
         twist = before.twist[..., None, :] - after.twist[..., None, :] @ rot
         out[..., 7:8, 3:6] = _by_axis(twist, before.v, parameters)
@@ -238,7 +240,7 @@ class Crank(BaseCarrier):
         """Arm at reading zero, turning about v; its foot is ``center + along v + radial e0``."""
         frame = _frame(parameters)
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, _ = _turned(frame, parameters, np.zeros(parameters.shape[:-1]))
+        out, _ = _arm_directions(frame, parameters, np.zeros(parameters.shape[:-1]))
         foot = parameters[..., :3] + along * frame.v + radial * frame.e0
         return Chain("turn", foot, frame.v, arm * out)
 
@@ -258,7 +260,7 @@ def _frame(parameters: Array) -> _Frame:
     return _Frame(v, e0, side, twist, n, drawn)
 
 
-def _turned(frame: _Frame, parameters: Array, readings: Array) -> tuple[Array, Array]:
+def _arm_directions(frame: _Frame, parameters: Array, readings: Array) -> tuple[Array, Array]:
     """Arm's direction, and the direction in which its end moves, (..., 3) each."""
     turn = readings[..., None] + parameters[..., 7, None]
     c, s = np.cos(turn), np.sin(turn)
@@ -270,7 +272,7 @@ def _outer(a: Array, b: Array) -> Array:
     return a[..., :, None] * b[..., None, :]
 
 
-def _lead(parameters: Array, transform: Array) -> tuple[int, ...]:
+def _leading_shape(parameters: Array, transform: Array) -> tuple[int, ...]:
     """Leading shape of parameters and transforms, broadcast."""
     return np.broadcast_shapes(parameters.shape[:-1], transform.shape[:-2])
 
