@@ -188,18 +188,21 @@ def calibrate_camera(
     check_enough(used, len(detections))
     image_size = used[0].image_size
     views = views_of(used, board)
+    # Choose the model and its coefficients on a subset of the corners.
     pool = camera_candidates(thinned(views), image_size, tuple(DISTORTION_CANDIDATES))
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)
     chosen = best_of(mine)
     model_warnings = check_model(model, chosen, best_of(pool))
+    # Fit all corners, with the covariance scaled by the disagreement of the views.
     fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
     spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views)
+    # Test on held-out views.
     tested = held_out(fit, views, board.lines)
     check_explained(tested.rms, fit.camera)
     inliers = (fit.weight >= 0.5) & views.visible

@@ -132,6 +132,7 @@ def _common_step(differences: Array) -> int | None:
 
 def _neighbours(markers: Markers) -> _Neighbours | None:
     """Neighbours in one image; None if there are none."""
+    # Markers that are large enough.
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
     large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER_SIDE
@@ -140,6 +141,7 @@ def _neighbours(markers: Markers) -> _Neighbours | None:
         return None
     # The detector's corners are centres of the outermost dark pixels: enlarge the axes.
     bigger = (wide[large].mean(axis=1) + 1) / wide[large].mean(axis=1)
+    # Axes of each marker, and offsets to all others in units of its sides, (n, n, 2).
     right = (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3]) / 2
     below = (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1]) / 2
     axes = np.stack([right, below], axis=-1) * bigger[:, None, None]
@@ -147,6 +149,7 @@ def _neighbours(markers: Markers) -> _Neighbours | None:
     off = np.linalg.solve(axes[:, None], (middle[None] - middle[:, None])[..., None])[..., 0]
     # Average of the steps i to j and, reversed, j to i: first-order perspective cancels.
     off = (off - off.swapaxes(0, 1)) / 2
+    # Steps on the lattice, in pitches.
     distance = np.linalg.norm(off, axis=-1)
     np.fill_diagonal(distance, np.inf)
     nearest = distance.min(axis=1)

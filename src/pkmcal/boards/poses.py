@@ -395,10 +395,12 @@ def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array,
     mean.
     """
     views, poses = board_views.views, board_views.poses
+    # Means (N, 2) of the corners over the images.
     used = agreed[:, None] & (poses.weight > 0.5)
     count = used.sum(axis=0)
     pixels = np.where(used[..., None], views.pixels, 0.0).sum(axis=0)
     pixels = np.where(count[:, None] > 0, pixels / np.maximum(count, 1)[:, None], np.nan)
+    # Their noise, from the scatter over the images.
     off = np.where(used[..., None], views.pixels - pixels, 0.0)
     freedom = 2 * int(np.sum(np.maximum(count - 1, 0)))
     single = np.sqrt(np.where(used, views.sigma**2, 0.0).sum(axis=0) / np.maximum(count, 1))
@@ -423,6 +425,7 @@ def _common_motion_covariance(
     sigma2 = np.mean(views.views.sigma[views.views.visible] ** 2) + views.poses.noise**2
     # Covariance of each pose with only the part of the noise that differs between images.
     each = views.poses.covariance[agreed] * (np.mean(np.square(noise)) / sigma2)
+    # Excess scatter of the poses over this noise.
     off = pose_difference(views.poses.T_camera_board[agreed], T_camera_board)
     chi2 = np.einsum("fi,fij,fj->", off, np.linalg.inv(each), off)
     spread = chi2 / (6 * (count - 1))
@@ -454,6 +457,7 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     covariance : (N, 6, 6), left perturbation.
     common : share of the covariance that the repeats have in common.
     """
+    # Reject repeats far from the median of their configuration.
     groups = groups_of(configuration)
     delta = pose_difference(T, T[groups.first[groups.member]])
     off = _deviation(delta - groups.median(delta)[groups.member], covariance)
@@ -461,9 +465,11 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     repeated = groups.count[groups.member] > 2
     usual = float(np.median(off[repeated])) if repeated.any() else 1.0
     used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~repeated
+    # Mean of the rest.
     groups_used = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
     mean, stated = groups_used.mean(delta), groups_used.mean(covariance_used)
+    # The part of the covariance that averages out, scaled up if the repeats scatter by more.
     independent = (1 - common) * stated
     residual = delta - mean[groups_used.member]
     freedom = float(np.sum(groups_used.count - 1))

@@ -87,6 +87,7 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
         if np.isfinite(score):
             scored.append((score, camera, poses))
     scored.sort(key=lambda item: item[0])
+    # Refine the best few.
     best: CameraFit | None = None
     for _, camera, poses in scored[:CAMERA_STARTS_REFINED]:
         settled = settled_poses(camera, views, poses)
@@ -143,6 +144,7 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
     part_of = np.arange(count) % min(HELD_OUT_PARTS, count)
     for part in range(part_of.max() + 1):
         out = np.flatnonzero(part_of == part)
+        # Camera from the other views; poses of this part fitted to it.
         camera = refit(fit, views, np.flatnonzero(part_of != part)).camera
         mine = views.take(out)
         scale = np.where(inliers[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
@@ -181,6 +183,7 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
             continue
         s, turn = rays[ids], by_pixel[ids]
         weight, normal = np.ones(len(ids)), np.zeros(3)
+        # The normal of the plane is the least eigenvector of the weighted rays.
         for _ in range(3):
             normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
             slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)

@@ -64,6 +64,7 @@ def undistort(target: Array, k: Array) -> Array:
     xy = _undistort_radially(target, k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
+            # Newton step with the inverse of the 2x2 derivative written out.
             value, slope = distort(xy, k)
             error = value - target
             det = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]

@@ -149,6 +149,7 @@ def _elimination_step(jac: Array, value: Array, damping: Array) -> Array:
             np.einsum("en,en->n", j[:, k], r, out=row[-1])
             row[0] *= 1 + damping
             row[0] += 1e-300
+        # Forward elimination.
         for k, row in enumerate(a):
             row[1:] /= row[0]
             for i in range(k + 1, d):
@@ -156,6 +157,7 @@ def _elimination_step(jac: Array, value: Array, damping: Array) -> Array:
                 share = np.multiply(row[i - k], row[0], out=part[-1])
                 np.multiply(row[i - k :], share, out=part[: d - i + 1])
                 a[i] -= part[: d - i + 1]
+        # Back substitution.
         x = np.empty((d, jac.shape[0]))
         for k in range(d - 1, -1, -1):
             x[k] = a[k][-1]

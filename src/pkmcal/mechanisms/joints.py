@@ -120,11 +120,13 @@ def angle_rows(layout: AngleLayout, theta: Array, rot: Array, line: Array) -> An
     rot : (..., 3, 3) rotation of the platform.
     line : (..., E, 3) B - A of each equation's leg, m.
     """
+    # Unit axes in the base frame, and the direction w to which the line is orthogonal.
     first, second = layout.on_base[:, None], layout.on_platform[:, None]
     v, v_size = _unit(theta[..., layout.base], first)
     own, own_size = _unit(theta[..., layout.platform], second)
     turned = (rot[..., None, :, :] @ own[..., None])[..., 0]
     w = np.where(first & second, cross(v, turned), np.where(first, v, turned))
+    # Derivatives of line . w by the unit axes, in the base frame.
     by_v = np.where(second, cross(turned, line), line)
     by_turned = np.where(first, cross(line, v), line)
     by_own = (rot.mT[..., None, :, :] @ by_turned[..., None])[..., 0]

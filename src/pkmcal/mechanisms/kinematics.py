@@ -273,11 +273,13 @@ def inverse_result(
     :func:`readings_at_poses`.
     """
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
+    # Each leg on its own, with hinges that keep the bars' directions.
     internal = _initial_internal(layout, theta, poses, shape)
     legs = _leg_readings(layout, theta, poses, internal, near)
     if not layout.shares_motors:
         driven = np.flatnonzero(layout.actuated >= 0)
         return legs[..., driven[np.argsort(layout.actuated[driven], kind="stable")]], internal
+    # Several rods for a motor: least squares from the mean over its rods.
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
     readings = legs @ (columns / columns.sum(axis=1, keepdims=True)).T
     return _least_squares_readings(layout, theta, poses, readings, internal)
@@ -454,6 +456,7 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
         beside = (0.0,) if layout.free[2] else (0.0, -reach / 3, reach / 3)
         places = [shift + np.array([0.0, y, 0.0]) for y in beside]
         return np.stack([pose(rotation(np.array([0, 0, a])), p) for a in angles for p in places])
+    # Spatial motion: above and below the base.
     flat = float(np.linalg.norm((b + shift - a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
     # Cranks whose ends are below their axes on average carry a platform below the base.
@@ -498,11 +501,13 @@ def on_manifold(
     for _ in range(steps if free else 0):
         own = every if every.ndim == 1 else every[remaining]
         c = closure_at(layout, own, current[remaining])
+        # Violated constraints and their derivatives by the pose.
         value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
         out_of_reach[remaining] = np.where(
             np.isfinite(c.readings).all(axis=-1), 0, out_of_reach[remaining] + 1
         )
+        # Continue with poses that are neither converged nor out of reach.
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
         more &= out_of_reach[remaining] < STEPS_OUT_OF_REACH
         remaining = remaining[more]

@@ -222,7 +222,9 @@ class LimbLayout:
         parts = [self.a_index, self.b_index, rod]
         if self.scales_move_rods:
             parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
+        # Rows of lengths: A, B, rod and the rod's scale.
         lengths = np.concatenate(parts, axis=1)[keep]
+        # Rows of axes: A, B and the two axes.
         angles = np.concatenate(
             [
                 self.a_index[leg],

@@ -169,9 +169,11 @@ class ParameterTable:
         """Matrix M of :meth:`free_matrix`, cached."""
         owner, sign = self._owners()
         fixed = [self.index(name) for name in self.fixed]
+        # One column for each group of tied parameters that is not fixed, axes apart.
         still = {owner[k] for k in fixed if self.kinds[k] != "axis"}
         plain = [k for k in np.unique(owner) if k not in still and self.kinds[k] != "axis"]
         matrix = (owner[:, None] == np.array(plain, dtype=int)[None, :]) * sign[:, None]
+        # Up to two columns for each group of tied axes.
         tangents = [
             self._tangent(np.flatnonzero(owner == axis[0]), sign, fixed)
             for axis in self.axes
@@ -194,6 +196,7 @@ class ParameterTable:
                 raise InputError(
                     what="a parameter is tied to its own opposite", found=", ".join(group)
                 )
+            # Merge the groups into the first one's, with signs relative to it.
             first = min(turn)
             for root, flip in turn.items():
                 joined = owner == root
@@ -206,6 +209,7 @@ class ParameterTable:
 
         Fixed components leave only the rotation orthogonal to them.
         """
+        # Orthogonal complement of the axis and the fixed components.
         axis = self.drawing[first[0] : first[0] + 3]
         held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
         span = np.array([axis, *held])

@@ -79,6 +79,7 @@ def _shared_motor_jacobian(c: Closure) -> Array:
     all rows for the readings' and hinges' rates, as in inverse kinematics.
     """
     layout, m = c.layout, c.layout.n_readings
+    # Scale readings and hinges to unit displacements, so that the rank is without units.
     legs = np.flatnonzero(layout.closing)
     by_motor = layout.actuated[legs][:, None] == np.arange(m)
     largest = np.where(by_motor, _reading_scale(layout, c.base)[..., legs, None], 0.0).max(axis=-2)
@@ -86,6 +87,7 @@ def _shared_motor_jacobian(c: Closure) -> Array:
     shape = np.broadcast_shapes(largest.shape[:-1], hinges.shape[:-1])
     parts = (1 / largest, hinges)
     scale = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
+    # Solve drives rates + hinges rates = -by_pose twist by least squares.
     drives = by_motors(layout, c.by_reading)
     jac = np.concatenate([drives, c.rows.by_internal], axis=-1) * scale[..., None, :]
     rates = -_pseudo_inverse(jac) @ c.rows.by_pose
@@ -149,6 +151,7 @@ def amplification(
     if p_platform is not None:
         arm = (poses[..., :3, :3] @ p_platform[:, None])[..., 0]
         moving = moving - skew(arm) @ turning
+    # Singular values of J for speed, rotation, and both with rotations scaled to speeds.
     scale = platform_radius(layout, theta)[..., None, None]
     scaled = _singular_values(np.concatenate([scale * turning, moving], axis=-2))
     speeds, turns = _singular_values(moving), _singular_values(turning)

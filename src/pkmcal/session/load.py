@@ -263,6 +263,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         A file is missing or invalid; the error names file, line and field.
 
     """
+    # Session file and machine.
     folder, document = _session_document(Path(folder))
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
@@ -274,6 +275,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             next_step="Where readings alone are calibrated from, spread the poses over all that the"
             " machine reaches",
         )
+    # Joint readings.
     if measured or (folder / schema.joints.file).exists():
         path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
@@ -291,6 +293,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     else:
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
         table, findings = CsvTable(schema.joints.file, columns, (), none, ()), list[Finding]()
+    # Board, camera stations and trackers.
     board = _board(folder, document, schema)
     findings += _unused_board(document, schema)
     stations = tuple(
@@ -310,6 +313,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         else:
             trackers.append(PoseTable.to_come(name, tracker.poses, *noise))
     links = _links(folder, document, schema, table.names, machine) if measured else ()
+    # Checks across files.
     if measured:
         _check_paths(document, schema, table)
     _check_distinct(document, stations)

@@ -227,8 +227,10 @@ class Crank(BaseCarrier):
         n = parameters.shape[-1]
         shape = (*_leading_shape(parameters, e), n, n)
         out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), shape))
+        # The angle takes up the change of the twist.
         twist = before.twist[..., None, :] - after.twist[..., None, :] @ rot
         out[..., 7:8, 3:6] = _by_axis(twist, before.v, parameters)
+        # The centre takes up the change of radial e0.
         lag = rot @ _turn_of_e0(before) - _turn_of_e0(after) @ rot
         lag = parameters[..., 9, None, None] * lag
         out[..., :3, 3:6] = _by_axis(lag, before.v, parameters)
