@@ -56,6 +56,7 @@ _HOMES = {
     "simulate": "pkmcal.api.simulate",
     "study": "pkmcal.studies.findings",
 }
+"""Modules of the public names."""
 
 
 def __getattr__(name: str) -> Any:

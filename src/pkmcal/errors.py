@@ -104,6 +104,7 @@ class PkmcalError(Exception):
         }
 
     def _fields(self) -> dict[str, Any]:
+        """Arguments of the constructor by name."""
         return {
             "what": self.what,
             "where": self.where,

@@ -47,6 +47,7 @@ class Range:
 
 
 def _whole(least: int, most: int) -> Range:
+    """Range of integers."""
     return Range(least, most, whole=True)
 
 

@@ -11,7 +11,9 @@ DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
 """Factor and name of the unit shown in reports, by the SI unit used inside."""
 
 LARGEST_DECIMALS = 6
+"""Most decimals of a number."""
 LEG_PARAMETER_NAME = re.compile(r"legs\[(\d+)\]\.(.+)")
+"""Name of a leg's parameter: the leg's number and the rest of the path."""
 
 
 def install_step(extra: str) -> str:

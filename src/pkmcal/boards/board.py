@@ -135,6 +135,7 @@ class GridSchema(_Dictionary):
 BOARD_SCHEMAS: dict[str, type[Schema]] = {
     "charuco": CharucoSchema, "chessboard": ChessboardSchema, "aruco_grid": GridSchema,
 }  # fmt: skip
+"""Schemas of board files by ``type``."""
 
 
 @dataclass(frozen=True)

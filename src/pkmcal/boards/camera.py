@@ -39,7 +39,9 @@ from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
 LEAST_VIEWS = 3
+"""Fewest images that show the board."""
 GOOD_VIEWS = 6
+"""Number of images below which a warning is given."""
 UNFIT_MODEL_RATIO = 3.0
 """Ratio of held-out errors above which a model named by the user is refused; a smaller significant
 ratio gives a warning."""
@@ -57,7 +59,9 @@ FACING_CAMERA_TILT = 15.0
 """Tilt of a board in degrees below which views all have the same information on the focal length,
 which is little."""
 COVERAGE_CELLS = (8, 6)
+"""Columns and rows of cells by which the coverage of the image is counted."""
 LEAST_COVERED_SHARE = 0.5
+"""Share of cells with corners below which a warning is given."""
 STRONG_INTRINSICS_CORRELATION = 0.95
 """Correlation above which two intrinsics are reported as hardly separable."""
 

@@ -32,7 +32,9 @@ FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12,
 """Range of starting values for the pixels per radian at the image's centre, as a share of its
 width."""
 FOCALS_TRIED = 16
+"""Focal lengths of the grid, in geometric steps over the range."""
 XIS_TRIED = (0.0, 0.5, 1.0, 1.5, 2.2)
+"""Values of xi of the grid."""
 CAMERA_STARTS_REFINED = 3
 """Number of best starting values that are refined."""
 CAMERA_START_ROUNDS = 3

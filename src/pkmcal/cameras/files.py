@@ -149,6 +149,7 @@ CAMERA_NUMBER_ROUNDING = 1e-12
 """Relative difference allowed between a number before writing and after reading; decimal text with
 sixteen digits stays below."""
 _ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+"""Camera models by ROS's distortion model."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
@@ -156,6 +157,7 @@ _KALIBR = {
     ("omni", "radtan"): "unified",
     ("omni", "none"): "unified",
 }
+"""Camera models by Kalibr's camera and distortion model."""
 _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "matrix": ("camera_matrix", "cameraMatrix", "K", "Camera_Matrix"),
     "distortion": ("distortion_coefficients", "distCoeffs", "D", "Distortion_Coefficients"),
@@ -163,6 +165,7 @@ _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "height": ("image_height", "image_Height", "height"),
     "xi": ("xi", "Xi"),
 }
+"""Names under which OpenCV's programs write each quantity."""
 
 
 def foreign_text(camera: Camera, path: Path | str, form: str) -> str:

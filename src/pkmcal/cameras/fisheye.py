@@ -16,7 +16,9 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
 
 _POWERS = np.array([3, 5, 7, 9])
+"""Powers of the angle in the terms of k1 to k4."""
 _NEWTON_STEPS = 30
+"""Most Newton steps for a viewing ray."""
 _TABLE = 513
 """Size of the table of angles from which Newton's method starts; their spacing is at most a third
 of a degree."""

@@ -15,6 +15,7 @@ from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.geometry.rigid import dot, of_components
 
 _NEWTON_STEPS = 20
+"""Most Newton steps for an undistorted point."""
 _TABLE = 513
 """Size of the table of radii from which Newton's method starts; their spacing is a thousandth of
 the image."""

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 
 Response = Literal["linear", "srgb"]
+"""Encodings of light in grey levels."""
 OTHER_RESPONSE: dict[Response, Response] = {"linear": "srgb", "srgb": "linear"}
 JPEG_FILE_ENDINGS = frozenset({".jpg", ".jpeg"})
 """Suffixes of files whose standards (JFIF 1.02, CIPA DC-008) specify sRGB encoding."""

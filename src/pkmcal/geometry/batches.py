@@ -17,6 +17,7 @@ POSES_WORTH_BATCH_LAST = 16
 NUMBERS_WORTH_CALLS = 100
 """Array size below which call overhead exceeds the arithmetic."""
 CYCLIC_PAIRS = ((1, 2), (2, 0), (0, 1))
+"""Indices (j, k) of the factors in component i of a cross product, for i = 0, 1, 2."""
 CROSS_PRODUCT_SIGNS = -skew(np.eye(3))
 """Levi-Civita symbol: ``(a x b)_i`` is the sum of ``CROSS_PRODUCT_SIGNS[i, j, k] a_j b_k``."""
 

@@ -84,6 +84,7 @@ Rod = Annotated[
 OFFSET_KIND = ParameterKind("offset", "m", "offset", part="zero")
 CONSTANT_LENGTH_KIND = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
 READING_SCALE_KIND = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
+"""Parameters of a leg's rod and reading."""
 EXACT_TURNS, LEAD_TOLERANCE = 0.0, 0.0005
 """Default prior sigmas of a reading's scale: of readings in rad, zero because encoders count whole
 turns and gears have whole teeth; of readings in m, that of a ground screw or a tape."""

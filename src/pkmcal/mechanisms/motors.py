@@ -105,6 +105,7 @@ def middles(document: MechanismDocument) -> Array:
 
 
 Group = tuple[str, ...]
+"""Names of parameters that are tied."""
 
 
 def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:

@@ -195,6 +195,7 @@ class Effort:
 
 
 FINE_EFFORT = Effort()
+"""Default resolution."""
 ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
 """Resolution for a bounding box of the workspace."""
 PATH_POSES_AHEAD = 8

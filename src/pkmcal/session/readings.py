@@ -38,6 +38,7 @@ _UNITS = {
         "Multiply them by pi/180, or head them motor1 [deg] and so on",
     ),
 }
+"""By SI unit: factor from the likely wrong unit, its name, the right one's name, and the remedy."""
 
 
 def check_readings(

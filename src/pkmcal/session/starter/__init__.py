@@ -22,6 +22,7 @@ from pkmcal.outcome.finding import Finding, doubtful
 
 ObservedChoice = Literal["legs", "board", "both", "readings"]
 OBSERVED_CHOICES: tuple[ObservedChoice, ...] = ("legs", "board", "both", "readings")
+"""Observations that a starter session can have."""
 SESSION_TEMPLATE_FOLDER = Path(__file__).parent / "session"
 TO_FILL = {
     "mechanism.yaml": "write the drawing of your machine into it",
