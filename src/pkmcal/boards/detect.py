@@ -25,10 +25,10 @@ from pkmcal.boards.layout import LEAST_MARKER_SIDE, another_grid, marker_layout
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
 
-BOARD_PHOTOGRAPHS_EXAMINED = 3
+BOARD_IMAGES_EXAMINED = 3
 """Images examined for another board; one good one is enough."""
 SQUARE_MISCOUNTS_TRIED = 2
 """Largest miscount of a chessboard's columns or rows that is tried."""
@@ -81,7 +81,7 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
     """Common size of the images; raises InputError with the names of those that differ."""
     if not files:
         raise InputError("no photographs were named", expected="photographs of the board")
-    sizes = {path: photograph_header(path) for path in files}
+    sizes = {path: image_header(path) for path in files}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     usual = max(counts, key=lambda size: counts[size])
     odd = [path for path, size in sizes.items() if size != usual]
@@ -107,8 +107,8 @@ def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: 
     size = detections[0].image_size
     other: str | None = None
     if board.type == "aruco_grid":
-        _check_grid([path for path, _ in detected[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
-    for path, detection in detected[:BOARD_PHOTOGRAPHS_EXAMINED]:
+        _check_grid([path for path, _ in detected[:BOARD_IMAGES_EXAMINED]], size, board)
+    for path, detection in detected[:BOARD_IMAGES_EXAMINED]:
         # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
@@ -122,7 +122,7 @@ def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: 
             break
     if other is not None:
         raise _other_board_error(with_board[0], other, board)
-    for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
+    for path in missed[:BOARD_IMAGES_EXAMINED]:
         other = other_board(decode(path, size, path.name), board, part=not with_board)
         if other is not None and not with_board:
             raise _other_board_error(path, other, board)

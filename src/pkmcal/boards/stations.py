@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session
 
-SLOW_SEARCH_PHOTOGRAPHS = 4
+SLOW_SEARCH_IMAGES = 4
 """Images in which a still chessboard is searched by the slow methods."""
 OTHER_BOARD_TRIALS = 2
 """Images examined for another board."""
@@ -65,16 +65,16 @@ def station_board(
 ) -> StationBoard:
     """Board in the images of one fixed station."""
     station = session.stations[number]
-    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.photographs]
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.success for detection in detections)
     _check_another(board, station.name, [p.path for p in station.photographs], detections)
     # Each image of a moving board is a new measurement; of a still one, a few are enough.
-    most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
+    most = len(images) if moves else SLOW_SEARCH_IMAGES if nowhere else 0
     detections = detect_again(images, board, detections, most)
     _check_visible(station.name, board, detections)
-    rows = np.array([photo.configuration for photo in station.photographs])
+    rows = np.array([image.configuration for image in station.photographs])
     views = board_views(number, station.camera, rows, board, detections)
     stood = None if moves else standing_board(views)
     if not moves and stood is None:
@@ -105,11 +105,11 @@ def _board_by_hand(
 ) -> tuple[Detection, StationBoard | None]:
     """Detection in a hand-held image, and the board's pose if it is usable."""
     station = session.stations[number]
-    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.photographs]
     detections = detect_again(images, board, detect_in(images, board, labels), len(images))
     if not detections[0].success:
         return detections[0], None
-    rows = np.array([photo.configuration for photo in station.photographs])
+    rows = np.array([image.configuration for image in station.photographs])
     views = board_views(number, station.camera, rows, board, detections)
     if session.board_body == "platform":
         return detections[0], StationBoard(views, None)

@@ -12,7 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import read_exif
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 
 EXIF_CAMERA_WORD = "exif"
 """Word in session.yaml in place of a camera's file."""
@@ -44,7 +44,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
     labels: dict[tuple[float, tuple[int, int]], str] = {}
     sizes: list[tuple[int, int]] = []
     for path, label in images:
-        width, height = photograph_header(path, label)
+        width, height = image_header(path, label)
         with path.open("rb") as stream:
             focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
         if focal is None:

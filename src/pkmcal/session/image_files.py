@@ -39,7 +39,7 @@ class Photograph:
     path: Path
 
 
-def find_photographs(
+def find_images(
     folder: Path, pattern: str, names: Sequence[str], where: str, *, needed: bool = True
 ) -> tuple[Photograph, ...]:
     """Find the image files of a pattern such as ``images/front/{configuration}.png``.
@@ -89,10 +89,10 @@ def find_photographs(
         images.append(Photograph(row, fields.get("repeat"), folder / name))
     if unknown:
         raise _unknown_configuration(unknown, parts, names, where)
-    return tuple(sorted(images, key=lambda photo: (photo.configuration, photo.repeat or "")))
+    return tuple(sorted(images, key=lambda image: (image.configuration, image.repeat or "")))
 
 
-def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
+def image_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
     """Size (width, height) in pixels of an image as stored, before any EXIF rotation.
 
     Reads only the header of PNG, JPEG, TIFF, BMP and PGM files.

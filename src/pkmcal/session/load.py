@@ -49,7 +49,7 @@ from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanis
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
-from pkmcal.session.image_files import Photograph, find_photographs, label_of, photograph_header
+from pkmcal.session.image_files import Photograph, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
@@ -552,7 +552,7 @@ def _stations(
     """Stations of an entry: one, or one for each image of a hand-held camera."""
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
-    images = find_photographs(folder, station.images, names, where, needed=measured)
+    images = find_images(folder, station.images, names, where, needed=measured)
     from_exif = station.camera == EXIF_CAMERA_WORD
     if from_exif:
         label = document.where(*keys, "camera")
@@ -623,7 +623,7 @@ def _rotated_images(folder: Path, stations: tuple[Station, ...]) -> list[Finding
     turned: list[str] = []
     for station, image in ((s, image) for s in stations for image in s.photographs):
         label, wanted = label_of(folder, image.path), tuple(station.camera.image_size)
-        width, height = size = photograph_header(image.path, label)
+        width, height = size = image_header(image.path, label)
         if wanted not in (size, (height, width)):
             raise InputError(
                 "the photograph has another size than its camera",
@@ -735,7 +735,7 @@ def _unmeasured(
     """Warning about configurations without measurements; raises InputError if fewer than two have
     any.
     """
-    measured = {photo.configuration for station in stations for photo in station.photographs}
+    measured = {image.configuration for station in stations for image in station.photographs}
     measured |= {int(k) for tracker in trackers for k in tracker.configuration}
     measured |= {int(k) for one in links for k in one.configuration.ravel()}
     if len(measured) < 2:
