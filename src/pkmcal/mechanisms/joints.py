@@ -25,7 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
-from pkmcal.mechanisms.document import Leg, MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 
 JOINT_AXIS_KINDS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
@@ -36,21 +36,17 @@ def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
     """Angle equations of a machine, (leg from 0, kind), in the order of the legs."""
     if document.motion != "spatial":
         return ()
-    return tuple((j, e) for j, leg in enumerate(document.legs) for e in _equations(leg))
-
-
-def _equations(leg: Leg) -> list[Equation]:
-    """Angle equations of a leg."""
-    base = base_carriers()[leg.base.joint].axis_role(leg.base)
-    platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
-    kinds: list[Equation] = []
-    if base == "square":
-        kinds.append("revolute base")
-    if platform == "square":
-        kinds.append("revolute platform")
-    if base == platform == "twist":
-        kinds.append("torsion")
-    return kinds
+    out: list[tuple[int, Equation]] = []
+    for j, leg in enumerate(document.legs):
+        base = base_carriers()[leg.base.joint].axis_role(leg.base)
+        platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
+        if base == "square":
+            out.append((j, "revolute base"))
+        if platform == "square":
+            out.append((j, "revolute platform"))
+        if base == platform == "twist":
+            out.append((j, "torsion"))
+    return tuple(out)
 
 
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:

@@ -278,8 +278,8 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
     base_axis, platform_axis = (_axis_index(document, s, positions) for s in ("base", "platform"))
     return LimbLayout(
         n_legs=len(legs),
-        base=_groups(document, "base", carriers, positions),
-        platform=_groups(document, "platform", platform_carriers(), positions),
+        base=_carrier_groups(document, "base", carriers, positions),
+        platform=_carrier_groups(document, "platform", platform_carriers(), positions),
         rod=np.array(
             [
                 positions.get(f"{rod}.offset", positions.get(f"{rod}.constant", -1))
@@ -289,7 +289,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         closing=closing,
         actuated=motor_columns(document),
         middle=middles(document),
-        internal=_internal(document),
+        internal=_internal_columns(document),
         rod_reads=reads,
         scale=np.array(
             [positions.get(f"legs[{j + 1}].scale", len(positions)) for j in range(len(legs))]
@@ -298,7 +298,10 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         base_axis=base_axis,
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
-        turning=(_turning(document, "base", positions), _turning(document, "platform", positions)),
+        turning=(
+            _direction_index(document, "base", positions),
+            _direction_index(document, "platform", positions),
+        ),
         radius=tuple(
             np.array(
                 [positions[f"legs[{j + 1}].tubes[{t + 1}].radius"] for t in range(len(leg.tubes))],
@@ -317,7 +320,7 @@ def _axis_index(document: MechanismDocument, side: str, positions: dict[str, int
     return np.array([[positions.get(name, -1) for name in row] for row in names], dtype=int)
 
 
-def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
+def _direction_index(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
     """Indices (n, 3) of the components of all direction vectors on one side; they are adjacent."""
     carriers = base_carriers() if side == "base" else platform_carriers()
     names = (
@@ -332,7 +335,7 @@ def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) 
     return np.array(first, dtype=int)[:, None] + np.arange(3)
 
 
-def _groups(
+def _carrier_groups(
     document: MechanismDocument, side: str, carriers: dict[str, Any], positions: dict[str, int]
 ) -> tuple[CarrierGroup, ...]:
     """Groups of legs by carrier on one side, in the order of first use."""
@@ -354,7 +357,7 @@ def _groups(
     return tuple(groups)
 
 
-def _internal(document: MechanismDocument) -> Integers:
+def _internal_columns(document: MechanismDocument) -> Integers:
     """Column of each leg's internal coordinate (L,), by the body on which it ends, or -1."""
     kinds = platform_carriers()
     turns = np.array([kinds[leg.platform.joint].turns for leg in document.legs])

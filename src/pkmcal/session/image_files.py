@@ -190,18 +190,18 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
         exists = False
     if exists:
         entries = sorted(entry.name for entry in parent.iterdir())
-        others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
-        content = f"{others} {entries[0]} in {parent}" if entries else f"nothing in {parent}"
-    ending = Path(pattern).suffix
-    same = Counter(_image_suffixes(folder, wildcard.removesuffix(ending)))
-    others = [other for other, _ in same.most_common() if other != ending]
+        number = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
+        content = f"{number} {entries[0]} in {parent}" if entries else f"nothing in {parent}"
+    suffix = Path(pattern).suffix
+    counts = Counter(_image_suffixes(folder, wildcard.removesuffix(suffix)))
+    others = [other for other, _ in counts.most_common() if other != suffix]
     return InputError(
         "there is no photograph under this pattern",
         where=where,
         found=content,
         expected=f"files {pattern}",
         next_step=f"Photographs there end in {others[0]}: write"
-        f" {pattern.removesuffix(ending)}{others[0]}"
+        f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,
     )

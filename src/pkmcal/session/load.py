@@ -330,7 +330,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         joint_noise=schema.joints.noise,
         stations=stations,
         board=board,
-        document=_resolved(folder, schema, table, stations),
+        document=_resolved_document(folder, schema, table, stations),
         findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
         trackers=tuple(trackers),
@@ -762,7 +762,7 @@ def _unmeasured(
     ]
 
 
-def _resolved(
+def _resolved_document(
     folder: Path, schema: SessionDocument, table: CsvTable, stations: tuple[Station, ...]
 ) -> dict[str, Any]:
     """Content of session.yaml as plain data, with columns, readings and image files written out."""

@@ -135,7 +135,9 @@ def session_texts(
         texts["joints.csv"] = example_readings(model)
         turns = set(model.joint_units) == {"rad"}
     what = what or "legs"
-    texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, what, places)
+    texts["session.yaml"] = _session_text(
+        texts["session.yaml"], machine is None, turns, what, places
+    )
     if what in ("board", "both"):
         texts["board.yaml"] = board_text()
     readme = texts.pop("images/front/README.txt")
@@ -144,7 +146,7 @@ def session_texts(
     if what == "readings":
         del texts["cameras/front.yaml"]
         return texts
-    for name in _places(places):
+    for name in _station_names(places):
         texts[f"images/{name}/README.txt"] = readme.replace('"front"', f'"{name}"')
     return texts
 
@@ -154,7 +156,7 @@ def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
     return STARTER_BOARD_TEXT.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
 
 
-def _places(count: int) -> list[str]:
+def _station_names(count: int) -> list[str]:
     """Names of the stations."""
     return [
         *STARTER_PLACE_NAMES,
@@ -187,7 +189,7 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
     return csv_text(heads, ["0001", "0002"], rows.round(4))
 
 
-def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
+def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
     """Text of session.yaml for another machine, another observation, or more stations."""
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
@@ -200,7 +202,7 @@ def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places
         first += text[start:end].partition("\n")[2]
     further = [
         MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[what])
-        for n in _places(places)[1:]
+        for n in _station_names(places)[1:]
     ]
     rest = text[end:] if places == 1 and what == "legs" and hexapod else ""
     board = "" if what == "legs" else ON_PLATFORM
@@ -212,11 +214,11 @@ def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
     return tuple(
         doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
-        if _untouched(Path(folder) / name, name)
+        if _is_untouched(Path(folder) / name, name)
     )
 
 
-def _untouched(path: Path, name: str) -> bool:
+def _is_untouched(path: Path, name: str) -> bool:
     """Whether a file equals any starter text, compared by lines because editors may change line
     ends.
     """
@@ -227,7 +229,7 @@ def _untouched(path: Path, name: str) -> bool:
     # of readings, only examples have two rows
     if not lines or (name == "joints.csv" and len(lines) != 3):
         return False
-    examples = _examples(name)
+    examples = _starter_texts(name)
     if name == "joints.csv":
         examples = (*examples, *_readings_of_machine(path.parent, lines[0].split(",")[1:]))
     return any(lines == text.splitlines() for text in examples)
@@ -243,7 +245,7 @@ def _readings_of_machine(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
 
 
 @cache
-def _examples(name: str) -> tuple[str, ...]:
+def _starter_texts(name: str) -> tuple[str, ...]:
     """All texts that a file of a starter session can have."""
     if name == "board.yaml":
         return tuple(board_text(square) for square in STARTER_SQUARE_CHOICES)
@@ -254,7 +256,7 @@ def _examples(name: str) -> tuple[str, ...]:
         return template, *(example_readings(load_mechanism(machine)) for machine in catalogue())
     if name == "session.yaml":
         return tuple(
-            _session(template, *given)
+            _session_text(template, *given)
             for given in product(
                 (True, False),
                 (True, False),
