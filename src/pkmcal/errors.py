@@ -1,9 +1,9 @@
 """Exceptions for faults that a user can cause or should read.
 
-Each is a `PkmcalError` with what happened, where, what was found, what was expected, and the next
-step. It renders as one sentence, followed by the next step where there is one. The command line
-prints this text, or `as_dict` with ``--json``, and exits with `exit_code`. Any other exception that
-escapes is a defect of pkmcal.
+Each is a `PkmcalError`. It states what happened, where, the value that was found, the value that
+was expected, and the next step; it renders as one sentence, followed by the next step if there is
+one. The command line prints this text, or `as_dict` with ``--json``, and exits with `exit_code`.
+Any other exception that escapes is a defect of pkmcal.
 """
 
 from __future__ import annotations

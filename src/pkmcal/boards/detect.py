@@ -29,7 +29,7 @@ from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
 
 BOARD_IMAGES_EXAMINED = 3
-"""Images examined for another board; one good one is enough."""
+"""Images examined for another board; a single sharp one would be enough."""
 SQUARE_MISCOUNTS_TRIED = 2
 """Largest miscount of a chessboard's columns or rows that is tried."""
 MOST_SQUARES = 16
@@ -78,7 +78,7 @@ def _detect_in_file(path: Path, size: tuple[int, int], board: Board, *, quick: b
 
 
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Common size of the images; raises InputError with the names of those that differ."""
+    """Common size of the images; raises InputError naming images of another size."""
     if not files:
         raise InputError("no photographs were named", expected="photographs of the board")
     sizes = {path: image_header(path) for path in files}

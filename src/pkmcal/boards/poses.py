@@ -44,7 +44,7 @@ from pkmcal.wording import count, listed
 
 BOARD_RESIDUAL_LIMIT = 0.004
 """Rms of the corners' residuals, as a share of the image's width, above which the board file or the
-camera file is wrong; good ones leave a hundredth of it."""
+camera file is wrong; correct files leave a hundredth of this limit."""
 LEAST_CORNERS_WEIGHED = 6
 """Least sum of the corners' weights of a usable pose; with fewer, no corner is redundant."""
 TWO_TILTS = 25.0
@@ -328,7 +328,7 @@ def _projected_corners(views: BoardViews) -> tuple[Array, Array]:
 
 
 def _consistent_images(there: Array, noise: Array, usable: Booleans) -> Booleans:
-    """Images (F,) that agree with the image that has the most agreement."""
+    """Largest set of images (F,) that agree with one of them."""
     limit = np.sqrt(
         STILL_BOARD_DIFFERENCE**2 + MOVED_BOARD_DEVIATIONS**2 * (noise[:, None] ** 2 + noise**2)
     )

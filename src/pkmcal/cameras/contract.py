@@ -146,9 +146,9 @@ class Camera(ABC):
         """Derivatives of :meth:`ray` by the pixel (..., 3, 2) and by the parameters (..., 3, n).
 
         They follow from the implicit function project(ray) = pixel, so models do not implement
-        them. With J = d project / d ray, a change of the pixel changes the ray by the inverse of J
-        on the ray's tangent plane; a change of the parameters changes it by minus that inverse
-        times d project / d parameters.
+        them. Let J = d project / d ray. The derivative by the pixel is the inverse of J on the
+        ray's tangent plane; the derivative by the parameters is minus this inverse times d project
+        / d parameters.
         """
         rays = self.ray(pixels)
         by_point, by_parameters = self.project_jacobians(rays)

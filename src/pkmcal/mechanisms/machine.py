@@ -204,7 +204,9 @@ class Machine:
         return self._home.copy()
 
     def check_home(self) -> None:
-        """Raise InputError if the file states neither a home pose nor the ranges that give one."""
+        """Raise InputError if neither a home pose nor the ranges of all readings are in the
+        file.
+        """
         if self.document.home is None and not np.isfinite(self.joint_ranges).all():
             raise InputError(
                 what=f"mechanism {self.name!r} gives neither a home pose nor every leg's range",

@@ -49,8 +49,8 @@ def reversed_motors(joints: Array, ranges: Array) -> list[list[ReadingHypothesis
 
     joints : (K, m).
     ranges : (m, 2) smallest and largest reading, NaN if unknown.
-    Returns a list for each motor, with the wrong sign alone first if it is in range, and only it if
-    the range is unknown; an empty list if no constant is possible.
+    Returns a list for each motor. The wrong sign alone comes first if these readings are in range;
+    for an unknown range it is the only hypothesis. The list is empty if no constant is possible.
     """
     out: list[list[ReadingHypothesis]] = []
     for motor, (low, high) in enumerate(ranges):

@@ -118,7 +118,7 @@ class Reach:
         return tuple(words)
 
     def _motor_obstacles(self, pose: tuple[int, ...], motor: int, unit: str) -> list[str]:
-        """Obstacle at one motor as text, at most one."""
+        """Obstacle at one motor as text, in a list of at most one."""
         at, (low, high) = (*pose, motor), self.limits.ranges[motor]
         if self.lost[at]:
             return [f"the limb of motor {motor + 1} cannot reach"]

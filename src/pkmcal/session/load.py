@@ -496,8 +496,10 @@ def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | 
 
 
 def _check_base_board(document: Document, schema: SessionDocument, users: list[str]) -> None:
-    """Refuse stations that observe only a board on the base: it relates stations that observe legs,
-    and alone it has no information on the machine.
+    """Refuse stations that observe only a board on the base.
+
+    Such a board relates stations that also observe legs; alone it has no information on the
+    machine.
     """
     legs = schema.observers("legs")
     alone = [name for name in users if name not in legs]
@@ -525,8 +527,8 @@ def _workspace(document: Document, schema: SessionDocument) -> Region | None:
 
 
 def _unused_board(document: Document, schema: SessionDocument) -> list[Finding]:
-    """Warnings about a board that has no effect: no station observes it, or it is on the base and
-    only one fixed station does.
+    """Warnings about a board without effect: observed by no station, or on the base and observed by
+    a single fixed station.
     """
     users = schema.observers("board")
     if schema.board is None:

@@ -90,9 +90,7 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 
 
 def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings that are mostly out of range and in range after a conversion from mm or
-    degrees.
-    """
+    """Refuse readings in mm or degrees: most are out of range, and in range after conversion."""
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
         finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
         if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
@@ -133,8 +131,8 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
 
 
 def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings of all joints, or of some, that are mostly out of range and all in range
-    after one constant shift: another zero point.
+    """Refuse readings with another zero point: readings of all joints, or of some, that are mostly
+    out of range and are all in range after one constant shift.
     """
     inside, near = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
     if near.all():
