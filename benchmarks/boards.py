@@ -17,7 +17,7 @@ from pkmcal.arrays import THREADS
 from pkmcal.boards.board import load_board
 from pkmcal.boards.poses import detect_in
 from pkmcal.observe.images import Pictures
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 
 ROUNDS = 5
 
@@ -27,7 +27,7 @@ def main() -> int:
     board = load_board(sys.argv[1])
     paths = [Path(word) for word in sys.argv[2:]]
     names = [path.name for path in paths]
-    images = Pictures(paths, photograph_header(paths[0]), names)  # none is kept decoded
+    images = Pictures(paths, image_header(paths[0]), names)  # none is kept decoded
     detect_in(images[:1], board, names[:1])  # what is imported at first use
     walls, processors = list[float](), list[float]()
     count = 0

@@ -12,7 +12,7 @@ from pkmcal.cameras import load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, limits, read_csv, read_json, read_yaml, validated_document
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 from pkmcal.session.load import load_session
 from pkmcal.session.schema import session_schema
 from pkmcal.session.starter import write_session
@@ -139,4 +139,4 @@ def test_pixels(tmp_path):
     with path.open("wb") as stream:
         stream.write(header)
         stream.truncate(len(header) + side**2)
-    assert limited(limits.MOST_PIXELS, side**2, photograph_header, path)
+    assert limited(limits.MOST_PIXELS, side**2, image_header, path)

@@ -12,7 +12,7 @@ from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
 from pkmcal.observe.images import decode
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 
 
 def image(path, width, height):
@@ -24,7 +24,7 @@ def test_sizes_are_those_of_the_decoded_image(tmp_path, suffix, monkeypatch):
     path = tmp_path / f"a.{suffix}"
     image(path, 37, 21)
     monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("decoded"))
-    assert photograph_header(path) == (37, 21)
+    assert image_header(path) == (37, 21)
     assert decode(path, (37, 21), path.name).shape == (21, 37)
 
 
@@ -34,13 +34,13 @@ def test_sizes_are_those_of_the_decoded_image(tmp_path, suffix, monkeypatch):
 ])  # fmt: skip
 def test_headers_without_a_size_are_refused_at_once(tmp_path, data):
     (tmp_path / "a.pgm").write_bytes(data)
-    assert "not an image" in fault(photograph_header, tmp_path / "a.pgm")
+    assert "not an image" in fault(image_header, tmp_path / "a.pgm")
 
 
 def test_sizes_of_headers_that_opencv_does_not_write(tmp_path):
     def size(data):
         (tmp_path / "a").write_bytes(data + b"\0" * 2000)
-        return photograph_header(tmp_path / "a")
+        return image_header(tmp_path / "a")
 
     assert size(b"P5 # a remark\n# and one more\n 37\n#x\n21 255\n") == (37, 21)
     assert size(b"BM" + b"\0" * 12 + struct.pack("<IHHHH", 12, 37, 21, 1, 8)) == (37, 21)
@@ -68,13 +68,13 @@ def test_no_more_memory_is_taken_than_a_file_can_fill(tmp_path, suffix):
     assert spoilt != data
     path.write_bytes(spoilt)
     with pytest.raises(InputError, match="not an image that can be read"):
-        photograph_header(path)
+        image_header(path)
 
 
 def test_other_formats_are_not_read(tmp_path):
     image(tmp_path / "a.webp", 37, 21)
     with pytest.raises(InputError, match="not an image that can be read"):
-        photograph_header(tmp_path / "a.webp")
+        image_header(tmp_path / "a.webp")
 
 
 def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
@@ -87,7 +87,7 @@ def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
     # Fill bytes before a marker are allowed, and some cameras write them.
     path.write_bytes(path.read_bytes()[:2] + b"\xff\xff" + block + path.read_bytes()[2:])
     assert cv2.imread(str(path)).shape[:2] == (37, 21)
-    assert photograph_header(path) == (37, 21)
+    assert image_header(path) == (37, 21)
 
 
 @pytest.mark.parametrize(
@@ -103,13 +103,13 @@ def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
 def test_broken_images(tmp_path, content, sentence):
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    values = fault(photograph_header, path, "front/a.png")
+    values = fault(image_header, path, "front/a.png")
     assert values.startswith(f"front/a.png: the {sentence}")
 
 
 def test_an_image_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        photograph_header(tmp_path / "none.png")
+        image_header(tmp_path / "none.png")
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
@@ -122,21 +122,21 @@ def test_a_size_that_a_file_of_this_length_cannot_hold(tmp_path, suffix, monkeyp
         data[16:24] = struct.pack(">II", 30000, 30000)
         path.write_bytes(data)  # first as a disk spoils it, with the old checksum
         with pytest.raises(InputError, match="not an image that can be read"):
-            photograph_header(path)
+            image_header(path)
         data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
     else:
         at = data.index(b"\xff\xc0") + 5
         data[at : at + 4] = struct.pack(">HH", 30000, 30000)
     path.write_bytes(data)
     with pytest.raises(InputError, match="not an image that can be read"):
-        photograph_header(path)
+        image_header(path)
 
 
 def test_pictures_of_one_colour_are_not_too_small_for_their_size(tmp_path):
     for suffix in ("png", "jpg"):
         path = tmp_path / f"a.{suffix}"
         assert cv2.imwrite(str(path), np.zeros((3000, 4000), np.uint8))
-        assert photograph_header(path) == (4000, 3000)
+        assert image_header(path) == (4000, 3000)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
@@ -151,6 +151,6 @@ def test_what_is_no_file_is_named_at_once(tmp_path):
         ("device", "this is a device, not a file"),
         ("link", "this is a link to what is not there; found nowhere"),
     ):
-        for read in (photograph_header, lambda p, label: decode(p, (4, 4), label), read_text):
+        for read in (image_header, lambda p, label: decode(p, (4, 4), label), read_text):
             with pytest.raises(InputError, match=f"^a.png: {text}"):
                 read(tmp_path / f"{name}.png", "a.png")

@@ -1,4 +1,4 @@
-"""pkmcal calibrates parallel kinematic machines from photographs.
+"""pkmcal calibrates parallel kinematic machines from images.
 
     >>> import pkmcal
     >>> result = pkmcal.calibrate("session")                      # doctest: +SKIP
@@ -6,8 +6,8 @@
     >>> result.save("out")                                        # doctest: +SKIP
     >>> machine = pkmcal.load_mechanism("out/mechanism.yaml")     # doctest: +SKIP
 
-Names below are imported when they are first used, so that ``import pkmcal`` and the command
-line's help stay quick: OpenCV and SciPy alone take most of a second.
+Public names are imported on first use, so that ``import pkmcal`` and the command line's help are
+quick: OpenCV and SciPy alone take most of a second.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ _HOMES = {
     "simulate": "pkmcal.api.simulate",
     "study": "pkmcal.studies.findings",
 }
+"""Modules of the public names."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""``python -m pkmcal``, the same as the command ``pkmcal``."""
+"""Entry point of ``python -m pkmcal``, the same as the command ``pkmcal``."""
 
 import sys
 

@@ -1,5 +1,5 @@
-"""The one array type of the project, so that signatures stay readable, what it is told as, its
-plain figures, and how many threads work on arrays.
+"""Array types, short reprs of dataclasses that hold arrays, small array helpers, and the number of
+worker threads.
 """
 
 from __future__ import annotations
@@ -15,31 +15,32 @@ Array = NDArray[np.floating[Any]]
 Integers = NDArray[np.integer[Any]]
 Booleans = NDArray[np.bool_]
 THREADS = 2
-"""Threads beside one another: decoding and array work release Python's lock."""
+"""Worker threads for decoding images and for array work, both of which release Python's lock."""
 
 
 def rms(values: Array) -> float:
-    """Root mean square of all values; NaN of none."""
+    """Root mean square over all elements; NaN for an empty array."""
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
 def evenly(count: int, most: int) -> Integers:
-    """Numbers of up to ``most`` of so many things in a row, evenly, the first and the last too."""
+    """Indices of at most ``most`` of ``count`` items, evenly spaced, first and last included."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
 
 def numbered(names: Iterable[Hashable]) -> Integers:
-    """Numbers (n,) of things that may be alike, in the order in which each is first named."""
+    """Integer labels (n,) of possibly repeated items, numbered in the order of first occurrence."""
     number: dict[Hashable, int] = {}
     return np.array([number.setdefault(name, len(number)) for name in names], dtype=int)
 
 
 LONGEST_VALUE = 40
-"""Characters of a value that a short repr shows."""
+"""Longest value, in characters, that a short repr shows in full."""
 
 
 def short_repr(self: Any) -> str:
-    """The repr of a dataclass that holds arrays: of these their shapes, of what is long its kind.
+    """Short repr of a dataclass: arrays are shown by their shape, long collections and dataclasses
+    by their type.
 
     For use as ``__repr__`` in a dataclass's body.
     """
@@ -48,6 +49,7 @@ def short_repr(self: Any) -> str:
 
 
 def _short(value: Any) -> str:
+    """Repr of one field's value, at most LONGEST_VALUE characters."""
     if isinstance(value, np.ndarray):
         return f"<{' × '.join(map(str, value.shape)) or 'one number'}>"
     if is_dataclass(value):

@@ -1,8 +1,9 @@
-"""One family of errors: what happened, where, found and expected, next step.
+"""Exceptions for faults that a user can cause or should read.
 
-Every error that a user can cause or should read is a `PkmcalError`. It renders as one sentence,
-or two where there is a next step; the command line prints that, or `as_dict` under ``--json``,
-and leaves with `exit_code`. Anything else that escapes is a defect of pkmcal.
+Each is a `PkmcalError`. It states what happened, where, the value that was found, the value that
+was expected, and the next step; it renders as one sentence, followed by the next step if there is
+one. The command line prints this text, or `as_dict` with ``--json``, and exits with `exit_code`.
+Any other exception that escapes is a defect of pkmcal.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ from functools import partial
 from typing import Any, ClassVar, Self
 
 LONGEST_NAME = 255
-"""Characters of a name; file systems take no longer ones."""
+"""Longest name in characters; file systems accept no longer ones."""
 _LONG_NAME = re.compile(rf"[^\s/\\]{{{LONGEST_NAME + 1},}}")
 _INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
-"""Of Unicode: what moves a terminal's cursor, turns the direction of writing, has no width, breaks
-lines, or is half of a character, as a file's name that is not UTF-8 holds it."""
+"""Unicode categories of characters that are written as escapes: control characters, format
+characters (direction marks, zero width), surrogates (from file names that are not UTF-8), line and
+paragraph separators."""
 LONGEST_VALUE_QUOTED = 500
-"""Characters of what was found: enough to recognise it by."""
+"""Longest `found` value in characters: enough to recognise the value."""
 
 
 class PkmcalError(Exception):
-    """Base of the family; raise one of its subclasses.
+    """Base class of all errors of pkmcal; raise one of its subclasses.
 
     Attributes
     ----------
@@ -32,11 +34,11 @@ class PkmcalError(Exception):
     where :
         File, line or field, for example "session.yaml, line 12, stations.front.camera".
     found, expected :
-        What was there, and what should have been.
+        The value that was found, and the value or range that is valid.
     next_step :
-        What the reader can do about it, a sentence.
+        What the reader can do about the error, a sentence.
     code :
-        What kind of fault it is, for programs, such as readings.sign; of its class unless given.
+        Kind of fault for programs, such as readings.sign; `class_code` by default.
 
     """
 
@@ -77,20 +79,22 @@ class PkmcalError(Exception):
         return sentence
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Keyword arguments do not survive Exception's own pickling, and worker processes pickle.
+        # Worker processes pickle errors; Exception's own pickling drops keyword arguments.
         return partial(type(self), **self._fields()), ()
 
     def located(self, where: str) -> Self:
-        """Return the same error with `where` added, for callers that know the file and line."""
+        """Copy of the error with `where` prepended, for callers that know the file and line."""
         place = where if self.where is None else f"{where}: {self.where}"
         return type(self)(**{**self._fields(), "where": place})
 
     def as_input(self, where: str) -> InputError:
-        """Return the same as a fault of the input at `where`, such as a drawing's geometry."""
+        """Copy of the error as an `InputError` at `where`, for example for the geometry of a
+        nominal model.
+        """
         return InputError(**self.located(where)._fields())
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything above under its name, for ``--json``."""
+        """All fields by name, with the class and the rendered message, for ``--json``."""
         return {
             "error": type(self).__name__,
             "exit_code": self.exit_code,
@@ -100,6 +104,7 @@ class PkmcalError(Exception):
         }
 
     def _fields(self) -> dict[str, Any]:
+        """Arguments of the constructor by name."""
         return {
             "what": self.what,
             "where": self.where,
@@ -111,29 +116,30 @@ class PkmcalError(Exception):
 
 
 class InputError(PkmcalError):
-    """The input is wrong: a file, a line, a field or an option."""
+    """Invalid input: a file, a line, a field or an option."""
 
     exit_code = 2
     class_code = "error.input"
 
 
 class ResultError(PkmcalError):
-    """The program ran, but its result should not be used."""
+    """The program ran, but its result must not be used."""
 
     class_code = "error.result"
 
 
 class GeometryError(PkmcalError):
-    """No usable answer here: a leg through the camera, a singular pose, no convergence."""
+    """No usable solution: a leg through the camera, a singular pose, no convergence."""
 
     class_code = "error.geometry"
 
 
 def legible(text: str, keep: str = "") -> str:
-    r"""Text with every character spelt out that cannot be read: ``\x1b`` for ESC, ``\u202e``.
+    r"""Text on one line with invisible characters escaped: ``\x1b`` for ESC, ``\u202e`` for a
+    direction mark.
 
-    All that is printed, and all that is written into comments, goes through here; what stays is of
-    one line. keep : characters that stay as they are.
+    All text that is printed or written into comments of files passes through this function.
+    keep : characters that are not escaped.
     """
     if text.isprintable():
         return text
@@ -144,14 +150,14 @@ def legible(text: str, keep: str = "") -> str:
 
 
 def _brief(text: str, most: int | None = None) -> str:
-    """Legible text without what is too long to be a name, of which both ends are enough to
-    recognise it.
+    """Legible text with overlong names shortened to their beginning and end, and cut to ``most``
+    characters.
     """
     text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", legible(text))
     return text if most is None or len(text) <= most else f"{text[: most - 1]}…"
 
 
 def _capitalised(sentence: str) -> str:
-    """Begin with a capital, unless the first word is a name such as joints.csv."""
+    """Sentence with a capital first letter, unless the first word is a name such as joints.csv."""
     first = sentence.partition(" ")[0]
     return sentence[:1].upper() + sentence[1:] if first.isalpha() else sentence

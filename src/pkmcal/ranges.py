@@ -1,8 +1,7 @@
-"""What every numeric option of a command, and every numeric argument of the public functions, may
-be: one table.
+"""Ranges of all numeric options of the commands and numeric arguments of the public functions.
 
-Numbers in files have their ranges in the files' schemas; what a study varies, in
-:mod:`pkmcal.studies.sweep`.
+Ranges of numbers in files are part of the files' schemas; ranges of the quantities that a study
+varies are in :mod:`pkmcal.studies.sweep`.
 """
 
 from __future__ import annotations
@@ -17,8 +16,10 @@ from pkmcal.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """From ``least`` to ``most``, both included, but for ``least`` where ``above``. whole : without
-    fractions.
+    """Interval from ``least`` to ``most``. Both ends are included, but ``least`` is excluded with
+    ``above``.
+
+    whole : integers only.
     """
 
     least: float
@@ -30,7 +31,9 @@ class Range:
         return f"{'over ' if self.above else ''}{self.least:g} to {self.most:g}"
 
     def check(self, value: float, where: str) -> None:
-        """Raise InputError for what is no number, not finite, or out of the range."""
+        """Check a value; raise InputError unless it is a finite number (an integer with ``whole``)
+        in the range.
+        """
         number = isinstance(value, Integral if self.whole else Real) and not isinstance(value, bool)
         high_enough = number and (value > self.least or (value == self.least and not self.above))
         if high_enough and value <= self.most:
@@ -44,14 +47,15 @@ class Range:
 
 
 def _whole(least: int, most: int) -> Range:
+    """Range of integers."""
     return Range(least, most, whole=True)
 
 
 MOST_CONFIGURATIONS = 1000
-"""Of a simulation: nobody photographs more in a day."""
+"""Most configurations in a simulated session; more images are not taken in a day."""
 MOST_PLANNED_CONFIGURATIONS = 200
-"""Configurations from each place that a plan may choose; candidates are twenty times as many, and
-memory grows with them."""
+"""Most configurations for each station of a plan; there are twenty times as many candidates, and
+memory grows with their number."""
 _SEED = _whole(0, 2**63 - 1)
 _COUNT = _whole(1, 100)
 _READING_NOISE = Range(0, 1, above=True)
@@ -105,14 +109,14 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
         "watch": {"alpha": Range(1e-6, 0.2), "seed": _SEED},
     }
 )
-"""By command and by the option's name; lengths in m, angles as the option has them, noise of images
-in px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
+"""Ranges by command and option. Lengths in m, angles in the option's own unit, noise of images in
+px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
 
 
 def check_number(command: str, name: str, value: float | None, where: str | None = None) -> None:
-    """Raise InputError for a number that a command's option may not be; None is no number.
+    """Check a numeric option of a command; raise InputError outside its range. None passes.
 
-    where : its name in the message; ``name`` unless given.
+    where : name of the option in the message, by default ``name``.
     """
     if value is not None:
         RANGES[command][name].check(value, where or name)

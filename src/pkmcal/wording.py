@@ -1,4 +1,4 @@
-"""Words and numbers for people: lists, counts, magnitudes, parameters' names."""
+"""Text for people: lists, counts, magnitudes with units, names of parameters."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ from collections.abc import Iterable, Sequence
 
 MINUS_SIGN = "\N{MINUS SIGN}"
 DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
-"""Factor and name of the unit that the report shows, by the unit inside."""
+"""Factor and name of the unit shown in reports, by the SI unit used inside."""
 
 LARGEST_DECIMALS = 6
+"""Most decimals of a number."""
 LEG_PARAMETER_NAME = re.compile(r"legs\[(\d+)\]\.(.+)")
+"""Name of a leg's parameter: the leg's number and the rest of the path."""
 
 
 def install_step(extra: str) -> str:
-    """How to install what an extra of pyproject.toml names; no registry has a release of pkmcal."""
+    """Instruction to install an optional dependency group of pyproject.toml; pkmcal is on no
+    package index.
+    """
     return f"In a copy of pkmcal's sources: pip install '.[{extra}]'"
 
 
 def decimals(sigma: float) -> int:
-    """Decimals that show ``sigma`` with two significant digits; 3 where it has none."""
+    """Number of decimals that show ``sigma`` with two significant digits; 3 if it is not a positive
+    number.
+    """
     if not math.isfinite(sigma) or sigma <= 0:
         return 3
     exponent = int(f"{sigma:.1e}".partition("e")[2])  # after rounding: 0.0996 is 0.10
@@ -28,7 +34,7 @@ def decimals(sigma: float) -> int:
 
 
 def number(value: float, places: int, signed: bool = False) -> str:
-    """A number with a true minus sign; never a negative zero; a dash where there is none."""
+    """Number with a true minus sign and without negative zeros; a dash if it is not finite."""
     if not math.isfinite(value):
         return "–"
     text = f"{value:.{places}f}"
@@ -40,36 +46,40 @@ def number(value: float, places: int, signed: bool = False) -> str:
 
 
 def brief(value: float) -> str:
-    """A positive magnitude with two significant digits, for headlines."""
+    """Positive magnitude with two significant digits, for headlines."""
     return number(value, decimals(value))
 
 
 def amount(value: float, unit: str) -> str:
-    """A positive magnitude in m or rad, as ``0.07 mm`` or ``0.3°``."""
+    """Positive magnitude in m or rad in its display unit, such as ``0.07 mm`` or ``0.3°``."""
     scale, name = DISPLAY_UNITS[unit]
     return with_unit(brief(value * scale), name)
 
 
 def with_unit(text: str, unit: str) -> str:
-    """``0.07 mm``, ``0.3°``."""
+    """Number and unit: ``0.07 mm``, ``0.3°``."""
     return text + unit if unit == "°" else f"{text} {unit}"
 
 
 def count(n: float, thing: str) -> str:
-    """``1 edge``, ``12 345 edges``; thousands apart by a narrow space."""
+    """Number of things: ``1 edge``, ``12 345 edges``, with narrow spaces between thousands."""
     text = f"{round(n):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
     return f"{text} {thing}" if round(n) == 1 else f"{text} {thing}s"
 
 
 def split_name(name: str) -> tuple[int | None, str]:
-    """Leg number from 1 (None where the parameter has none) and what is left of the path."""
+    """Leg number, counted from 1 (None for a parameter of the whole machine), and the rest of a
+    parameter's path.
+    """
     match = LEG_PARAMETER_NAME.fullmatch(name)
     return (int(match[1]), match[2]) if match else (None, name)
 
 
 def named(legs: Iterable[int], all_legs: int = 0) -> str:
-    """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0; ``all legs``
-    where their number is given.
+    """Legs as text, ``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from indices that count from
+    0.
+
+    all_legs : number of legs of the machine; if given, a complete list becomes ``all legs``.
     """
     count = sorted({int(leg) + 1 for leg in legs})
     if len(count) == all_legs and all_legs > 1:
@@ -80,24 +90,24 @@ def named(legs: Iterable[int], all_legs: int = 0) -> str:
 
 
 def in_full(k: int) -> str:
-    """Small numbers as words."""
+    """Integer as a word up to twelve, above as digits."""
     words = ("no", "one", "two", "three", "four", "five", "six")
     words += ("seven", "eight", "nine", "ten", "eleven", "twelve")
     return words[k] if k < len(words) else str(k)
 
 
 def ways(k: int) -> str:
-    """``in one way``, ``in six ways``."""
+    """Count of ways: ``in one way``, ``in six ways``."""
     return "in one way" if k == 1 else f"in {in_full(k)} ways"
 
 
 def joined(words: Sequence[str]) -> str:
-    """``a, b and c``."""
+    """Words joined as ``a, b and c``."""
     return listed(words, len(words))
 
 
 def listed(names: Sequence[str], longest: int = 6) -> str:
-    """Join names for a sentence: "a, b and c", or "a, b, c and 12 more"."""
+    """Names joined as "a, b and c", or as "a, b, c and 12 more" beyond ``longest``."""
     if len(names) <= 1:
         return "".join(names)
     if len(names) <= longest:
@@ -106,22 +116,22 @@ def listed(names: Sequence[str], longest: int = 6) -> str:
 
 
 def capital(text: str) -> str:
-    """The beginning of a sentence."""
+    """Text with its first letter as a capital."""
     return text[:1].upper() + text[1:]
 
 
 def how_often(probability: float) -> str:
-    """``once in 30 times``, or ``as a rule``."""
+    """Frequency of a probability, ``once in 30 times``, or ``as a rule`` from one half on."""
     return f"once in {1 / probability:.0f} times" if probability < 0.5 else "as a rule"
 
 
 def percent(share: float) -> str:
-    """A share as whole percent, never rounded up to a certainty it has not."""
+    """Share as whole percent, rounded down so that it never claims certainty."""
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"
 
 
 def ratio_in_per_cent(value: float, sigma: float) -> str:
-    """The size of a ratio in per cent, with its standard deviation where that is known."""
+    """Magnitude of a ratio in per cent, with its standard deviation if that is finite."""
     if not math.isfinite(sigma):
         return f"some {100 * abs(value):.1g} %"
     places = max(0, 1 - math.floor(math.log10(max(100 * sigma, 1e-6))))

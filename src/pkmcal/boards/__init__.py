@@ -1,1 +1,3 @@
-"""Boards in photographs: found, measured as poses; cameras calibrated from them."""
+"""Calibration boards: detection in images, poses as measurements, and camera calibration from
+boards.
+"""

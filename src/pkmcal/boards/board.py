@@ -1,9 +1,10 @@
-"""Calibration boards: their description, and their corners found in photographs.
+"""Calibration boards: their description and their corners in an image.
 
-Board frame: x along the first count, y along the second, z into the board, as OpenCV has it; m.
-A corner's id is its row in :attr:`Board.points`, row by row. ChArUco: the inner corners, from the
-outer corner of the first square. Chessboard: the inner corners, from the first of them. Grid of
-markers: four corners a marker, clockwise as printed, from the outer corner of the first.
+Board frame: x along the first count, y along the second, z into the board, as in OpenCV; m. A
+corner's id is its row in :attr:`Board.points`, row by row. ChArUco: inner corners, with the origin
+at the outer corner of the first square. Chessboard: inner corners, with the origin at the first
+one. Grid of markers: four corners per marker, clockwise as printed, with the origin at the outer
+corner of the first marker.
 """
 
 from __future__ import annotations
@@ -36,13 +37,15 @@ BoardSizeTolerance = Annotated[
     Share, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
 ]
 PRINTED_SIZE_TOLERANCE = 1e-3
-"""Standard deviation of a printed board's size, relative, unless its file says otherwise: paper
-moves by as much with the air's moisture, and printers' feeds differ by more."""
+"""Default prior sigma of a printed board's size, relative. Paper expands by as much with humidity,
+and printers' feeds differ by more."""
 LONGEST_SQUARE_SIDE = 5.0
-"""m; a square or marker longer than this was written in millimetres."""
+"""Longest side of a square or marker, m; a larger value was written in millimetres."""
 
 
 class _Dictionary(Schema):
+    """Field of boards with markers."""
+
     dictionary: str = Field(description="a dictionary's name in OpenCV, such as DICT_5X5_100")
 
     @field_validator("dictionary")
@@ -58,13 +61,16 @@ class _Dictionary(Schema):
 
 
 def _metres(length: float) -> float:
+    """Length if plausible in metres; raises ValueError beyond LONGEST_SQUARE_SIDE."""
     if length > LONGEST_SQUARE_SIDE:
         raise ValueError(f"{length:g} looks like millimetres; lengths are wanted in metres")
     return length
 
 
 class CharucoSchema(_Dictionary):
-    """``type: charuco``; ``legacy: true`` is the pattern of OpenCV before 4.6 with even rows."""
+    """ChArUco board, ``type: charuco``; ``legacy: true`` is OpenCV's pattern before 4.6 with even
+    rows.
+    """
 
     type: Literal["charuco"]
     squares: Counts = Field(description="[columns, rows] of squares, for example [9, 7]")
@@ -83,7 +89,7 @@ class CharucoSchema(_Dictionary):
 
 
 class ChessboardSchema(Schema):
-    """``type: chessboard``, with ``corners`` (inner ones) or ``squares``."""
+    """Chessboard, ``type: chessboard``, with either ``corners`` (inner ones) or ``squares``."""
 
     type: Literal["chessboard"]
     corners: InnerCorners | None = None
@@ -109,7 +115,7 @@ class ChessboardSchema(Schema):
 
 
 class GridSchema(_Dictionary):
-    """``type: aruco_grid``: ArUco or AprilTag markers in rows; the first has ``first_id``."""
+    """Grid of ArUco or AprilTag markers, ``type: aruco_grid``; the first one has ``first_id``."""
 
     type: Literal["aruco_grid"]
     markers: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (
@@ -129,16 +135,18 @@ class GridSchema(_Dictionary):
 BOARD_SCHEMAS: dict[str, type[Schema]] = {
     "charuco": CharucoSchema, "chessboard": ChessboardSchema, "aruco_grid": GridSchema,
 }  # fmt: skip
+"""Schemas of board files by ``type``."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """A board.
+    """Calibration board.
 
+    type : charuco, chessboard or aruco_grid.
     counts : columns and rows of inner corners, or of markers for a grid of markers.
-    points : (N, 3) m, board frame, by corner id.
+    points : (N, 3) corners in the board frame by id, m.
     lines : ids of corners on one straight line, at least three each.
-    document : board.yaml's fields.
+    document : fields of board.yaml.
     """
 
     type: str
@@ -149,12 +157,12 @@ class Board:
 
     @property
     def tolerance(self) -> float:
-        """Standard deviation of its size, relative: all squares are larger or smaller alike."""
+        """Prior sigma of the board's size, relative; it scales all squares equally."""
         return self.document.get("tolerance", PRINTED_SIZE_TOLERANCE)
 
     @property
     def described(self) -> str:
-        """In words, for messages."""
+        """Description of the board for messages."""
         columns, rows = self.counts
         if self.type == "aruco_grid":
             return f"a grid of {columns}x{rows} markers"
@@ -164,19 +172,21 @@ class Board:
 
     @property
     def turnable(self) -> bool:
-        """True where a photograph cannot tell the board from itself turned by 180 degrees."""
+        """Whether the board looks the same rotated by 180 degrees."""
         return self.type == "chessboard" and sum(self.counts) % 2 == 0
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What one photograph shows of the board.
+    """Board corners detected in one image.
 
-    ids : (n,) corners found. pixels : (n, 2). sigma : (n,) px, standard deviation of a coordinate
-        by the noise and sharpness of the picture; 0 where unknown.
-    reason : why no corner is used, empty where the board was found.
-    weak : ids of corners located but not fitted: half covered, in shadow or at the border.
-    mirrored : the picture is a mirror image; only boards with markers can tell.
+    ids : (n,) corners detected.
+    pixels : (n, 2).
+    sigma : (n,) px, standard deviation of a coordinate from noise and sharpness of the image; 0 if
+        unknown.
+    reason : why no corner is used; empty if the board was detected.
+    weak : ids of corners located but not fitted: half occluded, in shadow or at the image's border.
+    mirrored : whether the image is mirrored; only boards with markers show this.
     """
 
     name: str
@@ -190,17 +200,17 @@ class Detection:
 
     @property
     def success(self) -> bool:
-        """True where the board's corners are there."""
+        """Whether the board was detected."""
         return not self.reason
 
 
 def load_board(path: Path | str, label: str | None = None) -> Board:
-    """Read a board file; every fault is an InputError with its line."""
+    """Read a board file; raises InputError with the line of the fault."""
     return board_from_document(read_yaml(path, label))
 
 
 def board_from_document(document: Document) -> Board:
-    """The board of a file's fields, checked."""
+    """Board from a file's fields, validated; raises InputError."""
     kind = document.data.get("type")
     if not isinstance(kind, str) or kind not in BOARD_SCHEMAS:
         guess = closest(str(kind), BOARD_SCHEMAS)
@@ -222,7 +232,7 @@ def board_from_document(document: Document) -> Board:
 
 
 def chessboard(corners: tuple[int, int], square: float) -> Board:
-    """A chessboard of (columns, rows) inner corners, square in m."""
+    """Chessboard of (columns, rows) inner corners; square : m."""
     document = {"type": "chessboard", "corners": list(corners), "square": square}
     return _grid("chessboard", corners, square, (0.0, 0.0), document)
 
@@ -230,6 +240,7 @@ def chessboard(corners: tuple[int, int], square: float) -> Board:
 def _grid(
     kind: str, counts: tuple[int, int], square: float, first: tuple[float, float], data: Any
 ) -> Board:
+    """Board with a rectangular grid of corners. first : (x, y) of corner 0, m."""
     columns, rows = counts
     y, x = np.mgrid[:rows, :columns].reshape(2, -1)
     points = np.stack([first[0] + square * x, first[1] + square * y, 0.0 * x], axis=-1)
@@ -239,6 +250,7 @@ def _grid(
 
 
 def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
+    """Board with the corners of a grid of markers."""
     columns, rows = fields.markers
     row, column = np.mgrid[:rows, :columns].reshape(2, -1)
     side, step = fields.marker, fields.marker + fields.gap
@@ -254,7 +266,7 @@ def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
 
 
 def dictionaries() -> tuple[str, ...]:
-    """Names of OpenCV's dictionaries of markers."""
+    """Names of OpenCV's marker dictionaries."""
     import cv2
 
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))

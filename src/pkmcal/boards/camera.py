@@ -1,4 +1,4 @@
-"""A camera calibrated from photographs of a board, with what is wrong or weak in them."""
+"""Camera calibration from images of a board, with checks of the images and of the result."""
 
 from __future__ import annotations
 
@@ -39,41 +39,50 @@ from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
 LEAST_VIEWS = 3
+"""Fewest images that show the board."""
 GOOD_VIEWS = 6
+"""Number of images below which a warning is given."""
 UNFIT_MODEL_RATIO = 3.0
-"""A model whose left-out error is so many times another's is refused; less, and worse, warned."""
+"""Ratio of held-out errors above which a model named by the user is refused; a smaller significant
+ratio gives a warning."""
 LEAST_SURE = 0.02
-"""Share of the focal length that its standard deviation may reach; a machine of a metre would be
-2 cm off."""
+"""Largest standard deviation of the focal length, as a share of it; a machine of 1 m would be off
+by 2 cm."""
 HELD_OUT_ERROR_LIMIT = 0.004
-"""Held-out error as a share of the image's width from which no model explains the photographs."""
+"""Held-out error, as a share of the image's width, above which no model explains the images."""
 MOST_CORNERS_LOST = 0.25
-"""Share of the corners that may be left out: their noise is judged by the better half of all, which
-says nothing of the rest where that is another kind."""
+"""Largest share of rejected corners. Their noise is estimated from the better half of all corners,
+which does not represent the rest if its errors are of another kind."""
 ODD_VIEW_RMS_FACTOR = 2.5
+"""Ratio of a view's held-out error to the median of all views above which the view is reported."""
 FACING_CAMERA_TILT = 15.0
-"""degrees; boards tilted by less all say the same about the focal length."""
+"""Tilt of a board in degrees below which views all have the same information on the focal length,
+which is little."""
 COVERAGE_CELLS = (8, 6)
+"""Columns and rows of cells by which the coverage of the image is counted."""
 LEAST_COVERED_SHARE = 0.5
+"""Share of cells with corners below which a warning is given."""
 STRONG_INTRINSICS_CORRELATION = 0.95
-"""Correlation from which two intrinsics are named as hardly told apart."""
+"""Correlation above which two intrinsics are reported as hardly separable."""
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """A calibrated camera, how sure it is, and what it was found from.
+    """Calibrated camera with its uncertainty and the data used.
 
-    terms : distortion parameters that were estimated. covariance : (n, n) of the intrinsics,
-        zero where not estimated. spread : factor on the corners' noise by which views disagree,
-        contained in the covariance.
-    views : names of the V photographs used. T_camera_board : (V, 4, 4) m.
-    pose_covariance : (V, 6, 6), left perturbation, with the intrinsics' share.
-    pixels : (V, N, 2) corners seen, NaN where not. residuals : (V, N, 2) px, predicted minus seen.
-    weight : (V, N); corners far off count less, down to 0.
-    rms, held_out : px, root mean square of the residual's length, on the views used and on views
-        that the camera was not fitted to (their poses are). noise : px, corners' noise beyond
-        their own sigma, a coordinate.
-    compared : every model and set of terms that was tried.
+    terms : estimated distortion coefficients.
+    covariance : (n, n) of the intrinsics, zero for those not estimated.
+    spread : factor on the corners' noise by which views disagree, contained in the covariance.
+    views : names of the V images used.
+    T_camera_board : (V, 4, 4) m.
+    pose_covariance : (V, 6, 6), left perturbation, with the intrinsics' uncertainty.
+    pixels : (V, N, 2) detected corners, NaN where not detected.
+    residuals : (V, N, 2) px, predicted minus detected.
+    weight : (V, N) IRLS weights, 0 to 1.
+    noise : px, corners' noise beyond their own sigma, per coordinate.
+    rms, held_out : px, root mean square of the residuals' lengths, on the views used, and on views
+        held out of the estimate of the camera (their poses are fitted).
+    compared : all candidate models and sets of coefficients.
     """
 
     camera: Camera
@@ -96,22 +105,22 @@ class CameraCalibration:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The findings' sentences."""
+        """Sentences of the findings."""
         return tuple(one.text for one in self.findings)
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the intrinsics (n,), 0 where not estimated."""
+        """Standard deviations (n,) of the intrinsics, 0 for those not estimated."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def inliers(self) -> Booleans:
-        """(V, N) corners in use: seen, and with at least half their weight."""
+        """Whether corners (V, N) are in use: detected, with a weight of at least one half."""
         return np.isfinite(self.residuals).all(axis=-1) & (self.weight >= 0.5)
 
     @property
     def correlations(self) -> tuple[tuple[str, str, float], ...]:
-        """Pairs of intrinsics that are hardly told apart, the strongest first."""
+        """Pairs of intrinsics with a strong correlation, the strongest first."""
         sigma = np.where(self.sigma > 0, self.sigma, 1.0)
         rho = self.covariance / sigma / sigma[:, None]
         names = self.camera.parameter_names
@@ -124,7 +133,7 @@ class CameraCalibration:
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
     def document(self) -> dict[str, Any]:
-        """Everything in plain data, for JSON; the camera as its file has it."""
+        """Calibration as plain data for JSON, with the camera as in its file."""
         names = self.camera.parameter_names
         return {
             "camera": self.camera.document(),
@@ -164,7 +173,7 @@ class CameraCalibration:
 def calibrate_photographs(
     paths: Sequence[Path | str], board: Board, model: str = "auto"
 ) -> CameraCalibration:
-    """Find the board in photographs of one size and calibrate the camera that took them."""
+    """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
     return calibrate_camera(detect_boards(paths, board), board, model)
 
@@ -172,28 +181,32 @@ def calibrate_photographs(
 def calibrate_camera(
     detections: Sequence[Detection], board: Board, model: str = "auto"
 ) -> CameraCalibration:
-    """Calibrate from corners that were found. model : pinhole, fisheye, unified, or auto.
+    """Calibrate a camera from detected corners.
 
-    Raises `InputError` where the views are too few or `model` does not fit, and `ResultError`
-    where the views do not determine the camera.
+    model : pinhole, fisheye, unified, or auto.
+    Raises `InputError` if the views are too few or `model` does not fit, and `ResultError` if the
+    views do not determine the camera.
     """
     _check_model_name(model)
     used = [detection for detection in detections if detection.success]
     check_enough(used, len(detections))
     image_size = used[0].image_size
     views = views_of(used, board)
+    # Choose the model and its coefficients on a subset of the corners.
     pool = camera_candidates(thinned(views), image_size, tuple(DISTORTION_CANDIDATES))
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)
     chosen = best_of(mine)
     model_warnings = check_model(model, chosen, best_of(pool))
+    # Fit all corners, with the covariance scaled by the disagreement of the views.
     fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
     spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views)
+    # Test on held-out views.
     tested = held_out(fit, views, board.lines)
     check_explained(tested.rms, fit.camera)
     inliers = (fit.weight >= 0.5) & views.visible
@@ -221,17 +234,18 @@ def calibrate_camera(
 
 
 def _check_model_name(model: str) -> None:
-    reference_values = ("auto", *DISTORTION_CANDIDATES)
-    if model not in reference_values:
+    """Raise InputError for an unknown camera model."""
+    models = ("auto", *DISTORTION_CANDIDATES)
+    if model not in models:
         raise InputError(
             "no such camera model",
             found=model,
-            expected=closest(model, reference_values) or listed(reference_values),
+            expected=closest(model, models) or listed(models),
         )
 
 
 def check_enough(used: Sequence[Any], taken: int) -> None:
-    """Raise `InputError` where fewer than three photographs show the board."""
+    """Raise `InputError` if fewer than LEAST_VIEWS images show the board."""
     if len(used) < LEAST_VIEWS:
         raise InputError(
             "too few photographs show the board",
@@ -241,7 +255,7 @@ def check_enough(used: Sequence[Any], taken: int) -> None:
 
 
 def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
-    """The chosen model cannot even be begun."""
+    """Error about a model for which no starting value gives finite pixels."""
     other = min(pool, key=lambda c: c.left_out) if pool else None
     return InputError(
         f"the model {model} does not fit the photographs",
@@ -252,7 +266,9 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
 
 
 def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]:
-    """Warnings about a model named by the user; `InputError` where it does not fit."""
+    """Warnings about a model chosen by the user that is worse than another; raises `InputError` if
+    it does not fit.
+    """
     if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
         return []
     ratio = chosen.left_out / best.left_out
@@ -274,11 +290,11 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]
 
 
 def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
-    """Raise `ResultError` where the views do not tell the focal length."""
+    """Raise `ResultError` if the views do not determine the focal length."""
     names = fit.camera.parameter_names
     mine = [names.index("focal.x"), names.index("focal.y")]
     if "xi" in names:
-        # Pixels a radian in the picture's middle, f / (1 + xi): f and xi alone are never sure.
+        # Pixels per radian at the centre, f / (1 + xi); f and xi alone are correlated.
         xi = names.index("xi")
         by = np.zeros((2, len(names)))
         by[[0, 1], mine] = 1.0
@@ -301,17 +317,17 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
 
 
 def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
-    """Raise `InputError` where the board's corners do not lie as its file has them, and
-    `ResultError` where too many fit no camera.
+    """Raise `InputError` if the corners contradict the board file, and `ResultError` if too many
+    corners are rejected.
     """
     check_numbering(fit.residuals, views.pixels, board, "the board file")
-    in_view = views.visible
-    lost = 1 - float((in_view & (fit.weight >= 0.5)).sum()) / max(int(in_view.sum()), 1)
-    if lost <= MOST_CORNERS_LOST:
+    visible = views.visible
+    rejected = 1 - float((visible & (fit.weight >= 0.5)).sum()) / max(int(visible.sum()), 1)
+    if rejected <= MOST_CORNERS_LOST:
         return
     raise ResultError(
         "too many of the board's corners do not fit the rest",
-        found=f"{lost:.0%} of them ({fit.camera.model} fits best)",
+        found=f"{rejected:.0%} of them ({fit.camera.model} fits best)",
         expected=f"{MOST_CORNERS_LOST:.0%} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",
@@ -319,7 +335,7 @@ def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
 
 
 def check_explained(rms: float, camera: Camera) -> None:
-    """Raise `ResultError` where not even the best model explains the photographs."""
+    """Raise `ResultError` if the best model does not explain the images."""
     limit = HELD_OUT_ERROR_LIMIT * camera.image_size[0]
     if rms <= limit:
         return
@@ -333,7 +349,7 @@ def check_explained(rms: float, camera: Camera) -> None:
 
 
 def tilts(T_camera_board: Array, points: Array) -> Array:
-    """Angle (V,) in degrees between the board's normal and the line of sight to its middle."""
+    """Angles (V,) in degrees between the board's normal and the line of sight to its centre."""
     middle = T_camera_board[:, :3, :3] @ points.mean(axis=0) + T_camera_board[:, :3, 3]
     normal = T_camera_board[:, :3, 2]
     across = np.linalg.norm(np.cross(normal, middle), axis=-1)
@@ -341,7 +357,9 @@ def tilts(T_camera_board: Array, points: Array) -> Array:
 
 
 def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
-    """Corners in each cell of the picture, COVERAGE_CELLS columns and rows, (rows, columns)."""
+    """Number of corners in each cell of the image, (rows, columns) for COVERAGE_CELLS columns and
+    rows.
+    """
     flat = pixels[np.isfinite(pixels).all(axis=-1)]
     edges = [
         np.linspace(-0.5, size - 0.5, n + 1)
@@ -351,7 +369,7 @@ def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
 
 
 def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
-    """Warnings about a camera's calibration that may be used."""
+    """Warnings about a usable camera calibration."""
     c = calibration
     missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.success]
     if missed:
@@ -379,7 +397,7 @@ def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
         if rms > ODD_VIEW_RMS_FACTOR * middle:
             yield doubtful("lens.odd_view", name, scale=rms / middle)
-    # xi with f, and the like: known together, not alone
+    # intrinsics that are determined only together with xi
     others = [
         f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in c.correlations if "xi" in (a, b)
     ]

@@ -1,4 +1,4 @@
-"""A board in photographs: detected in all of them, or what is wrong with them or its file."""
+"""Detection of a board in images, and diagnosis of images or board files that do not match."""
 
 from __future__ import annotations
 
@@ -25,58 +25,63 @@ from pkmcal.boards.layout import LEAST_MARKER_SIDE, another_grid, marker_layout
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
 
-BOARD_PHOTOGRAPHS_EXAMINED = 3
-"""Photographs that are examined more closely; one good one is enough."""
+BOARD_IMAGES_EXAMINED = 3
+"""Images examined for another board; a single sharp one would be enough."""
 SQUARE_MISCOUNTS_TRIED = 2
-"""Counts each way by which a description of a chessboard is tried wrong."""
+"""Largest miscount of a chessboard's columns or rows that is tried."""
 MOST_SQUARES = 16
+"""Columns and rows of a ChArUco board are tried up to below this number."""
 COUNTING_IMAGE_WIDTH = 512
-"""px; photographs are reduced to this width to try many counts of a chessboard on them: each try
-takes a quarter of a second there, a second and more at full size."""
+"""Width in px to which images are reduced to try many sizes of chessboards: a try takes a quarter
+of a second, and more than one second at full size."""
 LARGEST_FAMILY_DICTIONARY = 1000
-"""Markers in the largest dictionary of a family, whose first ones are the smaller dictionaries."""
+"""Number of markers in the largest dictionary of a family; the smaller dictionaries are its first
+ones."""
 OTHER_MARKER = 0.1
-"""Part by which markers must differ from their description: their corners are found to half a
-pixel or so, which is a twentieth of the smallest that are looked at."""
+"""Least relative difference between measured and described markers. Corners of markers are located
+to about half a pixel, a twentieth of the smallest markers used."""
 LEAST_MARKERS = 4
+"""Fewest markers for a measurement of their size."""
 NO_SIZE = 9999
-"""Of a dictionary that is alone."""
+"""Size of a dictionary that belongs to no family."""
 
 
 def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:
-    """Find the board in photographs: one detection each, with corners or with a reason.
+    """Detect the board in images; one detection each, with corners or with a reason.
 
-    Raises `InputError` where the photographs differ in size, or show another board than the one
-    described, all of them or some.
+    Raises `InputError` if the images differ in size, or if some or all of them show another board.
     """
     files = [Path(path) for path in paths]
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
-        detections = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
+        detections = list(
+            pool.map(lambda path: _detect_in_file(path, size, board, quick=True), files)
+        )
         if not any(detection.success for detection in detections):
-            # Before all that can be tried is tried on photographs of something else.
+            # Check for another board before the slow methods run on all images.
             check_boards(files, detections, board)
         missed = [k for k, detection in enumerate(detections) if not detection.success]
-        again = pool.map(lambda k: _detect(files[k], size, board, quick=False), missed)
+        again = pool.map(lambda k: _detect_in_file(files[k], size, board, quick=False), missed)
         for k, detection in zip(missed, again, strict=True):
             detections[k] = detection
-    check_any(detections, board)  # another board would have been told above
+    check_any(detections, board)  # a different board was reported above
     check_boards(files, detections, board)
     return tuple(detections)
 
 
-def _detect(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
+def _detect_in_file(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
+    """Detection in one image file."""
     return detect_board(decode(path, size, path.name), board, path.name, quick)
 
 
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:
-    """The photographs' one size; the odd ones are named."""
+    """Common size of the images; raises InputError naming images of another size."""
     if not files:
         raise InputError("no photographs were named", expected="photographs of the board")
-    sizes = {path: photograph_header(path) for path in files}
+    sizes = {path: image_header(path) for path in files}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     usual = max(counts, key=lambda size: counts[size])
     odd = [path for path, size in sizes.items() if size != usual]
@@ -95,44 +100,44 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
 
 
 def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: Board) -> None:
-    """Raise `InputError` where some or all photographs show another board than `board`."""
+    """Raise `InputError` if some or all images show a board other than `board`."""
     missed = [f for f, d in zip(files, detections, strict=True) if not d.success]
-    visible = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
-    display = [path for path, _ in visible]
+    detected = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
+    with_board = [path for path, _ in detected]
     size = detections[0].image_size
     other: str | None = None
     if board.type == "aruco_grid":
-        _check_grid([path for path, _ in visible[:BOARD_PHOTOGRAPHS_EXAMINED]], size, board)
-    for path, detection in visible[:BOARD_PHOTOGRAPHS_EXAMINED]:
-        # One photograph alone may show something beside the board that looks like more of it.
+        _check_grid([path for path, _ in detected[:BOARD_IMAGES_EXAMINED]], size, board)
+    for path, detection in detected[:BOARD_IMAGES_EXAMINED]:
+        # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
-            other = _larger(image, board)
+            other = _larger_chessboard(image, board)
         else:
             markers = detect_markers(image, dictionary(board.document["dictionary"]))
-            other = _beyond(image, board, markers)
+            other = _markers_beyond(image, board, markers)
             if other is None and board.type == "charuco":
                 _check_size(markers, board, detection, path)
         if other is None:
             break
     if other is not None:
-        raise _another(display[0], other, board)
-    for path in missed[:BOARD_PHOTOGRAPHS_EXAMINED]:
-        other = other_board(decode(path, size, path.name), board, part=not display)
-        if other is not None and not display:
-            raise _another(path, other, board)
+        raise _other_board_error(with_board[0], other, board)
+    for path in missed[:BOARD_IMAGES_EXAMINED]:
+        other = other_board(decode(path, size, path.name), board, part=not with_board)
+        if other is not None and not with_board:
+            raise _other_board_error(path, other, board)
         if other is not None:
             raise InputError(
                 "photographs of two boards are mixed",
                 where=path.name,
                 found=other,
-                expected=f"{board.described}, as in {listed([f.name for f in display], 3)}",
+                expected=f"{board.described}, as in {listed([f.name for f in with_board], 3)}",
                 next_step="Calibrate with the photographs of one board",
             )
 
 
 def check_any(detections: Sequence[Detection], board: Board) -> None:
-    """Raise `InputError` where no photograph shows the board."""
+    """Raise `InputError` if no image shows the board."""
     if not any(detection.success for detection in detections):
         raise InputError(
             "the board is in none of the photographs",
@@ -144,7 +149,8 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
         )
 
 
-def _another(path: Path, other: str, board: Board) -> InputError:
+def _other_board_error(path: Path, other: str, board: Board) -> InputError:
+    """Error about images of another board than the one described."""
     grid = board.type == "aruco_grid"
     first = f" with first_id: {board.document.get('first_id', 0)}" if grid else ""
     return InputError(
@@ -157,18 +163,20 @@ def _another(path: Path, other: str, board: Board) -> InputError:
 
 
 def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> None:
-    """Raise `InputError` where a grid's markers do not lie to each other as its file says."""
-    words = dictionary(board.document["dictionary"])
-    layout = marker_layout([detect_markers(decode(p, size, p.name), words) for p in paths])
+    """Raise `InputError` if the layout of a grid's markers contradicts its file."""
+    aruco_dictionary = dictionary(board.document["dictionary"])
+    layout = marker_layout(
+        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths]
+    )
     if layout is None:
         return
     other = another_grid(layout, board)
     if other is not None:
-        raise _another(paths[0], other, board)
+        raise _other_board_error(paths[0], other, board)
     marker, gap = board.document["marker"], board.document["gap"]
     if abs((1 + layout.gap) * marker / (marker + gap) - 1) <= OTHER_MARKER:
         return
-    # programs that write the gap as a part of the marker's side
+    # Some programs state the gap as a share of the marker's side.
     ratio = abs((1 + layout.gap) / (1 + gap) - 1) <= OTHER_MARKER
     raise InputError(
         "the gaps between the board's markers are not as its file says",
@@ -185,10 +193,10 @@ def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> N
 
 
 def _check_size(markers: Markers, board: Board, detection: Detection, path: Path) -> None:
-    """Raise `InputError` where a ChArUco board's markers have another size than described.
+    """Raise `InputError` if the markers of a ChArUco board have another size than described.
 
-    Corners stay right to 0.02 px with any size, yet those of squares that seem to be full of
-    marker, or empty, come out up to six times as uncertain as they are.
+    A wrong size changes corners by less than 0.02 px, but corners of squares that are described as
+    full, or empty, of marker get up to six times their true sigma.
     """
     share = marker_share(markers, board, detection)
     if share is None:
@@ -207,7 +215,9 @@ def _check_size(markers: Markers, board: Board, detection: Detection, path: Path
 
 
 def marker_share(markers: Markers, board: Board, detection: Detection) -> float | None:
-    """Width of a ChArUco board's markers in squares, by the corners found; None for too few."""
+    """Side of a ChArUco board's markers in units of its squares, from the detected corners; None
+    for too few markers.
+    """
     import cv2
 
     ids, corners = markers
@@ -222,17 +232,18 @@ def marker_share(markers: Markers, board: Board, detection: Detection) -> float 
         return None
     there = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
     shares = np.linalg.norm(np.diff(there, axis=1), axis=-1)
-    # the detector's corners lie on the outermost dark pixels' centres
+    # The detector's corners are centres of the outermost dark pixels.
     return float(np.median(shares * (wide + 1) / wide))
 
 
 def other_board(image: Integers, board: Board, part: bool) -> str | None:
-    """The board that a photograph shows in place of `board`, in words; None for none.
+    """Description of the board in an image if it is not `board`; None if there is none.
 
-    part : whether a part of a described chessboard is another one, or badly seen.
+    part : whether a part of the described chessboard counts as another board, not as a partial
+        detection.
     """
     if board.type == "chessboard":
-        # Markers first: they are looked for once, chessboards for every count.
+        # Markers first: one search, where chessboards need one for each size.
         return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
     name = board.document["dictionary"]
     if board.type == "charuco":
@@ -242,8 +253,8 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
     return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
 
 
-def _larger(image: Integers, board: Board) -> str | None:
-    """The larger chessboard of which the described one, which was found, is a part."""
+def _larger_chessboard(image: Integers, board: Board) -> str | None:
+    """Description of a larger chessboard that contains the described one; None if there is none."""
     columns, rows = board.counts
     for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
         if _all_corners(image, counts):
@@ -251,8 +262,10 @@ def _larger(image: Integers, board: Board) -> str | None:
     return None
 
 
-def _beyond(image: Integers, board: Board, markers: Markers) -> str | None:
-    """What the markers show that the described board, which was found, does not have."""
+def _markers_beyond(image: Integers, board: Board, markers: Markers) -> str | None:
+    """Description of detected markers that the described board does not have; None without at least
+    two.
+    """
     ids = markers.ids
     if board.type == "aruco_grid":
         ids = ids - board.document.get("first_id", 0)
@@ -269,7 +282,9 @@ def _beyond(image: Integers, board: Board, markers: Markers) -> str | None:
 
 
 def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> str | None:
-    """The counts near the described ones that fit; with (0, 0), of the usual ones."""
+    """Description of a chessboard whose size is near the described one and fits; with (0, 0), of
+    usual sizes.
+    """
     import cv2
 
     if counts == (0, 0):
@@ -281,7 +296,7 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
     if scale < 1:
         small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         image = small
-    # The largest first: a smaller grid is found inside a larger one.
+    # Largest first: smaller grids are also detected inside larger ones.
     for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
         if min(candidate) < 3 or candidate in (counts, counts[::-1]):
             continue
@@ -293,19 +308,21 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
 
 
 def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
-    """True where a chessboard of these counts is there, every corner of it looking like one."""
+    """Whether a chessboard of these counts is in the image with all corners fitted."""
     if find_chessboard(image, counts, quick=True) is None:
         return False
     return len(detect_board(image, chessboard(counts, 1.0)).ids) == counts[0] * counts[1]
 
 
 def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | None:
-    """The counts of squares, or the older pattern, with which most corners are found."""
+    """Description of the ChArUco board, by squares and pattern, with which most corners are
+    detected; None if no more than with `board`.
+    """
     ids, corners = markers
     if len(ids) < 2:
         return None
     most = int(ids.max()) + 1
-    # A board has at least as many markers as its highest says, and seldom twice as many.
+    # The highest marker id is a lower bound of the number of markers, rarely below half of it.
     layouts: list[dict[str, Any]] = [
         {**board.document, "squares": [columns, rows], "legacy": legacy}
         for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
@@ -329,40 +346,44 @@ def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | Non
 def _charuco_corners(
     image: Integers, data: dict[str, Any], ids: Integers, corners: Array
 ) -> tuple[int, float]:
-    """Corners of a ChArUco board between given markers, and their share of the board's."""
+    """Number of corners of a ChArUco board between given markers, and their share of all its
+    corners.
+    """
     marker_corners = [corner[None].astype(np.float32) for corner in corners]
     marker_ids = ids.astype(np.int32)[:, None]
     detector: Any = charuco_detector(data)
-    value: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
-    count = 0 if value is None else len(value)
+    corner_ids: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    count = 0 if corner_ids is None else len(corner_ids)
     columns, rows = data["squares"]
     return count, count / ((columns - 1) * (rows - 1))
 
 
 def _other_markers(image: Integers, mine: str) -> str | None:
-    """The dictionary whose markers the photograph shows; the smallest that has them all."""
-    # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search finds either's.
+    """Description of the dictionary whose markers the image shows, the smallest that contains them;
+    None for too few, or if most are of the dictionary ``mine``.
+    """
+    # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search covers the family.
     wanted = [
         n
         for n in dictionaries()
-        if _size_of(n) in (LARGEST_FAMILY_DICTIONARY, NO_SIZE) or n == mine
+        if _dictionary_size(n) in (LARGEST_FAMILY_DICTIONARY, NO_SIZE) or n == mine
     ]
-    # some names differ by a capital only
+    # some names differ only in case
     names = list({name.lower(): name for name in wanted}.values())
     ids = {name: detect_markers(image, dictionary(name)).ids for name in names}
     best = max(names, key=lambda name: len(ids[name]))
     count = len(ids[best])
     if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
         return None
-    if _size_of(best) == NO_SIZE:
+    if _dictionary_size(best) == NO_SIZE:
         return f"{count} markers of {best}"
     family = best.rpartition("_")[0]
-    sizes = [_size_of(n) for n in dictionaries() if n.rpartition("_")[0] == family]
+    sizes = [_dictionary_size(n) for n in dictionaries() if n.rpartition("_")[0] == family]
     size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
     return f"{count} markers of {family}_{size}"
 
 
-def _size_of(name: str) -> int:
-    """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
+def _dictionary_size(name: str) -> int:
+    """Number of markers in a dictionary by its name, DICT_5X5_100; NO_SIZE without a number."""
     last = name.rpartition("_")[2]
     return int(last) if last.isdigit() else NO_SIZE

@@ -1,8 +1,8 @@
-"""How the markers of a grid lie to each other in photographs, against how its file numbers them.
+"""Layout of a grid's markers in images, compared with the numbering in its file.
 
-Each marker is a square by itself, so the place of another one near it is known in sides of the
-square, whatever camera took the photograph. Neighbours along a row and down a column then tell the
-step of the ids along both, which of them begin a row, and the pitch; no pose and no lens is needed.
+Each marker is a square, so the position of a neighbour is known in units of the square's side for
+any camera. Neighbours along rows and columns determine the steps of the ids, the ids at which rows
+begin, and the pitch, without a pose or a lens model.
 """
 
 from __future__ import annotations
@@ -19,24 +19,26 @@ from pkmcal.boards.board import Board
 from pkmcal.boards.find import Markers
 
 LARGEST_LATTICE_MISFIT = 0.25
-"""Pitches by which a neighbour may lie beside its place on the lattice."""
+"""Largest distance of a neighbour from its lattice point, in pitches."""
 LEAST_MARKER_SIDE = 10.0
-"""px; corners are found to half a pixel or so, a twentieth of the smallest that are looked at."""
+"""Shortest side of a marker, px; corners are located to about half a pixel, a twentieth of it."""
 LEAST_NEIGHBOURS = 4
-"""Pairs that tell how ids go on along rows, or down columns."""
+"""Fewest pairs of neighbours that determine the step of the ids along rows or columns."""
 LEAST_AGREEMENT = 0.8
-"""Part of the pairs that agree on it; ids that are read wrong are few."""
+"""Least share of the pairs that agree on a step; misread ids are rare."""
 LEAST_CONTRADICTIONS = 2
-"""Pairs of neighbours in one row that a description puts into two, before it is wrong."""
+"""Fewest contradictions to a described numbering, pairs of row neighbours in different rows or ids
+out of range, for which it is wrong."""
 
 
 @dataclass(frozen=True)
 class MarkerLayout:
-    """How markers lie in photographs.
+    """Layout of markers in images.
 
-    along, down : steps of the ids to the right neighbour and to the one below. gap : between two
-    markers, in sides of one. within_rows : pairs of ids (i, i + along) that are neighbours in a
-    row, by how often. ids : all that were found.
+    along, down : steps of the ids to the right neighbour and to the one below.
+    gap : between two markers, in marker sides.
+    within_rows : number of occurrences of each pair of ids (i, i + along) as neighbours in a row.
+    ids : all ids detected.
     """
 
     along: int
@@ -46,23 +48,25 @@ class MarkerLayout:
     ids: frozenset[int]
 
     def breaks(self, first: int) -> int:
-        """Times that neighbours of a row would stand in two if the first marker had an id."""
+        """Number of row neighbours that are in different rows if the first marker has this id."""
         columns = abs(self.down)
         pairs = self.within_rows.items()
         return sum(n for (_, right), n in pairs if (right - first) % columns == 0)
 
     def first_ids(self) -> list[int]:
-        """Ids that the first marker may have: those that begin a row, below all that were found,
-        the largest first.
+        """Possible ids of the first marker, largest first: they begin a row and are not above any
+        detected id.
         """
         least = min(self.ids)
         return [k for k in range(least, max(least - self.down, -1), -1) if not self.breaks(k)]
 
 
 class _Neighbours(NamedTuple):
-    """Pairs of neighbours in a photograph: ids (n, 2), and the step (n, 2) from one to the other.
+    """Pairs of neighbours in one image.
 
-    pitch : distances (m,) of the nearest ones, in sides of a marker.
+    ids : (n, 2).
+    step : (n, 2) lattice step from the first to the second.
+    pitch : (n,) distance in marker sides.
     """
 
     ids: Array
@@ -70,32 +74,32 @@ class _Neighbours(NamedTuple):
     pitch: Array
 
 
-def marker_layout(photographs: Sequence[Markers]) -> MarkerLayout | None:
-    """The layout that photographs show, None where they do not show one."""
-    results = [part for markers in photographs if (part := _neighbours(markers)) is not None]
-    if not results:
+def marker_layout(images: Sequence[Markers]) -> MarkerLayout | None:
+    """Layout of the markers in images; None if there are too few neighbours or they disagree."""
+    neighbours = [part for markers in images if (part := _neighbours(markers)) is not None]
+    if not neighbours:
         return None
-    ids = np.concatenate([part.ids for part in results])
-    step = np.concatenate([part.step for part in results])
+    ids = np.concatenate([part.ids for part in neighbours])
+    step = np.concatenate([part.step for part in neighbours])
     difference = ids[:, 1] - ids[:, 0]
-    along = _usual(difference[step[:, 0] == 1])
-    down = _usual(difference[step[:, 1] == 1])
+    along = _common_step(difference[step[:, 0] == 1])
+    down = _common_step(difference[step[:, 1] == 1])
     if along is None or down is None:
         return None
     rows = ids[(step[:, 0] == 1) & (difference == along)].tolist()
     return MarkerLayout(
         along,
         down,
-        float(np.median(np.concatenate([part.pitch for part in results]))) - 1,
+        float(np.median(np.concatenate([part.pitch for part in neighbours]))) - 1,
         Counter((i, j) for i, j in rows),
         frozenset(int(number) for number in ids.flat),
     )
 
 
 def another_grid(layout: MarkerLayout, board: Board) -> str | None:
-    """What the markers show in place of a described grid, in words; None where it is as described.
+    """Description of a detected grid that differs from the one described; None if they agree.
 
-    The pitch is not judged.
+    The pitch is not compared.
     """
     columns, rows = board.counts
     first, count = board.document.get("first_id", 0), columns * rows
@@ -117,32 +121,35 @@ def another_grid(layout: MarkerLayout, board: Board) -> str | None:
     return f"markers {', '.join(map(str, beyond[:4]))} beyond its {count}" if beyond else None
 
 
-def _usual(differences: Array) -> int | None:
-    """The step on which most pairs agree."""
+def _common_step(differences: Array) -> int | None:
+    """Most frequent difference of ids; None if LEAST_AGREEMENT of the pairs do not share it."""
     if len(differences) < LEAST_NEIGHBOURS:
         return None
-    values, counts = np.unique(differences, return_counts=True)
+    steps, counts = np.unique(differences, return_counts=True)
     best = int(np.argmax(counts))
-    return int(values[best]) if counts[best] >= LEAST_AGREEMENT * len(differences) else None
+    return int(steps[best]) if counts[best] >= LEAST_AGREEMENT * len(differences) else None
 
 
 def _neighbours(markers: Markers) -> _Neighbours | None:
-    """Those of one photograph."""
+    """Neighbours in one image; None if there are none."""
+    # Markers that are large enough.
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
     large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER_SIDE
     ids, corners = ids[large], corners[large]
     if len(ids) < 2:
         return None
-    # the detector's corners lie on the outermost dark pixels' centres
+    # The detector's corners are centres of the outermost dark pixels: enlarge the axes.
     bigger = (wide[large].mean(axis=1) + 1) / wide[large].mean(axis=1)
+    # Axes of each marker, and offsets to all others in units of its sides, (n, n, 2).
     right = (corners[:, 1] - corners[:, 0] + corners[:, 2] - corners[:, 3]) / 2
     below = (corners[:, 3] - corners[:, 0] + corners[:, 2] - corners[:, 1]) / 2
     axes = np.stack([right, below], axis=-1) * bigger[:, None, None]
     middle = corners.mean(axis=1)
     off = np.linalg.solve(axes[:, None], (middle[None] - middle[:, None])[..., None])[..., 0]
-    # both ways together: what perspective makes of a step cancels
+    # Average of the steps i to j and, reversed, j to i: first-order perspective cancels.
     off = (off - off.swapaxes(0, 1)) / 2
+    # Steps on the lattice, in pitches.
     distance = np.linalg.norm(off, axis=-1)
     np.fill_diagonal(distance, np.inf)
     nearest = distance.min(axis=1)

@@ -1,17 +1,16 @@
-"""A calibration board in a station's photographs: from its corners to measured poses.
+"""Calibration board in a station's images: from corners to measured poses.
 
-Every photograph that shows the board gives a pose by maximum likelihood from all its corners with
-their noise; corners far off lose their weight, and a board that is partly hidden counts by what
-is seen of it. A board on the platform is somewhere else in every configuration, each of which is
-one measurement, by the mean of its repeats (:func:`one_a_configuration`). A board on the base is
-always in the same place: its photographs are one measurement, by the means of their corners
-(:func:`standing_board`).
+Each image that shows the board gives a maximum-likelihood pose from all its corners with their
+noise. Corners are weighted robustly; a partly occluded board counts by its visible corners. A board
+on the platform has another pose in each configuration, and the mean of the repeats of a
+configuration is one measurement (:func:`one_a_configuration`). A board on the base has one pose,
+and the means of its corners over all images are one measurement (:func:`standing_board`).
 
-A pose's uncertainty here is that of its corners: their noise in the picture, and what camera
-model and board leave unexplained. What the camera's calibration may be wrong by is not in it.
-That error is common to all photographs of a camera; as noise of each pose on its own it would
-average out over the photographs, which it does not do. ``BoardPoses.by_intrinsics`` says how it
-moves them.
+The uncertainty of a pose comes from its corners: their noise in the image, and residuals that
+camera model and board leave unexplained. The uncertainty of the camera's calibration is not
+included: this error is common to all images of a camera, and as independent noise of each pose it
+would falsely average out. ``BoardPoses.by_intrinsics`` is the derivative of the poses by the
+intrinsics.
 """
 
 from __future__ import annotations
@@ -44,36 +43,43 @@ from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import count, listed
 
 BOARD_RESIDUAL_LIMIT = 0.004
-"""Share of the image's width that corners lie off their prediction, rms, from which the board file
-or the camera file is wrong; good ones leave a hundredth of it."""
+"""Rms of the corners' residuals, as a share of the image's width, above which the board file or the
+camera file is wrong; correct files leave a hundredth of this limit."""
 LEAST_CORNERS_WEIGHED = 6
-"""Corners with weight below which a pose is not tested by any corner."""
+"""Least sum of the corners' weights of a usable pose; with fewer, no corner is redundant."""
 TWO_TILTS = 25.0
-"""Chi square by which a board must speak against its other tilt, which looks alike from afar."""
+"""Least difference of chi square between a pose and the board's other tilt, which from afar looks
+the same."""
 UNSURE_BOARD_REASON = "the board: too few corners agree on one pose, or its tilt is not sure"
+"""Reason for the rejection of a pose."""
 STILL_BOARD_DIFFERENCE = 0.2
-"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
-tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
+"""Difference between two images of a still board allowed beyond noise, px rms over the board. A
+camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of legs,
+which are as uncertain."""
 MOVED_BOARD_DEVIATIONS = 4.0
-"""Standard deviations of a photograph's own noise beyond that."""
+"""Standard deviations of the images' own noise allowed in addition."""
 MOST_ODD = 1 / 3
-"""Share of the photographs that may disagree one by one; with more, the board was never still."""
+"""Largest share of single images that disagree; with more, the board never stood still."""
 _EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
     "station show the board in one place"  # fmt: skip
 MOST_COMMON = 0.99
+"""Largest share of a pose's covariance that repeats have in common."""
 ODD_BOARD_REASON = "the board lies {:.1f} standard deviations from where the repeats show it"
 ODD_BOARD_DEVIATIONS = 5.0
-"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
-which it is not one of them."""
+"""Distance of a repeat from the median repeat, in standard deviations (root mean square of six
+numbers), above which it is rejected."""
 
 
 @dataclass(frozen=True)
 class BoardViews:
-    """One station's K photographs of a board, of which F show it.
+    """A station's K images of a board, of which F show it.
 
-    configuration : (K,) rows of the session's readings. detections : K. numbers : (F,) the
-    photographs that show it. views, poses : of these. rms : (F,) px. usable : (F,) True where the
-    pose is sure.
+    configuration : (K,) rows of the session's readings.
+    detections : K.
+    numbers : (F,) indices of the images that show the board.
+    views, poses : of these F images.
+    rms : (F,) px.
+    usable : (F,) whether the pose is unambiguous and has enough corners.
     """
 
     station: int
@@ -89,28 +95,28 @@ class BoardViews:
 
     @property
     def names(self) -> list[str]:
-        """Names of the photographs that show the board."""
+        """Names of the images that show the board."""
         return [self.detections[k].name for k in self.numbers]
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
-        """Photographs without a pose, with the reason."""
+        """Images without a pose, with the reason."""
         missed = [(k, f"the board: {d.reason}") for k, d in enumerate(self.detections) if d.reason]
         unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.numbers[~self.usable]]
         return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
 
     def rejection(self, photograph: int, reason: str) -> Rejection:
-        """One photograph's board left out; photograph : its number among the K."""
+        """Rejection of the board in one image; photograph : index among the K images."""
         return Rejection(self.station, int(self.configuration[photograph]), -1, -1, -1, reason)
 
 
 def detect_in(
     images: Sequence[Integers], board: Board, names: Sequence[str]
 ) -> tuple[Detection, ...]:
-    """The board's corners in photographs, by the first way of finding it."""
+    """Corners of the board in images, by the fast method."""
 
     def detect(k: int) -> Detection:
-        # Taken in the thread, so that photographs may be decoded there.
+        # Indexed in the thread, where a lazy sequence decodes the image.
         return detect_board(images[k], board, names[k], quick=True)
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -120,9 +126,9 @@ def detect_in(
 def detect_again(
     images: Sequence[Integers], board: Board, detections: Sequence[Detection], most: int
 ) -> tuple[Detection, ...]:
-    """Where the board was not found, every way is tried, on `most` photographs spread over these.
+    """Detections with all methods tried on `most` of the images without the board, evenly spread.
 
-    Only a chessboard has more than one way, and it takes seconds.
+    Only chessboards have slow methods, which take seconds.
     """
     missed = [k for k, detection in enumerate(detections) if not detection.success]
     if board.type != "chessboard" or not missed or most < 1:
@@ -143,30 +149,39 @@ def board_views(
     board: Board,
     detections: Sequence[Detection],
 ) -> BoardViews:
-    """Poses of the board in one station's photographs.
+    """Poses of the board in a station's images.
 
-    detections : one a photograph. Raises `InputError` where the corners cannot be this board's,
-    or this camera's.
+    detections : one for each image.
+    Raises `InputError` if the corners contradict the board file or the camera file.
     """
     _check_sides(board, detections)
-    visible = np.flatnonzero([detection.success for detection in detections])
+    with_board = np.flatnonzero([detection.success for detection in detections])
     views = views_of([detection for detection in detections if detection.success], board)
     poses = board_poses(camera, views)
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
-    usable = (used >= LEAST_CORNERS_WEIGHED) & _one_tilt(camera, views, poses)
-    in_view = BoardViews(
-        station, camera, board, configuration, tuple(detections), visible, views, poses, rms, usable
+    usable = (used >= LEAST_CORNERS_WEIGHED) & _tilt_is_unique(camera, views, poses)
+    station_views = BoardViews(
+        station,
+        camera,
+        board,
+        configuration,
+        tuple(detections),
+        with_board,
+        views,
+        poses,
+        rms,
+        usable,
     )
-    _check_explained(in_view)
-    return in_view
+    _check_explained(station_views)
+    return station_views
 
 
 def pose_set(
     station: int, configuration: Integers, mount: int, T_camera_board: Array, covariance: Array
 ) -> PoseSet:
-    """Poses (N, 4, 4) of one station with their covariances (N, 6, 6) as measurements."""
+    """Measurements from poses (N, 4, 4) of one station with their covariances (N, 6, 6)."""
     n = len(configuration)
     return PoseSet(
         station=np.full(n, station),
@@ -177,20 +192,22 @@ def pose_set(
     )
 
 
-def _one_tilt(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
-    """(V,) True where the corners tell the pose from the board tilted the other way."""
+def _tilt_is_unique(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
+    """Whether the corners exclude the second local minimum of the pose, the board tilted the other
+    way, (V,).
+    """
     if not len(poses.T_camera_board):
         return np.zeros(0, dtype=bool)
     scale = np.sqrt(poses.weight / (views.sigma**2 + poses.noise**2))
     first, cost = fit_board_poses(camera, views, poses.T_camera_board, scale)
     second, other = fit_board_poses(camera, views, tilted_back(first, views.points), scale)
-    # Where both searches end in one place there is no other tilt.
+    # If both searches converge to one pose there is no second minimum.
     same = np.linalg.norm((second - first)[:, :3, :3], axis=(1, 2)) < 1e-3
     return same | (other > cost + TWO_TILTS)
 
 
 def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
-    """Raise `InputError` for a board, or photographs, that leave the board's axes open."""
+    """Raise `InputError` for a board with a rotational symmetry, and for mirrored images."""
     if board.turnable:
         raise InputError(
             "the board cannot be told from itself turned by half a turn, so its pose is not known",
@@ -220,7 +237,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
 
 
 def _check_explained(views: BoardViews) -> None:
-    """Raise `InputError` where the corners do not lie as board and camera files say."""
+    """Raise `InputError` if the corners contradict board and camera files."""
     check_numbering(views.poses.residuals, views.views.pixels, views.board, "board.yaml")
     limit = BOARD_RESIDUAL_LIMIT * views.camera.image_size[0]
     if not len(views.rms) or np.median(views.rms) <= limit:
@@ -237,13 +254,15 @@ def _check_explained(views: BoardViews) -> None:
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a board stood, from the photographs that agree.
+    """Pose of a board that stands still, from the images that agree.
 
-    T_camera_board : (4, 4). covariance : (6, 6), left perturbation, by the corners alone.
-    agreed : (F,) photographs used, of those that show the board. scatter : px, rms over the board
-    and these photographs of their distance from the mean; nan where there is only one.
+    T_camera_board : (4, 4).
+    covariance : (6, 6), left perturbation, from the corners alone.
+    agreed : (F,) images used, of those that show the board.
+    scatter : px, rms over the board and these images of the distance from the mean; nan for one
+        image.
     noise : px rms beyond the corners' noise that the mean leaves unexplained.
-    rejected : photographs that disagree.
+    rejected : images that disagree.
     """
 
     T_camera_board: Array
@@ -254,30 +273,32 @@ class Standing:
     rejected: tuple[Rejection, ...]
 
     def poses(self, views: BoardViews, mount: int) -> PoseSet:
-        """One measurement; the configuration of its row says nothing, for nothing moves."""
+        """Single measurement of the pose; its configuration is arbitrary because the board does not
+        move.
+        """
         row = views.configuration[views.numbers[self.agreed]][:1]
-        actual_names = pose_set(
+        poses = pose_set(
             views.station, row, mount, self.T_camera_board[None], self.covariance[None]
         )
         by = views.poses.by_intrinsics[self.agreed].mean(axis=0)[None]
-        return replace(actual_names, by_intrinsics=by)
+        return replace(poses, by_intrinsics=by)
 
 
 def standing_board(views: BoardViews) -> Standing | None:
-    """The board's one pose in a station's photographs; None where none shows it surely.
+    """Pose of a still board in a station's images; None if no image has a usable pose.
 
-    Raises `InputError` where the board or the camera was moved between photographs.
+    Raises `InputError` if the board or the camera moved between images.
     """
     if not views.usable.any():
         return None
-    there, noise = _places(views)
-    agreed = _agreed(there, noise, views.usable)
+    there, noise = _projected_corners(views)
+    agreed = _consistent_images(there, noise, views.usable)
     odd = views.usable & ~agreed
     _check_still(views, there, agreed)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
     scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
-    distance = _distance(there, there[agreed].mean(axis=0))
+    distance = _rms_distance(there, there[agreed].mean(axis=0))
     return Standing(
         T_camera_board,
         covariance,
@@ -294,9 +315,9 @@ def standing_board(views: BoardViews) -> Standing | None:
     )
 
 
-def _places(views: BoardViews) -> tuple[Array, Array]:
-    """Where each photograph's pose puts the board's corners, (F, N, 2) px, and the standard
-    deviation of that, rms over the board, (F,) px.
+def _projected_corners(views: BoardViews) -> tuple[Array, Array]:
+    """Projected corners (F, N, 2) px by each image's pose, and their standard deviation, rms over
+    the board, (F,) px.
     """
     T = views.poses.T_camera_board[:, None]
     there = apply(T, views.board.points)
@@ -306,29 +327,29 @@ def _places(views: BoardViews) -> tuple[Array, Array]:
     return views.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
 
 
-def _agreed(there: Array, noise: Array, usable: Booleans) -> Booleans:
-    """(F,) the photographs that agree with the one that agrees with the most others."""
+def _consistent_images(there: Array, noise: Array, usable: Booleans) -> Booleans:
+    """Largest set of images (F,) that agree with one of them."""
     limit = np.sqrt(
         STILL_BOARD_DIFFERENCE**2 + MOVED_BOARD_DEVIATIONS**2 * (noise[:, None] ** 2 + noise**2)
     )
-    agree = (_distance(there[:, None], there) <= limit) & usable & usable[:, None]
+    agree = (_rms_distance(there[:, None], there) <= limit) & usable & usable[:, None]
     return agree[int(np.argmax(agree.sum(axis=1)))]
 
 
-def _distance(there: Array, other: Array) -> Array:
-    """Root mean square over the board of the distance of its corners; (..., N, 2) px."""
+def _rms_distance(there: Array, other: Array) -> Array:
+    """Root mean square over the board of the distances of corners (..., N, 2) px."""
     return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
 
 
 def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
-    """Raise `InputError` where photographs disagree that follow one another, or too many do."""
+    """Raise `InputError` if consecutive images disagree with the rest, or too many others."""
     used = np.flatnonzero(views.usable)
     runs = [
         (bool(same), [int(k) for k in run]) for same, run in groupby(used, key=lambda k: agreed[k])
     ]
     long = next((n for n, (same, run) in enumerate(runs) if not same and len(run) > 1), None)
     if long is not None:
-        # A run at the beginning ends with the movement, any other begins with it.
+        # The movement ends a run at the beginning, and begins any other run.
         before, after = (runs[long][1], runs[long + 1][1]) if long == 0 else (
             runs[long - 1][1], runs[long][1]
         )  # fmt: skip
@@ -346,9 +367,11 @@ def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
 def _movement_error(
     views: BoardViews, there: Array, before: list[int], after: list[int]
 ) -> InputError:
-    """The error that names the photographs between which the board moved."""
+    """Error with the names of the images between which the board moved, and the size of the
+    movement.
+    """
     names, poses = views.names, views.poses.T_camera_board
-    pixels = float(_distance(there[before[-1]], there[after[0]]))
+    pixels = float(_rms_distance(there[before[-1]], there[after[0]]))
     middle = views.board.points.mean(axis=0)
     metres = float(np.linalg.norm(np.diff(apply(poses[[before[-1], after[0]]], middle), axis=0)))
     turn = float(np.linalg.norm(pose_difference(poses[after[0]], poses[before[-1]])[:3]))
@@ -364,37 +387,45 @@ def _movement_error(
 
 
 def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]:
-    """The pose by the means of the corners over photographs, its covariance (6, 6), and the
-    noise px that the means leave unexplained.
+    """Pose from the corners' means over images, its covariance (6, 6), and the noise px that the
+    means leave unexplained.
 
-    What the photographs do not share (pixel noise) averages out, and its size is told by their
-    scatter; what they share (the camera model, the board's print) remains, and does not.
+    Errors that differ between images (pixel noise) average out; their size is estimated from the
+    scatter. Errors common to all images (camera model, printing) remain in the residuals of the
+    mean.
     """
     views, poses = board_views.views, board_views.poses
+    # Means (N, 2) of the corners over the images.
     used = agreed[:, None] & (poses.weight > 0.5)
     count = used.sum(axis=0)
     pixels = np.where(used[..., None], views.pixels, 0.0).sum(axis=0)
     pixels = np.where(count[:, None] > 0, pixels / np.maximum(count, 1)[:, None], np.nan)
+    # Their noise, from the scatter over the images.
     off = np.where(used[..., None], views.pixels - pixels, 0.0)
     freedom = 2 * int(np.sum(np.maximum(count - 1, 0)))
     single = np.sqrt(np.where(used, views.sigma**2, 0.0).sum(axis=0) / np.maximum(count, 1))
     noise = np.sqrt(np.sum(off**2) / freedom) if freedom > 0 else single
     sigma = noise / np.sqrt(np.maximum(count, 1))
     mean = board_poses(board_views.camera, Views(views.points, pixels[None], sigma[None]))
-    covariance = mean.covariance[0] + _wandering(board_views, agreed, mean.T_camera_board[0], noise)
+    covariance = mean.covariance[0] + _common_motion_covariance(
+        board_views, agreed, mean.T_camera_board[0], noise
+    )
     return mean.T_camera_board[0], covariance, mean.noise
 
 
-def _wandering(views: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array) -> Array:
-    """Covariance (6, 6) of the mean by what moves the whole board from photograph to photograph
-    (a floor that shakes), beyond what the corners' noise does; zero where there is no more.
+def _common_motion_covariance(
+    views: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array
+) -> Array:
+    """Covariance (6, 6) of the mean pose from movements of the whole board between images (a
+    shaking floor), beyond the corners' noise; zero if there are none.
     """
     count = int(agreed.sum())
     if count < 2:
         return np.zeros((6, 6))
     sigma2 = np.mean(views.views.sigma[views.views.visible] ** 2) + views.poses.noise**2
-    # each pose's covariance, had its corners only the noise that differs between photographs
+    # Covariance of each pose with only the part of the noise that differs between images.
     each = views.poses.covariance[agreed] * (np.mean(np.square(noise)) / sigma2)
+    # Excess scatter of the poses over this noise.
     off = pose_difference(views.poses.T_camera_board[agreed], T_camera_board)
     chi2 = np.einsum("fi,fij,fj->", off, np.linalg.inv(each), off)
     spread = chi2 / (6 * (count - 1))
@@ -402,8 +433,13 @@ def _wandering(views: BoardViews, agreed: Booleans, T_camera_board: Array, noise
 
 
 class MeanPoses(NamedTuple):
-    """One pose a configuration, (G,); which repeats took part (N,), and how far each lies off (N,),
-    in standard deviations.
+    """One pose for each of G configurations.
+
+    first : (G,) row of the first repeat in use.
+    pose : (G, 4, 4).
+    covariance : (G, 6, 6).
+    used : (N,) repeats in use.
+    off : (N,) distance of each repeat from the median, in standard deviations.
     """
 
     first: Integers
@@ -414,69 +450,78 @@ class MeanPoses(NamedTuple):
 
 
 def mean_poses(configuration: Integers, T: Array, covariance: Array, common: float) -> MeanPoses:
-    """The mean pose of each configuration's repeats.
+    """Mean pose over the repeats of each configuration, with outliers rejected.
 
-    configuration : (N,). T : (N, 4, 4). covariance : (N, 6, 6), left perturbation. common : share
-    of it that the repeats have in common.
+    configuration : (N,).
+    T : (N, 4, 4).
+    covariance : (N, 6, 6), left perturbation.
+    common : share of the covariance that the repeats have in common.
     """
+    # Reject repeats far from the median of their configuration.
     groups = groups_of(configuration)
     delta = pose_difference(T, T[groups.first[groups.member]])
     off = _deviation(delta - groups.median(delta)[groups.member], covariance)
-    # Of two that differ nobody knows which is wrong, so both stay and their scatter tells.
-    several = groups.count[groups.member] > 2
-    usual = float(np.median(off[several])) if several.any() else 1.0
-    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~several
-    retained = groups_of(configuration[used])
+    # With two repeats the outlier is unknown: both stay, and their scatter increases sigma.
+    repeated = groups.count[groups.member] > 2
+    usual = float(np.median(off[repeated])) if repeated.any() else 1.0
+    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~repeated
+    # Mean of the rest.
+    groups_used = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
-    mean, stated = retained.mean(delta), retained.mean(covariance_used)
-    alone = (1 - common) * stated
-    rest = delta - mean[retained.member]
-    freedom = float(np.sum(retained.count - 1))
+    mean, stated = groups_used.mean(delta), groups_used.mean(covariance_used)
+    # The part of the covariance that averages out, scaled up if the repeats scatter by more.
+    independent = (1 - common) * stated
+    residual = delta - mean[groups_used.member]
+    freedom = float(np.sum(groups_used.count - 1))
     spread = 1.0
     if freedom:
-        size = np.sum(_deviation(rest, alone[retained.member]) ** 2)
+        size = np.sum(_deviation(residual, independent[groups_used.member]) ** 2)
         spread = max(float(size) / freedom, 1.0)
-    total = common * stated + spread * alone / retained.count[:, None, None]
-    first = np.flatnonzero(used)[retained.first]
-    reference = T[groups.first[groups.member]][used][retained.first]
+    total = common * stated + spread * independent / groups_used.count[:, None, None]
+    first = np.flatnonzero(used)[groups_used.first]
+    reference = T[groups.first[groups.member]][used][groups_used.first]
     return MeanPoses(first, perturb(reference, mean), total, used, off)
 
 
 def _deviation(delta: Array, covariance: Array) -> Array:
-    """Root mean square (N,) of six numbers (N, 6) in standard deviations."""
+    """Root mean square (N,) of six whitened numbers (N, 6)."""
     white = np.linalg.solve(np.linalg.cholesky(covariance), delta[..., None])[..., 0]
     return np.sqrt(np.mean(white**2, axis=-1))
 
 
 def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
-    """A board on the platform: one measurement a configuration, and the repeats that are odd."""
-    retained_rows = np.flatnonzero(views.usable)
-    rows = views.configuration[views.numbers[retained_rows]]
-    if not len(retained_rows):
+    """Measurements of a board on the platform, one for each configuration, and rejections of
+    outlying repeats.
+    """
+    usable = np.flatnonzero(views.usable)
+    rows = views.configuration[views.numbers[usable]]
+    if not len(usable):
         return PoseSet.empty(), ()
     sigma2 = float(np.median(views.views.sigma[views.views.visible]) ** 2)
     noise2 = views.poses.noise**2
     common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
-    value = mean_poses(
+    means = mean_poses(
         rows,
-        views.poses.T_camera_board[retained_rows],
-        views.poses.covariance[retained_rows],
+        views.poses.T_camera_board[usable],
+        views.poses.covariance[usable],
         common,
     )
     odd = tuple(
-        views.rejection(int(views.numbers[retained_rows[k]]), ODD_BOARD_REASON.format(value.off[k]))
-        for k in np.flatnonzero(~value.used)
+        views.rejection(int(views.numbers[usable[k]]), ODD_BOARD_REASON.format(means.off[k]))
+        for k in np.flatnonzero(~means.used)
     )
-    poses = pose_set(views.station, rows[value.first], mount, value.pose, value.covariance)
-    by = groups_of(rows[value.used]).mean(views.poses.by_intrinsics[retained_rows[value.used]])
+    poses = pose_set(views.station, rows[means.first], mount, means.pose, means.covariance)
+    by = groups_of(rows[means.used]).mean(views.poses.by_intrinsics[usable[means.used]])
     return replace(poses, by_intrinsics=by), odd
 
 
 def board_size_violation(poses: PoseSet, mount: int, file: str) -> ModelViolation:
-    """A board whose squares are not as large as its file says, by more than its tolerance.
+    """Model violation of a board whose size differs from its file beyond the prior sigma.
 
-    mount : the board's number. Where the size is an unknown with a tolerance, freeing it takes the
-    unknown back to what the file says: the value that fits is the whole difference.
+    mount : the board's number.
+
+    The violation has no prior, so if the size is also an unknown with one, the estimate is the full
+    difference from the file.
     """
     by = np.zeros((len(poses), 6, 1))
     mine = poses.mount == mount

@@ -1,12 +1,12 @@
-"""A board's print: its black cells to the last module, and a sheet of paper with them.
+"""Printed pattern of a board: its black cells down to single modules, and a PDF page with them.
 
-The sheet is a PDF page of plain rectangles in true size, which any printer prints to a tenth of a
-millimetre as long as nobody lets it "fit to page"; lines of a known length beside the board show
-whether somebody did.
+The page consists of plain rectangles in true size, which printers reproduce to a tenth of a
+millimetre unless "fit to page" is active; rulers of known length beside the board reveal this.
 """
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,24 +21,26 @@ from pkmcal.errors import InputError
 from pkmcal.files import closest
 
 PDF_POINT = 0.0254 / 72
-"""m; PDF's unit of length."""
+"""PDF's unit of length, m."""
 PAPER_SIZES = {
     "a4": (0.210, 0.297), "letter": (0.2159, 0.2794), "a3": (0.297, 0.420),
     "tabloid": (0.2794, 0.4318), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189),
 }  # fmt: skip
-"""Width and height, m, upright."""
+"""Width and height in portrait format, m."""
 UNPRINTABLE_EDGE_WIDTH, LETTERING_STRIP_WIDTH = 0.008, 0.022
-"""m; what printers leave white at an edge, and the strip for ruler and words at the left and below:
-a board needs white paper round it as well."""
+"""White margin of printers, and width of the strip for ruler and text at the left and below, m. A
+board also needs a white border."""
 PRINTED_RULER_LENGTHS = (0.2, 0.1, 0.05)
-"""m; lengths of the lines to measure, the longest that is no longer than the board."""
+"""Lengths of printed rulers, m; the longest that is not longer than the board is used."""
 PRINTED_LETTER_POINTS = 8
-"""Points."""
+"""Size of the text in points."""
 
 
 @dataclass(frozen=True)
 class Print:
-    """What is printed: cells between x (nx + 1,) and y (ny + 1,), m, board frame; dark (ny, nx)."""
+    """Printed pattern: cells with edges x (nx + 1,) and y (ny + 1,), m, board frame; dark :
+    (ny, nx).
+    """
 
     x: Array
     y: Array
@@ -46,7 +48,7 @@ class Print:
 
     @classmethod
     def of(cls, board: Board) -> Print:
-        """A board's cells: squares, and inside them the modules of the markers."""
+        """Pattern of a board: squares, with the modules of the markers inside."""
         data = board.document
         if board.type == "chessboard":
             columns, rows = (n + 1 for n in board.counts)
@@ -56,13 +58,14 @@ class Print:
         return _charuco(data) if board.type == "charuco" else _markers(data)
 
     def dark_at(self, x: Array, y: Array) -> Booleans:
-        """Whether points (n,) of the board's plane are black; white outside the print."""
+        """Whether points (n,) of the board's plane are black; white outside the pattern."""
         i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
         inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
         return self.dark[i * inside, j * inside] & inside
 
 
 def _charuco(data: dict[str, Any]) -> Print:
+    """Pattern of a ChArUco board."""
     columns, rows = data["squares"]
     square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
     margin = (square - marker) / 2
@@ -84,6 +87,7 @@ def _charuco(data: dict[str, Any]) -> Print:
 
 
 def _markers(data: dict[str, Any]) -> Print:
+    """Pattern of a grid of markers."""
     columns, rows = data["markers"]
     bits = marker_bits(data["dictionary"]) + 2
     cells = data["marker"] * np.arange(bits + 1) / bits
@@ -98,30 +102,30 @@ def _markers(data: dict[str, Any]) -> Print:
 
 
 def _modules(name: str, number: int) -> Booleans:
-    """A marker's modules, its black border included."""
+    """Modules of a marker with its black border, (bits + 2, bits + 2)."""
     import cv2
 
-    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
-    return np.asarray(picture) < 128
+    image = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
+    return np.asarray(image) < 128
 
 
 def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
-    """A PDF page with the board in true size, and the paper's name.
+    """PDF page with the board in true size, two rulers and a description, and the name of the
+    paper.
 
-    paper : one of PAPER_SIZES; the smallest ISO size that holds the board unless told. Besides the
-    board there are two lines of a stated length, and what the board is. Raises InputError where the
-    paper is too small.
+    paper : one of PAPER_SIZES, by default the smallest ISO size that holds the board.
+    Raises InputError if the paper is too small or unknown.
     """
     printed = Print.of(board)
     size = np.array([printed.x[-1] - printed.x[0], printed.y[-1] - printed.y[0]])
-    name, page = _page(size, paper)
+    name, page = _paper_for(size, paper)
     corner = (
         np.array([LETTERING_STRIP_WIDTH, UNPRINTABLE_EDGE_WIDTH])
         + (page - size - LETTERING_STRIP_WIDTH - UNPRINTABLE_EDGE_WIDTH) / 2
     )
 
     def on_page(x: float, y: float) -> str:
-        """A point right of and below the page's upper left corner, m, as PDF counts."""
+        """Point in PDF coordinates, from m right of and below the page's upper left corner."""
         return f"{x / PDF_POINT:.4f} {(page[1] - y) / PDF_POINT:.4f}"
 
     rectangles = [
@@ -140,26 +144,27 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
         *_ruler(np.array([corner[0], below]), np.array([ruler, 0.0]), on_page),
         *_ruler(np.array([left, corner[1] + size[1]]), np.array([0.0, -ruler]), on_page),
     ]
-    words = [
+    captions = [
         f"{1e3 * ruler:.0f} mm here, along the ruler at the left as well: print in actual size"
         " (100 %), not fitted to the page.",
         f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, and correct board.yaml"
         " by what you found. Fix it to something stiff and flat.",
-        f"{_described(board)}.",
+        f"{_description(board)}.",
     ]
-    # from the page's edge on where the board is small: beside it there is no room for a line
+    # Text begins left of a small board, which is narrower than a line.
     text = [
         f"BT /F {PRINTED_LETTER_POINTS} Tf"
         f" {on_page(min(corner[0], LETTERING_STRIP_WIDTH), below + 0.005)} Td 10 TL"
     ]
-    text += [f"({_escaped(line)}) Tj T*" for line in words] + ["ET"]
-    # all in one path: no seams between neighbours where a viewer smoothes their borders
+    escaped = [re.sub(r"([\\()])", r"\\\1", line) for line in captions]
+    text += [f"({line}) Tj T*" for line in escaped] + ["ET"]
+    # One path for all rectangles: antialiasing viewers draw seams between separate ones.
     content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])
     return _document(page / PDF_POINT, content), name
 
 
-def _page(size: Array, paper: str | None) -> tuple[str, Array]:
-    """The paper's name and its width and height, m, turned as the board is."""
+def _paper_for(size: Array, paper: str | None) -> tuple[str, Array]:
+    """Name of the paper and its width and height, m, in portrait or landscape format."""
     if paper is not None and paper.lower() not in PAPER_SIZES:
         raise InputError(
             "no such paper",
@@ -194,7 +199,7 @@ def _rectangles(printed: Print, corner: Array) -> Iterator[tuple[float, float, f
 
 
 def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
-    """A line with a tick at both ends and each tenth."""
+    """Line with ticks at both ends and each tenth, as PDF operators."""
     across = np.array([along[1], -along[0]]) / np.abs(along).max()
     out = [f"{on_page(*start)} m {on_page(*(start + along))} l"]
     for k in range(11):
@@ -204,8 +209,8 @@ def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
     return out
 
 
-def _described(board: Board) -> str:
-    """What the board is, for who finds the sheet."""
+def _description(board: Board) -> str:
+    """Description of the board for the printed page."""
     data = board.document
     lengths = [
         f"{key} {1e3 * data[key]:.6g} mm" for key in ("square", "marker", "gap") if key in data
@@ -214,13 +219,8 @@ def _described(board: Board) -> str:
     return f"pkmcal: {board.described}, {', '.join(lengths + lettering)}"
 
 
-def _escaped(line: str) -> str:
-    """Text between PDF's brackets."""
-    return line.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
-
-
 def _document(size: Array, content: str) -> bytes:
-    """A PDF 1.7 file (ISO 32000-1, 7.5) of one page of `size` points; printed as it is."""
+    """PDF 1.7 file (ISO 32000-1, 7.5) of one page of `size` points, with print scaling off."""
     stream = zlib.compress(content.encode("latin-1"))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",

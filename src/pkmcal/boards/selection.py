@@ -1,8 +1,8 @@
-"""Which camera model: first fits, errors on photographs left out, and the choice among models.
+"""Choice of the camera model: starting values, candidates and their held-out errors.
 
-Of each model a few focal lengths are tried without distortion, and the best goes on with more and
-more terms. Candidates are judged by what they predict of views left out of their fit: to first
-order while choosing, by refitting for the one that is chosen.
+For each model a grid of focal lengths is tried without distortion, and the best continues with more
+and more coefficients. Candidates are compared by their errors on held-out views: to first order
+during selection, by refitting for the selected one.
 """
 
 from __future__ import annotations
@@ -29,16 +29,21 @@ from pkmcal.solver.elimination import eliminate
 from pkmcal.solver.search import NO_WEIGHT_DISTANCE
 
 FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
-"""Range of pixels a radian in the picture's middle, as a share of its width."""
+"""Range of starting values for the pixels per radian at the image's centre, as a share of its
+width."""
 FOCALS_TRIED = 16
+"""Focal lengths of the grid, in geometric steps over the range."""
 XIS_TRIED = (0.0, 0.5, 1.0, 1.5, 2.2)
+"""Values of xi of the grid."""
 CAMERA_STARTS_REFINED = 3
-"""Best tries that are refined, over so many rounds of weights: it is a start only."""
+"""Number of best starting values that are refined."""
 CAMERA_START_ROUNDS = 3
+"""IRLS rounds of this refinement."""
 HELD_OUT_PARTS = 10
-"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
+"""Number of parts into which the views are dealt; each is predicted by a camera fitted to the
+others."""
 CHANCE_DISAGREEMENT_RATIO = 1.5
-"""Disagreement of views (square) that chance alone explains, with ten views or so."""
+"""Ratio of variances between views and corners that chance explains for about ten views."""
 DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
     "pinhole": (
         (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
@@ -46,79 +51,84 @@ DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
     "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
     "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
 }  # fmt: skip
-"""Candidates, from few terms to many; the model with the fewest first among equals."""
+"""Sets of distortion coefficients by model, from few to many; the first of equal ones wins."""
 LEAST_GAIN = 0.01
-"""Share by which the error on left-out views must fall for a term to be worth having."""
+"""Least relative decrease of the held-out error that justifies a coefficient."""
 MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
-"""Median length of two normal numbers, in their standard deviations."""
+"""Median length of a vector of two normal numbers, in their standard deviation."""
 MOST_CORNERS = 1500
-"""Corners in all that the choice looks at; the final fit takes every one."""
+"""Number of corners used for the selection; the final fit uses all."""
 LEAST_RAYS = 4
-"""Corners that fix a board's pose."""
+"""Fewest corners that determine a board's pose."""
 LEAST_OF_VIEW = 12
-"""Corners that every view keeps, where it has them."""
+"""Fewest corners kept of each view, if it has as many."""
 HOPELESS_MODEL_RATIO = 5.0
-"""A model that fits so many times worse than another, with two radial terms, gets no more."""
+"""Ratio of residuals to another model's, with two radial terms, above which no more terms are
+tried."""
 
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
-    """Positions of the free intrinsics: focal length, centre, xi where there is one, and terms."""
+    """Indices of the free intrinsics: focal lengths, centre, xi if present, and ``terms``."""
     base = ("focal.x", "focal.y", "center.x", "center.y", "xi")
     names = camera.parameter_names
     return np.array([k for k, name in enumerate(names) if name in base or name in terms])
 
 
 def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFit | None:
-    """The best fit without distortion, None where no try gives finite pixels."""
+    """Best fit without distortion; None if no starting value gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
-    for camera in _tries(model, image_size):
+    for camera in _starting_cameras(model, image_size):
         rays = camera.ray(views.pixels)
         if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < LEAST_RAYS:
-            continue  # it did not take these photographs, and has no pose to begin from
+            continue  # this camera has no rays for the corners, and so no initial poses
         poses = linear_poses(rays, views.points)
         off = camera.project(apply(poses[:, None], views.points)) - views.pixels
         distance = np.linalg.norm(off, axis=-1)[views.visible]
-        # Lost corners count as far.
+        # corners without a projection count as infinitely far
         score = float(np.median(np.where(np.isfinite(distance), distance, np.inf)))
         if np.isfinite(score):
             scored.append((score, camera, poses))
     scored.sort(key=lambda item: item[0])
+    # Refine the best few.
     best: CameraFit | None = None
     for _, camera, poses in scored[:CAMERA_STARTS_REFINED]:
         settled = settled_poses(camera, views, poses)
         fit = fit_camera(camera, positions(camera, ()), views, settled, CAMERA_START_ROUNDS)
-        if best is None or _level(fit) < _level(best):
+        if best is None or _median_residual(fit) < _median_residual(best):
             best = fit
     return best
 
 
 def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
-    """The fit continued with more free terms."""
+    """Fit continued with another set of free coefficients."""
     return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
 
 
-def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+def _starting_cameras(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+    """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     width, height = image_size
     kind = camera_models()[model]
     names = kind.parameter_names
     for scale in np.geomspace(*FOCAL_RANGES[model], FOCALS_TRIED):
         for xi in XIS_TRIED if "xi" in names else (0.0,):
-            values = dict.fromkeys(names, 0.0)
-            values["focal.x"] = values["focal.y"] = float(scale) * width * (1 + xi)
-            values["center.x"], values["center.y"] = (width - 1) / 2, (height - 1) / 2
+            parameters = dict.fromkeys(names, 0.0)
+            parameters["focal.x"] = parameters["focal.y"] = float(scale) * width * (1 + xi)
+            parameters["center.x"], parameters["center.y"] = (width - 1) / 2, (height - 1) / 2
             if "xi" in names:
-                values["xi"] = xi
-            yield kind(image_size, np.array([values[name] for name in names]))
+                parameters["xi"] = xi
+            yield kind(image_size, np.array([parameters[name] for name in names]))
 
 
 @dataclass(frozen=True)
 class HeldOut:
     """Errors on held-out views.
 
-    residuals : (V, N, 2) px; each view's pose is fitted, the camera is that of other views.
-    rms : px, of the residuals' lengths. by_view : (V,) the same by view.
-    straightness : px, root mean square distance of corners from the great circle of their board
-        line, in rays of the camera of other views; no pose takes part in it.
+    residuals : (V, N, 2) px; the pose of each view is fitted, the camera is estimated from other
+        views.
+    rms : px, of the residuals' lengths.
+    by_view : (V,) px, the same by view.
+    straightness : px, rms distance of corners from the great circle of their board line, in rays of
+        the camera from other views; it depends on no pose.
     """
 
     residuals: Array
@@ -128,7 +138,7 @@ class HeldOut:
 
 
 def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
-    """Refit without each part of the views, and predict that part."""
+    """Errors of each part of the views under a camera refitted to the other parts."""
     count = len(fit.T_camera_board)
     inliers = (fit.weight >= 0.5) & views.visible
     residuals = np.full(views.pixels.shape, np.nan)
@@ -136,6 +146,7 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
     part_of = np.arange(count) % min(HELD_OUT_PARTS, count)
     for part in range(part_of.max() + 1):
         out = np.flatnonzero(part_of == part)
+        # Camera from the other views; poses of this part fitted to it.
         camera = refit(fit, views, np.flatnonzero(part_of != part)).camera
         mine = views.take(out)
         scale = np.where(inliers[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
@@ -158,8 +169,11 @@ def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -
 def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ...]) -> Array:
     """Distances (n,) px of corners from the great circle through their line's rays.
 
-    pixels : (N, 2) of one view, NaN where not seen. lines : ids of corners on a straight line.
-    A line's plane is fitted to its rays, weighted so that pixels count, not angles.
+    pixels : (N, 2) of one view, NaN where not detected.
+    lines : ids of corners on straight lines.
+
+    The plane of a line is fitted to its rays, weighted such that distances are in pixels, not in
+    angle.
     """
     rays = camera.ray(pixels)
     by_pixel = camera.ray_jacobians(pixels)[0]
@@ -171,6 +185,7 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
             continue
         s, turn = rays[ids], by_pixel[ids]
         weight, normal = np.ones(len(ids)), np.zeros(3)
+        # The normal of the plane is the least eigenvector of the weighted rays.
         for _ in range(3):
             normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
             slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)
@@ -180,51 +195,54 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
 
 
 def leave_one_out_residuals(fit: CameraFit, views: Views) -> Array:
-    """Residuals (V, N, 2) px of each view under the camera of the others, to first order."""
-    shifted, rows, _ = _without_each(fit, views)
-    change = (rows @ shifted[..., None])[..., 0].reshape(*views.visible.shape, 2)
+    """Residuals (V, N, 2) px of each view under the camera estimated without it, to first order."""
+    changes, rows, _ = _jackknife_changes(fit, views)
+    change = (rows @ changes[..., None])[..., 0].reshape(*views.visible.shape, 2)
     scale = fit.problem(views).scale[0][..., None]
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
 
 
 def spread_of_views(fit: CameraFit, views: Views) -> float:
-    """Factor by which the intrinsics scatter over the views more than the corners' noise says.
+    """Ratio of the intrinsics' standard deviation by the jackknife over views to that by the
+    corners' noise.
 
-    The jackknife over views, whose covariance is (V - 1) / V of the sum of squares of what each
-    view's absence changes, against that of the noise; 1 where chance explains the difference.
+    The jackknife's covariance is (V - 1) / V times the sum of squares of the changes when a view is
+    left out. Returns 1 if chance explains the ratio.
     """
-    shifted, _, normal = _without_each(fit, views)
-    off = shifted - shifted.mean(axis=0)
-    count = len(shifted)
-    jackknife = (count - 1) / count * off.T @ off
+    changes, _, normal = _jackknife_changes(fit, views)
+    deviation = changes - changes.mean(axis=0)
+    count = len(changes)
+    jackknife = (count - 1) / count * deviation.T @ deviation
     ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
     return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
 
 
-def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
-    """How leaving out each view moves the free intrinsics (V, k), to first order; the rows with
-    poses eliminated (V, r, k); the normal matrix of all (k, k).
+def _jackknife_changes(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
+    """Changes of the free intrinsics (V, k) when each view is left out, to first order; the rows
+    with poses eliminated (V, r, k); and the normal matrix of all views (k, k).
 
-    With rows A_v and residuals r_v of view v, that is (N - N_v)^-1 A_v^T r_v, since all views
-    together are in balance.
+    With rows A_v and residuals r_v of view v, N_v = A_v^T A_v and N the sum of all N_v, the change
+    is (N - N_v)^-1 A_v^T r_v, because the gradient of all views together vanishes.
     """
     linear = fit.problem(views).linearize(fit.state)
     rows = eliminate(linear).rows[0]
     normals = rows.mT @ rows
     whole = normals.sum(axis=0)
     right = rows.mT @ linear.value[0][..., None]
-    shifted = np.stack([inverted(whole - part) for part in normals]) @ right
-    return shifted[..., 0], rows, whole
+    changes = np.stack([inverted(whole - part) for part in normals]) @ right
+    return changes[..., 0], rows, whole
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One model with one set of terms.
+    """A model with a set of distortion coefficients, fitted.
 
-    parameters : number of free intrinsics. rms : px, length of the residual, root mean square over
-    the corners in use by the best candidate. left_out : the same on views left out of the fit, to
-    first order. robust : the same of all corners, each counting for no more than the best
-    candidate's noise allows; by_view : (V,) px^2, its squares by view.
+    parameters : number of free intrinsics.
+    rms : px, root mean square length of the residuals, over the corners in use by the best
+        candidate.
+    left_out : px, the same for views left out of the fit, to first order.
+    robust : px, the same as left_out over all corners, each bounded by the best candidate's noise.
+    by_view : (V,) px^2, squares of ``robust`` by view.
     """
 
     model: str
@@ -240,9 +258,11 @@ class Candidate:
 def camera_candidates(
     views: Views, image_size: tuple[int, int], models: tuple[str, ...]
 ) -> tuple[Candidate, ...]:
-    """Every model with each of its sets of terms, fitted; models without a start are missing."""
+    """All models with each of their sets of coefficients, fitted; models without a starting value
+    are missing.
+    """
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
-    # The unified camera fits almost anything: it tells which of the others are hopeless.
+    # The unified model first: it fits almost any lens, and shows which other models are hopeless.
     for model in sorted(models, key=list(DISTORTION_CANDIDATES).index, reverse=True):
         start = first_fit(model, views, image_size)
         if start is None:
@@ -250,20 +270,22 @@ def camera_candidates(
         for terms in DISTORTION_CANDIDATES[model]:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            if "k2" in terms and _level(fit) > HOPELESS_MODEL_RATIO * min(
-                _level(f) for _, _, f in fits
+            if "k2" in terms and _median_residual(fit) > HOPELESS_MODEL_RATIO * min(
+                _median_residual(f) for _, _, f in fits
             ):
                 break
-            # A set that holds this one begins where it ended.
+            # a larger set starts from this fit
             start = fit if "k1" in terms else start
     if not fits:
         return ()
-    # All are compared by the same corners, those that a fit gave up too: each counts for as much as
-    # the one that fits best gives up, and no model wins by giving up more.
-    usual = min(_level(fit) for _, _, fit in fits) / MEDIAN_LENGTH
-    most = NO_WEIGHT_DISTANCE**2 * (usual**2 + views.sigma**2)
-    off = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
-    bounded = [np.minimum(_squares(remainder, views.visible), most) for remainder in off]
+    # Compare all candidates on the same corners, rejected ones included. Each squared residual is
+    # bounded by the rejection limit of the best fit, so no model wins by rejecting more.
+    sigma = min(_median_residual(fit) for _, _, fit in fits) / MEDIAN_LENGTH
+    limit = NO_WEIGHT_DISTANCE**2 * (sigma**2 + views.sigma**2)
+    held_out_residuals = [leave_one_out_residuals(fit, views) for _, _, fit in fits]
+    bounded = [
+        np.minimum(_squares(residuals, views.visible), limit) for residuals in held_out_residuals
+    ]
     best = int(np.argmin([np.sum(squares) for squares in bounded]))
     used = (fits[best][2].weight > 0.5) & views.visible
     pool = [
@@ -272,24 +294,26 @@ def camera_candidates(
             terms=terms,
             parameters=len(fit.free),
             rms=_rms(fit.residuals, used),
-            left_out=_rms(remainder, used),
+            left_out=_rms(residuals, used),
             robust=float(np.sqrt(np.sum(squares) / max(int(views.visible.sum()), 1))),
             by_view=np.sum(squares, axis=1) / np.maximum(views.visible.sum(axis=1), 1),
             fit=fit,
         )
-        for (model, terms, fit), remainder, squares in zip(fits, off, bounded, strict=True)
+        for (model, terms, fit), residuals, squares in zip(
+            fits, held_out_residuals, bounded, strict=True
+        )
     ]
     return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
 
 def best_of(pool: tuple[Candidate, ...]) -> Candidate:
-    """The fewest parameters among candidates that cannot be told from the best."""
+    """Candidate with the fewest parameters among those not significantly worse than the best."""
     best = min(pool, key=lambda c: c.robust)
     return min((c for c in pool if not is_worse(c, best)), key=lambda c: c.parameters)
 
 
 def is_worse(candidate: Candidate, best: Candidate) -> bool:
-    """True where left-out views tell the two apart: by a hundredth of the error, and by more
+    """Whether held-out views favour ``best`` significantly: by LEAST_GAIN of the error, and by more
     than the standard error of the difference over the views.
     """
     if candidate.robust <= best.robust * (1 + LEAST_GAIN):
@@ -300,35 +324,35 @@ def is_worse(candidate: Candidate, best: Candidate) -> bool:
 
 
 def fitted_to_all(chosen: Candidate, views: Views) -> CameraFit:
-    """A candidate's fit continued with every corner."""
+    """Fit of a candidate continued with all corners."""
     fit = chosen.fit
     return fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
 
 
 def thinned(views: Views) -> Views:
-    """The views with fewer corners each, where there are many: evenly over the board."""
+    """Views with at most about MOST_CORNERS corners in all, spread over the board."""
     total = int(views.visible.sum())
     if total <= MOST_CORNERS:
         return views
-    # One set of corners for all views, so that arrays stay small; no pattern of rows in it.
+    # One random set of corners for all views keeps arrays small and has no pattern of rows.
     order = np.random.default_rng(0).permutation(len(views.points))
     used = order[: max(len(order) * MOST_CORNERS // total, LEAST_OF_VIEW)]
-    for in_view in views.visible:
-        mine = order[in_view[order]]
+    for visible in views.visible:
+        mine = order[visible[order]]
         used = np.union1d(used, mine[:LEAST_OF_VIEW])
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 
 
-def _level(fit: CameraFit) -> float:
-    """Median length of a residual, px."""
+def _median_residual(fit: CameraFit) -> float:
+    """Median length of the residuals, px."""
     return float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1)))
 
 
 def _squares(off: Array, counted: Booleans) -> Array:
-    """Squared lengths (V, N) of residuals (V, N, 2) of the corners that count."""
+    """Squared lengths (V, N) of residuals (V, N, 2); 0 for corners that do not count."""
     return np.where(counted, np.sum(np.nan_to_num(off) ** 2, axis=-1), 0.0)
 
 
 def _rms(off: Array, counted: Booleans) -> float:
-    """Root mean square of the lengths."""
+    """Root mean square length of the residuals that count."""
     return float(np.sqrt(_squares(off, counted).sum() / max(int(counted.sum()), 1)))

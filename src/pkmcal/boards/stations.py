@@ -1,4 +1,4 @@
-"""The calibration board of a session, looked for in its stations' photographs."""
+"""Detection of a session's calibration board in the images of its stations."""
 
 from __future__ import annotations
 
@@ -16,42 +16,45 @@ from pkmcal.errors import InputError
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session
 
-SLOW_SEARCH_PHOTOGRAPHS = 4
-"""Photographs in which a chessboard that stands still is looked for by slow ways."""
+SLOW_SEARCH_IMAGES = 4
+"""Images in which a still chessboard is searched by the slow methods."""
 OTHER_BOARD_TRIALS = 2
-"""Photographs that are examined for another board."""
+"""Images examined for another board."""
 
 
 def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> Boards:
-    """The session's board in every station that observes it.
+    """Detect the session's board in all stations that observe it.
 
-    images : decoded photographs by the station's number. Raises `InputError` where a station's
-    photographs do not show the board, or show that it moved though it is fixed to the base.
+    images : decoded images by station number.
+    Raises `InputError` if a station's images do not show the board, or if a board on the base
+    moved.
     """
     board = board_of(session)
     if board is None:
         return Boards()
-    results: dict[int, StationBoard] = {}
+    boards: dict[int, StationBoard] = {}
     by_hand: dict[str, list[tuple[Path, Detection]]] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         if not station.handheld:
-            results[number] = station_board(session, board, number, images[number])
+            boards[number] = station_board(session, board, number, images[number])
             continue
-        # walking round a machine one does not see its board from everywhere
-        one, views = _board_by_hand(session, board, number, images[number])
-        by_hand.setdefault(station.entry, []).append((station.photographs[0].path, one))
+        # Hand-held images need not all show the board.
+        detection, views = _board_by_hand(session, board, number, images[number])
+        path = station.photographs[0].path
+        by_hand.setdefault(station.entry, []).append((path, detection))
         if views is not None:
-            results[number] = views
-    for entry, photographs in by_hand.items():
-        _check_another(board, entry, *zip(*photographs, strict=True))
-        _check_visible(entry, board, [detection for _, detection in photographs])
-    return Boards(results, session.board_body, board.tolerance)
+            boards[number] = views
+    for entry, detected in by_hand.items():
+        paths, detections = zip(*detected, strict=True)
+        _check_another(board, entry, paths, detections)
+        _check_visible(entry, board, detections)
+    return Boards(boards, session.board_body, board.tolerance)
 
 
 def board_of(session: Session) -> Board | None:
-    """The board that stations of a session observe, from its file; None where none does."""
+    """Board that stations of the session observe, read from its file; None if no station does."""
     if session.board is None or not any("board" in s.observe for s in session.stations):
         return None
     return load_board(session.board, label=label_of(session.folder, session.board))
@@ -60,18 +63,18 @@ def board_of(session: Session) -> Board | None:
 def station_board(
     session: Session, board: Board, number: int, images: Sequence[Integers]
 ) -> StationBoard:
-    """The board in one station's photographs, all of them decoded."""
+    """Board in the images of one fixed station."""
     station = session.stations[number]
-    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.photographs]
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.success for detection in detections)
     _check_another(board, station.name, [p.path for p in station.photographs], detections)
-    # A board that moves says something new in every photograph; a still one is seen enough.
-    most = len(images) if moves else SLOW_SEARCH_PHOTOGRAPHS if nowhere else 0
+    # Each image of a moving board is a new measurement; of a still one, a few are enough.
+    most = len(images) if moves else SLOW_SEARCH_IMAGES if nowhere else 0
     detections = detect_again(images, board, detections, most)
     _check_visible(station.name, board, detections)
-    rows = np.array([photo.configuration for photo in station.photographs])
+    rows = np.array([image.configuration for image in station.photographs])
     views = board_views(number, station.camera, rows, board, detections)
     stood = None if moves else standing_board(views)
     if not moves and stood is None:
@@ -85,7 +88,7 @@ def station_board(
 
 
 def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> None:
-    """Raise `InputError` where no photograph of a station shows the board."""
+    """Raise `InputError` if no image of a station shows the board."""
     if not any(detection.success for detection in detections):
         raise InputError(
             f"the board is in none of the photographs of station {name}",
@@ -100,13 +103,13 @@ def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> 
 def _board_by_hand(
     session: Session, board: Board, number: int, images: Sequence[Integers]
 ) -> tuple[Detection, StationBoard | None]:
-    """The board in a photograph by hand, and what it tells if it is seen well enough."""
+    """Detection in a hand-held image, and the board's pose if it is usable."""
     station = session.stations[number]
-    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.photographs]
     detections = detect_again(images, board, detect_in(images, board, labels), len(images))
     if not detections[0].success:
         return detections[0], None
-    rows = np.array([photo.configuration for photo in station.photographs])
+    rows = np.array([image.configuration for image in station.photographs])
     views = board_views(number, station.camera, rows, board, detections)
     if session.board_body == "platform":
         return detections[0], StationBoard(views, None)
@@ -117,7 +120,7 @@ def _board_by_hand(
 def _check_another(
     board: Board, name: str, paths: Sequence[Path], detections: Sequence[Detection]
 ) -> None:
-    """Raise `InputError` where photographs show another board, or more of it than is described."""
+    """Raise `InputError` if images show another board, or a larger one than described."""
     visible = np.flatnonzero([detection.success for detection in detections])
     rows = visible if visible.size else np.arange(len(detections))
     few = rows[evenly(len(rows), OTHER_BOARD_TRIALS)]

@@ -1,7 +1,6 @@
-"""The calibration board of a session as its stations saw it: measurements.
+"""Measurements of a session's calibration board by its stations.
 
-Where it is looked for stands in :mod:`pkmcal.boards.stations`, which sessions without a board do
-not load.
+Detection is in :mod:`pkmcal.boards.stations`, which sessions without a board do not import.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ if TYPE_CHECKING:
     from pkmcal.boards.poses import BoardViews, Standing
 
 ONLY_BOARD_MOUNT = 0
-"""A session has one board, so one mount."""
+"""Mount of the board; a session has only one."""
 
 
 @dataclass(frozen=True)
 class StationBoard:
-    """The board in one station's photographs; stood : where, of a board on the base."""
+    """Board in the images of one station; stood : pose of a board on the base, else None."""
 
     views: BoardViews
     stood: Standing | None
 
     @property
     def poses(self) -> PoseSet:
-        """The measurements that it gives."""
+        """Measurements from the board."""
         return (
             self._moving[0]
             if self.stood is None
@@ -41,13 +40,14 @@ class StationBoard:
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
-        """Photographs whose board is not used."""
+        """Images whose board is not used, with the reason."""
         return self.views.rejected + (
             self._moving[1] if self.stood is None else self.stood.rejected
         )
 
     @cached_property
     def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
+        """Measurements and rejections of a board on the platform."""
         from pkmcal.boards.poses import one_a_configuration
 
         return one_a_configuration(self.views, ONLY_BOARD_MOUNT)
@@ -55,10 +55,11 @@ class StationBoard:
 
 @dataclass(frozen=True)
 class Boards:
-    """The board in all stations that observe it.
+    """Board in all stations that observe it.
 
-    stations : by their number in the session. body : what the board is fixed to. tolerance :
-    standard deviation of its size, relative.
+    stations : by station number.
+    body : body to which the board is fixed.
+    tolerance : prior sigma of its size, relative.
     """
 
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
@@ -69,38 +70,38 @@ class Boards:
 
     @property
     def poses(self) -> PoseSet:
-        """All measurements."""
+        """Measurements of all stations."""
         return concatenate(
             [PoseSet.empty(), *(station.poses for station in self.stations.values())]
         )
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
-        """All that is not used."""
+        """Images of all stations whose board is not used."""
         return tuple(r for station in self.stations.values() for r in station.rejected)
 
     def of(self, stations: Integers) -> Boards:
-        """The board in some of the stations, numbered anew in their order."""
-        retained = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
+        """Boards of a subset of the stations, renumbered in their order."""
+        selected = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
         return replace(
             self,
             stations={
                 new: replace(one, views=replace(one.views, station=new))
-                for new, one in retained.items()
+                for new, one in selected.items()
             },
         )
 
     def joined(self, T_camera_base: Sequence[Array | None]) -> list[Array | None]:
-        """Poses of the stations with those that are not known put in through a board on the base.
+        """Poses of the stations, with unknown ones derived through a board on the base.
 
-        T_camera_base : (4, 4) each, None where not known.
+        T_camera_base : (4, 4) each, None if unknown. At least one station with a known pose must
+            observe the board.
+
         T_camera_base = T_camera_board T_board_other T_other_base, [A] 3.3.
         """
         stood = {k: s.stood.T_camera_board for k, s in self.stations.items() if s.stood}
-        reference_values = (
-            (k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood
-        )
-        T_board_base = next((inverse(stood[k]) @ T for k, T in reference_values), None)
+        posed = ((k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood)
+        T_board_base = next((inverse(stood[k]) @ T for k, T in posed), None)
         if T_board_base is None:
             return list(T_camera_base)
         return [

@@ -1,4 +1,6 @@
-"""Central cameras: one contract, one file a model; reading and writing their files."""
+"""Central cameras: their contract, one file for each model, and reading and writing of camera
+files.
+"""
 
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.cameras.files import load_camera

@@ -1,9 +1,10 @@
-"""What every central camera offers, whatever its lens or mirror.
+"""Contract of all central cameras, whatever their lens or mirror.
 
-A central camera maps rays through one point to pixels. Everything behind the image works
-with rays, so a camera model is three functions, which tell its field as well. A model is one
-file in this folder with one final subclass; :func:`camera_models` finds it, the conformance
-test runs over it, nothing else is edited.
+A central camera maps rays through one point to pixels. Everything outside this package works with
+rays, so a camera model consists of three functions (projection, its Jacobians, its inverse), which
+also define its field of view by returning NaN outside. A model is one file in this folder with one
+final subclass of :class:`Camera`. :func:`camera_models` finds it and the conformance test runs over
+it; no other file is edited.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
 
 LEAST_FOCAL = 0.05
-"""Share of the image's width below which a focal length is none in pixels: a fisheye lens with all
-of its 180 degrees in the picture has a third, a mirror a fifth."""
+"""Shortest focal length in pixels, as a share of the image's width. A fisheye lens with a field of
+180 degrees inside the image has a third, a mirror a fifth; below that the file is likely in
+millimetres."""
 
 
 class CameraSchema(Schema):
-    """The fields that every camera file has; a model's own schema adds to them."""
+    """Fields common to all camera files; the schema of each model adds its own."""
 
     covariance: tuple[tuple[float, ...], ...] | None = Field(
         default=None, description="the parameters' covariance, one row a parameter"
@@ -45,7 +47,7 @@ class CameraSchema(Schema):
     @field_validator("image_size")
     @classmethod
     def _of_some_pixels(cls, size: tuple[int, int]) -> tuple[int, int]:
-        """No more than an image may have."""
+        """Refuse images with more than MOST_PIXELS pixels."""
         if (pixels := size[0] * size[1]) > MOST_PIXELS:
             raise ValueError(f"too many pixels; found {pixels}, expected at most {MOST_PIXELS}")
         return size
@@ -53,7 +55,7 @@ class CameraSchema(Schema):
     @field_validator("focal")
     @classmethod
     def _in_pixels(cls, focal: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
-        """No lens or mirror sees so much that its focal length is a twentieth of the width."""
+        """Refuse focal lengths below LEAST_FOCAL of the width, which are likely millimetres."""
         width = info.data.get("image_size", (0, 0))[0]
         if min(focal) < LEAST_FOCAL * width:
             raise ValueError(
@@ -64,18 +66,19 @@ class CameraSchema(Schema):
 
 
 USUAL_FOCAL, USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.001, 0.01, 0.05
-"""Standard deviations of a camera whose file states none: of its focal lengths, relative, and of
-their ratio; of its centre, in parts of the picture's width; of its first term of distortion. A zoom
-ring turned by a hair, pixels that are square to a thousandth, a sensor that is not centred behind
+"""Prior sigmas of a camera whose file has no covariance: of the focal lengths (relative), of their
+ratio, of the centre (share of the image's width), and of the first distortion coefficient. They
+stand for a zoom ring turned slightly, pixels square to a thousandth, a sensor not centred behind
 its lens, and the distortion of most lenses."""
 
 
 class LensViolation(NamedTuple):
-    """How a camera may be another than its file says, by k numbers.
+    """Deviation of a camera's parameters from its file, along k directions.
 
-    columns : (n, k) change of its parameters by them. usual : their standard deviation where nobody
-    calibrated the camera with care. facts : of its finding, beside the estimates. code : the last
-    part of the finding's.
+    code : last part of the finding's code.
+    columns : (n, k) derivative of the parameters by the k numbers.
+    usual : prior sigma of these numbers for a camera that was not calibrated carefully.
+    facts : facts of the finding besides the estimates.
     """
 
     code: str
@@ -86,14 +89,14 @@ class LensViolation(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """Intrinsics of one central camera.
+    """Intrinsics of a central camera.
 
-    covariance : (n, n) of the parameters by the camera's calibration, where it is known.
     image_size : (width, height) in pixels.
-    parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
-        center, none for the rest. Pixel centres are at integers, as in OpenCV.
-    own : fields of the model's file between ``center`` and ``distortion``. odd : names of the
-        parameters that change their sign as the picture is turned by half.
+    parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and center,
+        dimensionless otherwise. Pixel centres are at integers, as in OpenCV.
+    covariance : (n, n) of the parameters from the camera's calibration, or None.
+    own : fields of the model's file between ``center`` and ``distortion``.
+    odd : names of the parameters that change sign when the image is rotated by 180 degrees.
     """
 
     model: ClassVar[str]
@@ -114,39 +117,42 @@ class Camera(ABC):
 
     @abstractmethod
     def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN outside the valid field."""
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN outside the field of view."""
 
     @abstractmethod
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
-        """Derivatives of :meth:`project`: by the point (..., 2, 3), by parameters (..., 2, n)."""
+        """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
+        (..., 2, n).
+        """
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """:meth:`project` (..., 2), and how it moves (..., 2) as points move along each of some
-        directions (..., 3), px by the unit of the points.
+        """Pixels (..., 2) of points and their directional derivatives (..., 2) along directions
+        (..., 3), px per unit of the points.
 
-        What a search asks for thousands of times; a model may have it for less, in the precision of
-        the points.
+        Searches call this function thousands of times. A model may override it with a cheaper
+        version, in the precision of the points.
         """
         by_point = self.project_jacobians(points)[0]
-        shifted = (
+        derivatives = (
             of_components(*(dot(by_point[..., k, :], d) for k in (0, 1))) for d in directions
         )
-        return self.project(points), *shifted
+        return self.project(points), *derivatives
 
     @abstractmethod
     def ray(self, pixels: Array) -> Array:
-        """Unit viewing rays (..., 3) of pixels (..., 2); NaN where no ray meets the pixel."""
+        """Unit viewing rays (..., 3) of pixels (..., 2); NaN for pixels that no ray maps to."""
 
     def ray_jacobians(self, pixels: Array) -> tuple[Array, Array]:
-        """Derivatives of :meth:`ray`: by the pixel (..., 3, 2), by parameters (..., 3, n).
+        """Derivatives of :meth:`ray` by the pixel (..., 3, 2) and by the parameters (..., 3, n).
 
-        From the implicit function project(ray) = pixel, so no model writes it again: with
-        J = d project/d ray, a change of the pixel turns the ray by J's inverse on the ray's
-        tangent plane, a change of the parameters by minus that times d project/d parameters.
+        They follow from the implicit function project(ray) = pixel, so models do not implement
+        them. Let J = d project / d ray. The derivative by the pixel is the inverse of J on the
+        ray's tangent plane; the derivative by the parameters is minus this inverse times d project
+        / d parameters.
         """
         rays = self.ray(pixels)
         by_point, by_parameters = self.project_jacobians(rays)
-        # on the tangent plane: J d = e with ray . d = 0, a 3x3 system
+        # Solve J d = e in the tangent plane, ray . d = 0: a 3x3 system.
         system = np.concatenate([by_point, rays[..., None, :]], axis=-2)
         bad: Booleans = ~np.all(np.isfinite(system), axis=(-1, -2))
         system = np.where(bad[..., None, None], np.eye(3), system)
@@ -156,10 +162,11 @@ class Camera(ABC):
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """The camera of a file's fields, checked by the model's ``schema``.
+        """Camera from the fields of a file that the model's ``schema`` has validated.
 
-        Parameters stand in the order of the fields: focal, center, the model's ``own``, distortion,
-        which may be absent or shorter.
+        The parameters are in the order of the fields: focal, center, the model's ``own``,
+        distortion. Distortion may be absent or shorter than the model's; missing coefficients are
+        zero.
         """
         own = [getattr(document, name) for name in cls.own]
         k = np.zeros(len(cls.parameter_names) - 4 - len(own))
@@ -168,16 +175,16 @@ class Camera(ABC):
 
     @property
     def focal_part(self) -> Array:
-        """(n,) the parameters with all but the focal lengths zero: their change when the lengths
-        grow by their own size.
+        """Parameters (n,) with all but the focal lengths set to zero: the derivative by the
+        relative change of both focal lengths.
         """
         focal = [name.startswith("focal.") for name in self.parameter_names]
         return np.where(focal, self.parameters, 0.0)
 
     @property
     def aspect_part(self) -> Array:
-        """(n,) change of the parameters when fx / fy grows by its own size and their geometric mean
-        stays.
+        """Derivative (n,) of the parameters by the relative change of fx / fy at constant geometric
+        mean.
         """
         direction = [
             {"focal.x": 0.5, "focal.y": -0.5}.get(name, 0.0) for name in self.parameter_names
@@ -185,8 +192,8 @@ class Camera(ABC):
         return np.array(direction) * self.parameters
 
     def violations(self) -> tuple[LensViolation, ...]:
-        """What is wrong first, where anything is: focus, pixels that are not as square as stated,
-        the picture cut otherwise, a lens whose distortion was left out.
+        """Likely deviations of the camera from its file: focal length (focus), aspect ratio of the
+        pixels, centre (cropped images), first distortion coefficient (distortion left out).
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
@@ -203,13 +210,15 @@ class Camera(ABC):
         )
 
     def usual_covariance(self) -> Array:
-        """(n, n) of the parameters where no calibration tells it: of what departs first."""
+        """Prior covariance (n, n) of the parameters of a camera without a stated one, from
+        :meth:`violations`.
+        """
         parts = [part.usual * part.columns for part in self.violations()]
         columns = np.concatenate(parts, axis=1)
         return columns @ columns.T
 
     def document(self) -> dict[str, Any]:
-        """The fields of a camera file, the inverse of :meth:`from_document`."""
+        """Fields of the camera's file, the inverse of :meth:`from_document`."""
         p = self.parameters.tolist()
         own = dict(zip(self.own, p[4:], strict=False))
         return {
@@ -222,11 +231,11 @@ class Camera(ABC):
         }
 
     def binned(self, count: int) -> Self:
-        """The camera of pictures in which ``count`` x ``count`` pixels are averaged to one; what is
-        left of a row or a column at its end is not in them.
+        """Camera of images in which ``count`` x ``count`` pixels are averaged to one; incomplete
+        blocks at the ends of rows and columns are dropped.
 
-        Derivatives by its parameters are by the binned ones, of which focal lengths and centre,
-        always the first four, are smaller.
+        Its parameters, and derivatives by them, are those of the binned image: focal lengths and
+        centre, always the first four parameters, are smaller.
         """
         if count == 1:
             return self
@@ -237,7 +246,9 @@ class Camera(ABC):
         return replace(self, image_size=size, parameters=parameters, covariance=None)
 
     def turned_by_half(self) -> Self:
-        """The camera of pictures that are turned by half, itself turned by half about its axis."""
+        """Camera of the images rotated by 180 degrees, itself rotated by 180 degrees about its
+        optical axis.
+        """
         sign = np.where(np.isin(self.parameter_names, self.odd), -1.0, 1.0)
         sign[2:4] = -1.0
         parameters = sign * self.parameters
@@ -246,7 +257,9 @@ class Camera(ABC):
         return replace(self, parameters=parameters, covariance=covariance)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
-        """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""
+        """Whether pixels (..., 2) are inside the image, at least ``margin`` px from its border;
+        (...).
+        """
         limit = np.asarray(self.image_size) - 1.0 - margin
         with np.errstate(invalid="ignore"):
             return np.all((pixels >= margin) & (pixels <= limit), axis=-1)
@@ -254,7 +267,7 @@ class Camera(ABC):
 
 @cache
 def camera_models() -> dict[str, type[Camera]]:
-    """Every camera model of this folder, by its name in camera files."""
+    """All camera models of this folder, by their names in camera files."""
     package = __name__.rpartition(".")[0]
     path = importlib.import_module(package).__path__
     for module in pkgutil.iter_modules(path):

@@ -1,4 +1,4 @@
-"""Camera files: ``model``, ``image_size`` and the model's own fields."""
+"""Camera files of pkmcal, OpenCV, ROS and Kalibr."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
-    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected by content.
+    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected from the content.
 
     Parameters
     ----------
     path :
-        The file; one of several cameras in a Kalibr file is named behind it,
+        The file. For a Kalibr file with several cameras, the camera's name follows a #,
         ``camchain.yaml#cam1``.
     label :
         The file's name in messages.
@@ -50,7 +50,11 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)
-    cameras = [key for key, value in document.data.items() if _is_kalibr(value)]
+    cameras = [
+        key
+        for key, entry in document.data.items()
+        if isinstance(entry, dict) and "camera_model" in entry  # Kalibr's format
+    ]
     if cameras:
         return _from_kalibr(document, cameras, camera)
     if camera is not None:
@@ -61,23 +65,25 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
 
 
 def written_camera(file: str) -> str:
-    """The name of a camera's file as refined with the machine, or turned by half as photographs
-    were, by the one that the session names: camera-front.yaml of cameras/front.yaml; other folders,
-    and a # in it, become hyphens.
+    """Name of the output file for a camera that was refined with the machine, or rotated by 180
+    degrees as its images were.
+
+    file : the camera's file as the session names it. cameras/front.yaml becomes camera-front.yaml;
+        other folders, and a #, become hyphens.
     """
     parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
     return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
 
 
 def camera_path(path: Path | str) -> tuple[Path, str | None]:
-    """A camera's file, and its name in it where one stands behind a #."""
+    """Path of a camera's file, and the camera's name within the file if one follows a #."""
     path = Path(path)
     file, sign, camera = path.name.rpartition("#")
     return (path.with_name(file), camera) if file and sign and not path.exists() else (path, None)
 
 
 def camera_from_document(document: Document) -> Camera:
-    """The camera of a file's fields, checked."""
+    """Camera from a document in pkmcal's format, validated; raises InputError."""
     models = camera_models()
     name = document.data.get("model")
     if not isinstance(name, str) or name not in models:
@@ -106,11 +112,13 @@ def camera_from_document(document: Document) -> Camera:
     if fields.covariance is None:
         return camera
     where = document.where("covariance")
-    return replace(camera, covariance=_checked(fields.covariance, camera, where))
+    return replace(camera, covariance=_checked_covariance(fields.covariance, camera, where))
 
 
-def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
-    """A covariance of the camera's parameters, or the reason why it is none."""
+def _checked_covariance(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) -> Array:
+    """Covariance (n, n) of the camera's parameters, checked for size, symmetry and negative
+    variances.
+    """
     n = len(camera.parameter_names)
     if len(rows) != n or any(len(row) != n for row in rows):
         raise InputError(
@@ -120,14 +128,16 @@ def _checked(rows: tuple[tuple[float, ...], ...], camera: Camera, where: str) ->
             expected=f"{n} rows of {n}, for {', '.join(camera.parameter_names)}",
         )
     matrix = np.array(rows)
-    values = np.linalg.eigvalsh((matrix + matrix.T) / 2)
-    if not np.allclose(matrix, matrix.T, rtol=1e-6) or values[0] < -1e-9 * abs(values[-1]):
+    eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2)
+    if not np.allclose(matrix, matrix.T, rtol=1e-6) or eigenvalues[0] < -1e-9 * abs(
+        eigenvalues[-1]
+    ):
         raise InputError("the covariance is not symmetric, or has negative variances", where=where)
     return matrix
 
 
 def camera_text(camera: Camera) -> str:
-    """The text of a camera file, which :func:`load_camera` reads back the same."""
+    """Text of a camera file; :func:`load_camera` reads back the same camera."""
     document = camera.document()
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
@@ -136,8 +146,10 @@ def camera_text(camera: Camera) -> str:
 
 CAMERA_FILE_FORMATS = ("opencv", "ros", "kalibr")
 CAMERA_NUMBER_ROUNDING = 1e-12
-"""Relative difference of a number before and after; decimal text of sixteen digits keeps it."""
+"""Relative difference allowed between a number before writing and after reading; decimal text with
+sixteen digits stays below."""
 _ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+"""Camera models by ROS's distortion model."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
@@ -145,6 +157,7 @@ _KALIBR = {
     ("omni", "radtan"): "unified",
     ("omni", "none"): "unified",
 }
+"""Camera models by Kalibr's camera and distortion model."""
 _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "matrix": ("camera_matrix", "cameraMatrix", "K", "Camera_Matrix"),
     "distortion": ("distortion_coefficients", "distCoeffs", "D", "Distortion_Coefficients"),
@@ -152,12 +165,14 @@ _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "height": ("image_height", "image_Height", "height"),
     "xi": ("xi", "Xi"),
 }
+"""Names under which OpenCV's programs write each quantity."""
 
 
 def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
-    """The text of another program's camera file; it is read back and compared before.
+    """Text of another program's camera file, verified by reading it back.
 
-    form : opencv (XML where the path ends so, else YAML), ros or kalibr.
+    form : opencv (XML if the path has this suffix, else YAML), ros or kalibr.
+    Raises InputError if the format is unknown or cannot represent the camera.
     """
     path = Path(path)
     if form not in CAMERA_FILE_FORMATS:
@@ -186,29 +201,32 @@ def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
 
 
 def _from_opencv(text: str, label: str) -> Camera:
+    """Camera of an OpenCV file, YAML or XML."""
     import cv2
 
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        results: dict[str, Any] = {
+        numbers: dict[str, Any] = {
             key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
         }
-        flag = storage.getNode("fisheye_model")
-        fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
+        flag, model_name = (storage.getNode(n) for n in ("fisheye_model", "distortion_model"))
+        fisheye = (not flag.empty() and flag.real() != 0) or (
+            not model_name.empty() and model_name.isString() and "fisheye" in model_name.string()
+        )
         storage.release()
-    except (cv2.error, SystemError):  # the latter where its constructor meets what is no YAML
+    except (cv2.error, SystemError):  # SystemError: its constructor met invalid YAML
         raise InputError(
             "not valid as OpenCV writes it",
             where=label,
             next_step="Write it again with cv2.FileStorage",
         ) from None
     for key in ("matrix", "width", "height"):
-        if results[key] is None:
+        if numbers[key] is None:
             raise InputError(
                 f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
             )
     for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
-        values = results[key]
+        values = numbers[key]
         if values is not None and (len(values) != count or not np.all(np.isfinite(values))):
             raise InputError(
                 f"the camera's {key} is not what it should be",
@@ -216,20 +234,17 @@ def _from_opencv(text: str, label: str) -> Camera:
                 found=quoted(values.tolist()),
                 expected=count_of(count, "finite number"),
             )
-    size = (round(float(results["width"][0])), round(float(results["height"][0])))
-    k = results["distortion"] if results["distortion"] is not None else np.zeros(0)
-    xi = results["xi"]
+    size = (round(float(numbers["width"][0])), round(float(numbers["height"][0])))
+    k = numbers["distortion"] if numbers["distortion"] is not None else np.zeros(0)
+    xi = numbers["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
-    return _made(model, size, results["matrix"], k, None if xi is None else float(xi[0]), label)
-
-
-def _word(storage: Any) -> str:
-    """The distortion model's name, where the file has one."""
-    node = storage.getNode("distortion_model")
-    return node.string() if not node.empty() and node.isString() else ""
+    return _camera_from_numbers(
+        model, size, numbers["matrix"], k, None if xi is None else float(xi[0]), label
+    )
 
 
 def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
+    """Numbers (n,) under the first of several names that an OpenCV file has, or None."""
     for name in names:
         node = storage.getNode(name)
         if node.empty():
@@ -243,36 +258,41 @@ def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
 
 
 def _opencv_text(camera: Camera, xml: bool) -> str:
+    """Text of an OpenCV file."""
     import cv2
 
     form = cv2.FileStorage_FORMAT_XML if xml else cv2.FileStorage_FORMAT_YAML
     storage = cv2.FileStorage("", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY | form)
-    values = _named(camera)
+    parameters = _parameters_by_name(camera)
     storage.write("image_width", int(camera.image_size[0]))
     storage.write("image_height", int(camera.image_size[1]))
-    storage.write("camera_matrix", _matrix(values))
+    storage.write("camera_matrix", _matrix(parameters))
     storage.write("distortion_coefficients", np.array(camera.document()["distortion"])[:, None])
     if camera.model == "fisheye":
         storage.write("fisheye_model", 1)
     if camera.model == "unified":
-        storage.write("xi", np.array([[values["xi"]]]))
+        storage.write("xi", np.array([[parameters["xi"]]]))
     return storage.releaseAndGetString()
 
 
 def _from_ros(document: Document) -> Camera:
+    """Camera of a ROS camera_info file."""
     word = document.data.get("distortion_model", "plumb_bob")
     if not isinstance(word, str) or word not in _ROS:
         value = word if isinstance(word, str) else quoted(word)
-        raise _not_ours(document.where("distortion_model"), value, _ROS)
-    size = _size(document, ("image_width",), ("image_height",))
-    matrix = _numbers(document, ("camera_matrix", "data"), (9,))
+        raise _unsupported(document.where("distortion_model"), value, _ROS)
+    size = _size_at(document, ("image_width",), ("image_height",))
+    matrix = _numbers_at(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
     if "distortion_coefficients" in document.data:
-        k = _numbers(document, ("distortion_coefficients", "data"), range(15))
-    return _made(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
+        k = _numbers_at(document, ("distortion_coefficients", "data"), range(15))
+    return _camera_from_numbers(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
 
 
 def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
+    """Content of a ROS camera_info file; raises InputError for models that the format does not
+    have.
+    """
     words = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
     if camera.model not in words:
         raise InputError(
@@ -280,7 +300,7 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
             expected="pinhole or fisheye",
             next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
         )
-    matrix = _matrix(_named(camera))
+    matrix = _matrix(_parameters_by_name(camera))
     k = camera.document()["distortion"]
     projection = np.concatenate([matrix, np.zeros((3, 1))], axis=1)
 
@@ -300,11 +320,8 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
     }
 
 
-def _is_kalibr(value: Any) -> bool:
-    return isinstance(value, dict) and "camera_model" in value
-
-
 def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
+    """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
     if wanted is None and len(cameras) > 1:
         raise InputError(
             "the file holds several cameras", where=document.label, found=listed(cameras),
@@ -318,44 +335,50 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     data = document.data[key]
     pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:
-        reference_values = ["-".join(names) for names in _KALIBR]
-        raise _not_ours(document.where(key, "camera_model"), "-".join(pair), reference_values)
+        models = ["-".join(names) for names in _KALIBR]
+        raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
     model = _KALIBR[pair]
     count = 5 if model == "unified" else 4
-    values = _numbers(document, (key, "intrinsics"), (count,))
-    size = _size(document, (key, "resolution", 0), (key, "resolution", 1))
+    intrinsics = _numbers_at(document, (key, "intrinsics"), (count,))
+    size = _size_at(document, (key, "resolution", 0), (key, "resolution", 1))
     k = np.zeros(0)
     if pair[1] != "none":
-        k = _numbers(document, (key, "distortion_coeffs"), (4,))
-    fu, fv, pu, pv = values[-4:].tolist()
+        k = _numbers_at(document, (key, "distortion_coeffs"), (4,))
+    fu, fv, pu, pv = intrinsics[-4:].tolist()
     matrix = np.array([fu, 0, pu, 0, fv, pv, 0, 0, 1])
-    xi = float(values[0]) if model == "unified" else None
-    return _made(model, size, matrix, k, xi, document.where(key, "intrinsics"))
+    xi = float(intrinsics[0]) if model == "unified" else None
+    return _camera_from_numbers(model, size, matrix, k, xi, document.where(key, "intrinsics"))
 
 
 def _kalibr_data(camera: Camera) -> dict[str, Any]:
-    values, k = _named(camera), camera.document()["distortion"]
+    """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
+    parameters, k = _parameters_by_name(camera), camera.document()["distortion"]
     if any(k[4:]):
         raise InputError(
             "Kalibr's radtan distortion has no third radial term",
             found=f"k3 = {k[4]:g}",
             next_step="Calibrate without k3, or write the camera for OpenCV or ROS",
         )
-    four = [values[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
+    four = [parameters[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
     mirror = camera.model == "unified"
     return {
         "camera_model": "omni" if mirror else "pinhole",
-        "intrinsics": [values["xi"], *four] if mirror else four,
+        "intrinsics": [parameters["xi"], *four] if mirror else four,
         "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
         "distortion_coeffs": list(k[:4]),
         "resolution": [int(n) for n in camera.image_size],
     }
 
 
-def _made(
+def _camera_from_numbers(
     model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
 ) -> Camera:
-    """A camera of this program from another's numbers, with its own checks."""
+    """Camera from another program's numbers, validated like pkmcal's own files.
+
+    matrix : (9,) or (3, 3) camera matrix.
+    k : distortion coefficients in the model's order; those beyond the model's number must be zero.
+    Raises InputError.
+    """
     kind = camera_models()[model]
     most = len([name for name in kind.parameter_names if name[0] in "kp" and name[1:].isdigit()])
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
@@ -386,21 +409,24 @@ def _made(
     return camera_from_document(Document(Path(where), where, fields, {}))
 
 
-def _named(camera: Camera) -> dict[str, float]:
+def _parameters_by_name(camera: Camera) -> dict[str, float]:
+    """Parameters of a camera by name."""
     return dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
 
 
-def _matrix(values: dict[str, float]) -> Array:
+def _matrix(parameters: dict[str, float]) -> Array:
+    """Camera matrix (3, 3)."""
     return np.array(
         [
-            [values["focal.x"], 0, values["center.x"]],
-            [0, values["focal.y"], values["center.y"]],
+            [parameters["focal.x"], 0, parameters["center.x"]],
+            [0, parameters["focal.y"], parameters["center.y"]],
             [0, 0, 1.0],
         ]
     )
 
 
-def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
+def _value_at(document: Document, keys: tuple[str | int, ...]) -> Any:
+    """Value under a path of keys; raises InputError if absent."""
     value: Any = document.data
     for key in keys:
         try:
@@ -410,8 +436,9 @@ def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
     return value
 
 
-def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
-    values = _value(document, keys)
+def _numbers_at(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
+    """List of numbers under a path of keys, as an array (n,) with n among ``counts``."""
+    values = _value_at(document, keys)
     numeric = isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) for v in values
     )
@@ -426,12 +453,13 @@ def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -
     )
 
 
-def _size(
+def _size_at(
     document: Document, width: tuple[str | int, ...], height: tuple[str | int, ...]
 ) -> tuple[int, int]:
+    """Image size (width, height) from two paths of keys, px."""
     out: list[int] = []
     for keys in (width, height):
-        value = _value(document, keys)
+        value = _value_at(document, keys)
         if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
             raise InputError(
                 "this is no size in pixels",
@@ -443,11 +471,12 @@ def _size(
     return out[0], out[1]
 
 
-def _not_ours(where: str, text: str, reference_values: Any) -> InputError:
+def _unsupported(where: str, text: str, models: Any) -> InputError:
+    """Error about a camera or lens model that pkmcal does not support."""
     return InputError(
         "this model of camera or lens is not known here",
         where=where,
         found=text,
-        expected=listed(list(reference_values)),
+        expected=listed(list(models)),
         next_step="Calibrate again from photographs of a board: pkmcal camera",
     )

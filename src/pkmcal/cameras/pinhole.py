@@ -1,4 +1,4 @@
-"""Pinhole camera with OpenCV's five distortion parameters k1 k2 p1 p2 k3."""
+"""Pinhole camera with OpenCV's five distortion coefficients k1 k2 p1 p2 k3."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.geometry.rigid import dot, of_components
 
 _NEWTON_STEPS = 20
+"""Most Newton steps for an undistorted point."""
 _TABLE = 513
-"""Radii of the table that Newton starts from: its steps are a thousandth of the picture."""
+"""Size of the table of radii from which Newton's method starts; their spacing is a thousandth of
+the image."""
 
 
 def distort(xy: Array, k: Array) -> tuple[Array, Array]:
     """OpenCV's radial and tangential distortion of normalised image points.
 
-    xy : (..., 2); k : (5,) k1 k2 p1 p2 k3.
+    xy : (..., 2).
+    k : (5,) k1 k2 p1 p2 k3.
     Returns the distorted points (..., 2) and their derivatives by xy (..., 2, 2).
     """
     x, y = xy[..., 0], xy[..., 1]
@@ -42,7 +45,7 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array]:
 
 
 def distort_by_coefficients(xy: Array) -> Array:
-    """Derivatives (..., 2, 5) of :func:`distort` by k1 k2 p1 p2 k3, which it is linear in."""
+    """Derivatives (..., 2, 5) of :func:`distort` by k1 k2 p1 p2 k3, in which it is linear."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     by_k = np.empty((*xy.shape, 5))
@@ -56,12 +59,13 @@ def distort_by_coefficients(xy: Array) -> Array:
 
 
 def undistort(target: Array, k: Array) -> Array:
-    """Newton's inverse of :func:`distort`, (..., 2); NaN where it has none in the field."""
+    """Inverse of :func:`distort` by Newton's method, (..., 2); NaN outside the field of view."""
     if not np.any(k):
         return np.array(target, dtype=float)
     xy = _undistort_radially(target, k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
+            # Newton step with the inverse of the 2x2 derivative written out.
             value, slope = distort(xy, k)
             error = value - target
             det = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]
@@ -81,42 +85,49 @@ def undistort(target: Array, k: Array) -> Array:
 
 
 def in_pixels(parameters: Array, good: Booleans, distorted: Array) -> Array:
-    """Pixels (..., 2) of what :func:`distort` gives, NaN where it is not good (...); parameters :
-    of a camera whose focal lengths and centre come first.
+    """Pixels (..., 2) of distorted normalised points (..., 2); NaN where ``good`` (...) is false.
+
+    parameters : (n,) of a camera, focal lengths and centre first.
     """
     focal, center = parameters[:2].tolist(), parameters[2:4].tolist()
-    with np.errstate(over="ignore"):  # of a focal length beyond all sense: far away is far away
+    with np.errstate(over="ignore"):  # absurd focal lengths give infinite pixels
         return of_components(
             *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
         )
 
 
-def moved_in_pixels(parameters: Array, shifted: Sequence[Array], by_xy: Array | None) -> Array:
-    """How pixels move (..., 2) as the undistorted x and y (...) do; by_xy : the derivative of
-    :func:`distort` there, None where the lens has none.
+def moved_in_pixels(parameters: Array, change: Sequence[Array], by_xy: Array | None) -> Array:
+    """Changes of pixels (..., 2) from changes of the undistorted x and y, each (...).
+
+    by_xy : (..., 2, 2) derivative of :func:`distort` at the points, None without distortion.
     """
-    x, y = shifted
+    x, y = change
     if by_xy is not None:
-        x, y = (by_xy[..., k, 0] * shifted[0] + by_xy[..., k, 1] * shifted[1] for k in (0, 1))
+        x, y = (by_xy[..., k, 0] * change[0] + by_xy[..., k, 1] * change[1] for k in (0, 1))
     focal = parameters[:2].tolist()
     return of_components(focal[0] * x, focal[1] * y)
 
 
 def before_image_fold(xy: Array, by_xy: Array, k: Array) -> Booleans:
-    """True before the place where the lens model folds the image back.
+    """Whether normalised points are inside the radius where the distortion model folds the image
+    back; (...).
 
-    xy : (..., 2) undistorted; by_xy : (..., 2, 2) derivative of :func:`distort` there. The radial
-    polynomial tells the sheets apart; the tangential terms move the fold, where the derivative is
-    singular, a little nearer on one side.
+    xy : (..., 2) undistorted.
+    by_xy : (..., 2, 2) derivative of :func:`distort` at xy.
+
+    The radial polynomial separates the sheets. The tangential terms move the fold, where the
+    derivative is singular, slightly nearer on one side; the determinant detects this.
     """
     det = by_xy[..., 0, 0] * by_xy[..., 1, 1] - by_xy[..., 0, 1] * by_xy[..., 1, 0]
     return (det > 0) & (dot(xy, xy) < _fold(k))
 
 
 def _undistort_radially(target: Array, k: Array) -> Array:
-    """A start for Newton, (..., 2): the inverse of the radial terms alone, from a table.
+    """Starting points (..., 2) for Newton's method: the inverse of the radial terms alone, from a
+    table.
 
-    Newton from the target itself leaps over the fold of a strong lens, and finds nothing.
+    Started from the target itself, Newton's method jumps over the fold of a strongly distorting
+    lens and does not converge.
     """
     distance = np.sqrt(np.sum(np.square(target, dtype=float), axis=-1))
     farthest, fold = float(np.nanmax(distance, initial=0.0)), np.sqrt(_fold(k))
@@ -130,26 +141,30 @@ def _undistort_radially(target: Array, k: Array) -> Array:
 
 
 def _radial(r2: Any, k: Array) -> Any:
+    """Radial factor of the distortion at squared radii r2."""
     return 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
 
 
 def _fold(k: Array) -> float:
-    """Square of the radius where the radial polynomial stops growing; inf where it never does."""
+    """Squared radius where the radial polynomial stops increasing; inf if it never does."""
     return _radial_fold(float(k[0]), float(k[1]), float(k[4]))
 
 
-@lru_cache(maxsize=64)  # a camera asks with every projection
+@lru_cache(maxsize=64)  # evaluated with every projection
 def _radial_fold(k1: float, k2: float, k3: float) -> float:
+    """Cached computation of :func:`_fold`."""
     if k1 >= 0 and k2 >= 0 and k3 >= 0:
         return np.inf
-    # first zero of d(r radial)/dr = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2
+    # First zero of d(r radial)/dr = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, with s = r^2.
     roots = np.roots(np.trim_zeros([7 * k3, 5 * k2, 3 * k1, 1.0], "f"))
     real = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].real
     return float(real.min()) if real.size else np.inf
 
 
 class PinholeSchema(CameraSchema):
-    """``model: pinhole``; ``distortion`` is OpenCV's k1 k2 p1 p2 k3, or fewer, or absent."""
+    """File of a pinhole camera, ``model: pinhole``; ``distortion`` holds up to five coefficients k1
+    k2 p1 p2 k3 of OpenCV's model.
+    """
 
     model: Literal["pinhole"]
     distortion: Annotated[tuple[float, ...], Field(max_length=5)] = ()
@@ -158,7 +173,7 @@ class PinholeSchema(CameraSchema):
 @final
 @dataclass(frozen=True, repr=False)
 class Pinhole(Camera):
-    """Perspective camera: p = K distort(x / z, y / z), OpenCV's model."""
+    """OpenCV's perspective camera, p = K distort(x / z, y / z)."""
 
     model: ClassVar[str] = "pinhole"
     schema: ClassVar[type[CameraSchema]] = PinholeSchema
@@ -168,24 +183,28 @@ class Pinhole(Camera):
     odd: ClassVar[tuple[str, ...]] = ("p1", "p2")
 
     def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
-        good, _, _, distorted, _ = self._imaged(points)
+        """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold of the
+        distortion.
+        """
+        good, _, _, distorted, _ = self._projection(points)
         return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """All from one pass through the lens, if there is one."""
-        good, z, xy, distorted, by_xy = self._imaged(points)
+        """Pixels and directional derivatives from one evaluation of the distortion."""
+        good, z, xy, distorted, by_xy = self._projection(points)
         z = np.where(good, z, np.nan)
-        shifted: list[Array] = []
+        derivatives: list[Array] = []
         for d in directions:
-            # x/z and y/z move by (dx - x/z dz) / z
+            # x/z and y/z change by (dx - x/z dz) / z
             own = [(d[..., k] - xy[..., k] * d[..., 2]) / z for k in (0, 1)]
-            shifted.append(moved_in_pixels(self.parameters, own, by_xy))
-        return in_pixels(self.parameters, good, distorted), *shifted
+            derivatives.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *derivatives
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
-        """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        good, z, xy, distorted, by_xy = self._imaged(points)
+        """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
+        (..., 2, 9).
+        """
+        good, z, xy, distorted, by_xy = self._projection(points)
         by_parameters = np.zeros((*points.shape[:-1], 2, 9))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
@@ -196,13 +215,15 @@ class Pinhole(Camera):
         )
 
     def ray(self, pixels: Array) -> Array:
-        """Unit viewing rays (..., 3) of pixels (..., 2)."""
+        """Unit viewing rays (..., 3) of pixels (..., 2); NaN beyond the fold of the distortion."""
         xy = undistort((pixels - self.parameters[2:4]) / self.parameters[:2], self.parameters[4:])
         rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def _by_point(self, z: Array, xy: Array, by_xy: Array | None) -> Array:
-        """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""
+        """Derivatives (..., 2, 3) of pixels by points: 1/z by x and y, -(x/z, y/z)/z by z, times
+        the distortion's derivative and the focal lengths.
+        """
         if by_xy is None:
             by_xy = np.broadcast_to(np.eye(2), (*z.shape, 2, 2))
         out = np.empty((2, 3, *z.shape))
@@ -213,9 +234,12 @@ class Pinhole(Camera):
             row[2] = scale * -dot(by_xy[..., own, :], xy)
         return np.moveaxis(out, (0, 1), (-2, -1))
 
-    def _imaged(self, points: Array) -> tuple[Booleans, Array, Array, Array, Array | None]:
-        """Where points have an image, and z there (...); x/z and y/z (..., 2); :func:`distort` of
-        these, which leaves them as they are, without a derivative, where the lens has none.
+    def _projection(self, points: Array) -> tuple[Booleans, Array, Array, Array, Array | None]:
+        """Intermediate values of the projection of points (..., 3).
+
+        Returns whether each point has an image (...), z with 1 for points behind the camera (...),
+        x/z and y/z (..., 2), their distorted values (..., 2), and the derivative of :func:`distort`
+        (..., 2, 2), None without distortion.
         """
         z = points[..., 2]
         front = z > 1e-9
@@ -223,8 +247,8 @@ class Pinhole(Camera):
         xy = of_components(points[..., 0] / z, points[..., 1] / z)
         lens = self.parameters[4:]
         if not lens.any():
-            # what is no number, or infinitely far aside, has no image
+            # NaN and infinite points have no image
             return front & np.isfinite(xy[..., 0] + xy[..., 1]), z, xy, xy, None
-        with np.errstate(over="ignore", invalid="ignore"):  # of points almost beside the camera
+        with np.errstate(over="ignore", invalid="ignore"):  # points almost beside the camera
             distorted, by_xy = distort(xy, lens)
             return front & before_image_fold(xy, by_xy, lens), z, xy, distorted, by_xy

@@ -1,9 +1,10 @@
-"""How a camera's grey levels follow from light.
+"""Response of a camera: how grey levels depend on light.
 
-Optics blur light, not levels. Sensors count it, and what their makers' programs store is mostly
-these counts. What telephones write, and whatever wants to be looked at, is coded: IEC 61966-2-1
-(sRGB) gives dark levels more room, so that half the light has the level 188 of 255. There a blurred
-edge leans to its dark side, by up to half its blur, and a bright leg looks wider than it is.
+Optics blur light, not grey levels. Sensors count light, and raw converters mostly store these
+counts. Telephones, and most files made to be looked at, encode the counts: IEC 61966-2-1 (sRGB)
+gives dark levels more room, so half the light has the level 188 of 255. In levels, a blurred edge
+is then displaced towards its dark side by up to half the blur, and a bright leg appears wider than
+it is.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 
 Response = Literal["linear", "srgb"]
+"""Encodings of light in grey levels."""
 OTHER_RESPONSE: dict[Response, Response] = {"linear": "srgb", "srgb": "linear"}
 JPEG_FILE_ENDINGS = frozenset({".jpg", ".jpeg"})
-"""Of files whose standards (JFIF 1.02, CIPA DC-008) say that they are coded to be looked at."""
+"""Suffixes of files whose standards (JFIF 1.02, CIPA DC-008) specify sRGB encoding."""
 
 
 @cache
 def light_of_levels(response: Response) -> Array:
-    """Light (256,) that each of a photograph's 256 levels stands for, 255 the brightest."""
+    """Light (256,) of each of an image's 256 grey levels, 255 for the brightest."""
     level = np.arange(256) / 255
     if response == "srgb":
         level = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
@@ -33,7 +35,7 @@ def light_of_levels(response: Response) -> Array:
 
 
 def levels_of_light(light: Array, response: Response) -> Array:
-    """The inverse of :func:`light_of_levels`, not rounded; light 0..255 of any shape."""
+    """Grey levels, not rounded, of light 0..255, any shape; inverse of :func:`light_of_levels`."""
     if response == "linear":
         return light
     part = np.clip(light / 255, 0, 1)
@@ -42,7 +44,7 @@ def levels_of_light(light: Array, response: Response) -> Array:
 
 
 def light_in(image: Integers, response: Response) -> Any:
-    """The light in a photograph (height, width), uint8; itself where levels are light."""
+    """Light of an image (height, width), uint8; the image itself for a linear response."""
     if response == "linear":
         return image
     import cv2

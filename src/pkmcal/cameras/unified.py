@@ -1,8 +1,9 @@
-"""Unified central camera: mirrors, and wide lenses that behave like one ([B] eq. 1-2).
+"""Unified central camera model for mirrors and wide lenses ([B] eq. 1-2).
 
-A point is projected on the unit sphere, seen from a point xi above the sphere's centre by a
-pinhole camera, then distorted and scaled. xi = 0 is a pinhole, xi = 1 a parabolic mirror. Rays
-more than 90 degrees from the axis have images; the field ends where two rays would share one.
+A point is projected onto the unit sphere, then by a pinhole camera whose centre is xi above the
+sphere's centre, then distorted and scaled. xi = 0 is a pinhole camera, xi = 1 a parabolic mirror.
+Rays more than 90 degrees from the axis have images; the field of view ends where two rays would
+share one image point.
 """
 
 from __future__ import annotations
@@ -26,11 +27,14 @@ from pkmcal.cameras.pinhole import (
 from pkmcal.geometry.rigid import dot, of_components
 
 _LEAST = 1e-9
-"""Cosine by which a ray must lie inside the field's border, where the image runs to infinity."""
+"""Margin, as a difference of cosines, between valid rays and the border of the field, where image
+points go to infinity."""
 
 
 class UnifiedSchema(CameraSchema):
-    """``model: unified``; ``distortion`` is OpenCV's omnidirectional k1 k2 p1 p2."""
+    """File of a unified camera, ``model: unified``; ``distortion`` holds up to four coefficients k1
+    k2 p1 p2 of OpenCV's omnidirectional model.
+    """
 
     model: Literal["unified"]
     xi: Annotated[float, Field(ge=0)] = Field(description="the mirror's parameter, 0 or more")
@@ -40,7 +44,7 @@ class UnifiedSchema(CameraSchema):
 @final
 @dataclass(frozen=True, repr=False)
 class Unified(Camera):
-    """p = K distort(x / (z + xi r), y / (z + xi r)) with r the point's distance."""
+    """Unified model, p = K distort(x / (z + xi r), y / (z + xi r)), with r the point's distance."""
 
     model: ClassVar[str] = "unified"
     schema: ClassVar[type[CameraSchema]] = UnifiedSchema
@@ -52,30 +56,32 @@ class Unified(Camera):
 
     @property
     def xi(self) -> float:
-        """Distance of the projection's centre from the sphere's."""
+        """Distance of the centre of projection from the sphere's centre, in radii."""
         return float(self.parameters[4])
 
     def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3); NaN outside the field."""
-        distorted, good = self._imaged(points)[2:4]
+        """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
+        distorted, good = self._projection(points)[2:4]
         return in_pixels(self.parameters, good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """All from one pass through the lens, if there is one."""
-        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        """Pixels and directional derivatives from one evaluation of the distortion."""
+        (distance, depth), xy, distorted, good, by_xy = self._projection(points)
         depth = np.where(good, depth, np.nan)
         bend = self.xi / distance
-        shifted: list[Array] = []
+        derivatives: list[Array] = []
         for d in directions:
-            # x / w moves by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
+            # x / w changes by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
             dw = bend * dot(points, d) + d[..., 2]
             own = [(d[..., k] - xy[..., k] * dw) / depth for k in (0, 1)]
-            shifted.append(moved_in_pixels(self.parameters, own, by_xy))
-        return in_pixels(self.parameters, good, distorted), *shifted
+            derivatives.append(moved_in_pixels(self.parameters, own, by_xy))
+        return in_pixels(self.parameters, good, distorted), *derivatives
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
-        """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
+        (..., 2, 9).
+        """
+        (distance, depth), xy, distorted, good, by_xy = self._projection(points)
         by_xy = np.eye(2) if by_xy is None else by_xy
         focal = self.parameters[:2, None]
         # d(x / w) = (dx - (x / w) dw) / w with w = z + xi r and dw = (xi X / r + e_z) . dX
@@ -98,39 +104,43 @@ class Unified(Camera):
         )
 
     def ray(self, pixels: Array) -> Array:
-        """Unit viewing rays (..., 3) of pixels (..., 2); NaN outside the mirror's image."""
-        xy = undistort((pixels - self.parameters[2:4]) / self.parameters[:2], self._five())
+        """Unit viewing rays (..., 3) of pixels (..., 2); NaN outside the image of the mirror."""
+        xy = undistort(
+            (pixels - self.parameters[2:4]) / self.parameters[:2], self._five_coefficients()
+        )
         r2 = np.sum(xy * xy, axis=-1)
         with np.errstate(invalid="ignore"):
             root = np.sqrt(1 + (1 - self.xi**2) * r2)
         scale = (self.xi + root) / (1 + r2)
-        # [B] eq. 2; z = scale - xi, written without its cancellation
+        # [B] eq. 2; z = scale - xi in a form without cancellation
         z = (root - self.xi * r2) / (1 + r2)
         return np.concatenate([scale[..., None] * xy, z[..., None]], axis=-1)
 
-    def _five(self) -> Array:
-        """Distortion in the pinhole's order, without a third radial term."""
+    def _five_coefficients(self) -> Array:
+        """Distortion coefficients (5,) in the pinhole model's order, with k3 = 0."""
         return np.append(self.parameters[5:], 0.0)
 
-    def _imaged(
+    def _projection(
         self, points: Array
     ) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array | None]:
-        """Distance r and depth z + xi r (...); x and y over the depth (..., 2); :func:`distort`
-        of these, which leaves them as they are, without a derivative, where the lens has none;
-        where they have an image (...); the distortion's derivative by these.
+        """Intermediate values of the projection of points (..., 3).
+
+        Returns (r, depth z + xi r) (...), x and y divided by the depth (..., 2), their distorted
+        values (..., 2), whether each point has an image (...), and the derivative of
+        :func:`distort` (..., 2, 2), None without distortion.
         """
         distance = np.sqrt(dot(points, points))
         there = distance > 0
         distance = np.where(there, distance, 1.0)
         depth = points[..., 2] + self.xi * distance
-        # Beyond cos = -1 / xi (or -xi) rays come back to pixels that have one already.
+        # Beyond cos = -1 / xi (or -xi) rays share pixels with rays inside the field.
         edge = -min(self.xi, 1 / self.xi) if self.xi > 0 else 0.0
         inside = there & (points[..., 2] > (edge + _LEAST) * distance)
         depth = np.where(inside, depth, 1.0)
         xy = of_components(points[..., 0] / depth, points[..., 1] / depth)
         if not self.parameters[5:].any():
             return (distance, depth), xy, xy, inside & np.isfinite(xy[..., 0] + xy[..., 1]), None
-        with np.errstate(over="ignore", invalid="ignore"):  # of points at the field's border
-            distorted, by_xy = distort(xy, self._five())
-            good = inside & before_image_fold(xy, by_xy, self._five())
+        with np.errstate(over="ignore", invalid="ignore"):  # points at the border of the field
+            distorted, by_xy = distort(xy, self._five_coefficients())
+            good = inside & before_image_fold(xy, by_xy, self._five_coefficients())
         return (distance, depth), xy, distorted, good, by_xy

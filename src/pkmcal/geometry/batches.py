@@ -1,9 +1,8 @@
-"""Many small matrices at once: arrays of a batch kept with the batch fastest in memory.
+"""Operations on batches of small matrices that are stored with the batch axis fastest in memory.
 
-NumPy runs through its arrays in the order of their memory. Where the first axis, the batch, is the
-fastest, one call works on long rows of numbers, and a thousand poses cost little more than one. The
-shapes are the usual ones, (n, ...): only :func:`batch_last` chooses, and the functions here, given
-such an array, answer with such an array.
+NumPy iterates in memory order. With the first axis (the batch) fastest, one call works on long rows
+of numbers, and a thousand poses cost little more than one. Shapes stay (n, ...). Only
+:func:`batch_last` chooses this memory order; the other functions return the order of their input.
 """
 
 from __future__ import annotations
@@ -14,27 +13,27 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, skew
 
 POSES_WORTH_BATCH_LAST = 16
-"""Poses from which on the other order of memory pays."""
+"""Fewest poses for which the batch-last memory order is faster."""
 NUMBERS_WORTH_CALLS = 100
-"""Numbers below which calls cost more than arithmetic."""
+"""Array size below which call overhead exceeds the arithmetic."""
 CYCLIC_PAIRS = ((1, 2), (2, 0), (0, 1))
+"""Indices (j, k) of the factors in component i of a cross product, for i = 0, 1, 2."""
 CROSS_PRODUCT_SIGNS = -skew(np.eye(3))
-"""The cross product's signs: ``(a x b)_i`` is the sum of
-``CROSS_PRODUCT_SIGNS[i, j, k] a_j b_k``."""
+"""Levi-Civita symbol: ``(a x b)_i`` is the sum of ``CROSS_PRODUCT_SIGNS[i, j, k] a_j b_k``."""
 
 
 def batch_last(array: Array) -> Array:
-    """The same (n, ...) with axis 0 fastest in memory."""
+    """Copy (n, ...) of an array with axis 0 fastest in memory."""
     return _first(np.ascontiguousarray(_last(array)))
 
 
 def _last(array: Array) -> Array:
-    """A view with the batch as last axis; ``np.moveaxis`` takes as long as some arithmetic."""
+    """View with the batch axis last; ``np.moveaxis`` takes as long as some arithmetic."""
     return array.transpose(*range(1, array.ndim), 0)
 
 
 def _first(array: Array) -> Array:
-    """A view with the batch, the last axis, as first."""
+    """View with the batch axis, which is last, moved to the front."""
     return array.transpose(array.ndim - 1, *range(array.ndim - 1))
 
 
@@ -45,14 +44,14 @@ def is_batch_last(array: Array) -> bool:
 
 
 def fresh(like: Array, shape: tuple[int, ...]) -> Array:
-    """An empty array in the same order of memory."""
+    """Uninitialised array of a shape, in the memory order of ``like``."""
     if is_batch_last(like):
         return _first(np.empty((*shape[1:], shape[0])))
     return np.empty(shape)
 
 
 def picked(array: Array, rows: Integers) -> Array:
-    """Some rows of a batch, (n, ...) -> (k, ...), in the same order of memory."""
+    """Selected rows of a batch, (n, ...) -> (k, ...), in the same memory order."""
     if is_batch_last(array):
         return _first(np.take(_last(array), rows, axis=-1))
     return array[rows]
@@ -72,8 +71,8 @@ def turned(rot: Array, p: Array) -> Array:
 
 
 def moments(arm: Array, w: Array, out: Array) -> None:
-    """Writes arm x w, (..., 3) each, into ``out``, an array like w."""
-    if out.size < NUMBERS_WORTH_CALLS:  # one call then takes less time than nine
+    """Cross products arm x w, (..., 3) each, written into ``out``, an array like w."""
+    if out.size < NUMBERS_WORTH_CALLS:  # one call is then faster than nine
         np.einsum("ijk,...j,...k->...i", CROSS_PRODUCT_SIGNS, arm, w, out=out)
         return
     for k, (i, j) in enumerate(CYCLIC_PAIRS):
@@ -82,17 +81,17 @@ def moments(arm: Array, w: Array, out: Array) -> None:
 
 
 def stepped(poses: Array, delta: Array) -> Array:
-    """Poses (n, 4, 4) moved by small steps (n, 6), as :func:`pkmcal.geometry.rigid.perturb` does to
-    second order.
+    """Poses (n, 4, 4) retracted along small steps (n, 6), equal to
+    :func:`pkmcal.geometry.rigid.perturb` to second order.
 
-    Cayley's map, ``I + 2 / (1 + w.w) ([w]x + [w]x^2)`` with w = omega / 2: exactly a rotation, and
-    without sines, so that a search may take it at every step.
+    Cayley's map, ``I + 2 / (1 + w.w) ([w]x + [w]x^2)`` with w = omega / 2, gives an exact rotation
+    without sines, so it is cheap enough for every step of a search.
     """
     out = np.empty_like(poses)
     w, rot = delta[:, :3] / 2, poses[:, :3, :3]
     if is_batch_last(poses):
-        swung = _crossed(w, rot)
-        swung += _crossed(w, swung)
+        swung = _cross_columns(w, rot)
+        swung += _cross_columns(w, swung)
         size = dot(w, w)
     else:
         turn = skew(w)
@@ -106,8 +105,8 @@ def stepped(poses: Array, delta: Array) -> Array:
     return out
 
 
-def _crossed(w: Array, matrix: Array) -> Array:
-    """Each column of matrices (n, 3, 3) under w (n, 3) x."""
+def _cross_columns(w: Array, matrix: Array) -> Array:
+    """Cross products of w (n, 3) with each column of matrices (n, 3, 3)."""
     out = np.empty_like(matrix)
     for k, (i, j) in enumerate(CYCLIC_PAIRS):
         np.multiply(w[:, i, None], matrix[:, j], out=out[:, k])
@@ -116,12 +115,14 @@ def _crossed(w: Array, matrix: Array) -> Array:
 
 
 def damped_step(jac: Array, value: Array, damping: Array) -> Array:
-    """Levenberg-Marquardt steps (..., d) with column scaling: the least |jac x - value|.
+    """Levenberg-Marquardt steps (..., d) with column scaling, minimising |jac x - value|.
 
-    jac (..., E, d), value (..., E), damping (...), relative to each column's square.
+    jac : (..., E, d).
+    value : (..., E).
+    damping : (...), relative to the square of each column.
     """
     if is_batch_last(jac):
-        return _eliminated(jac, value, damping)
+        return _elimination_step(jac, value, damping)
     transposed = jac.mT
     normal = transposed @ jac
     d = jac.shape[-1]
@@ -131,13 +132,16 @@ def damped_step(jac: Array, value: Array, damping: Array) -> Array:
     return np.linalg.solve(normal, transposed @ value[..., None])[..., 0]
 
 
-def _eliminated(jac: Array, value: Array, damping: Array) -> Array:
-    """The same by one elimination for the whole batch (n, E, d); no pivots, as the normal matrices
-    are positive definite. Where rounding made one singular its step is not finite.
+def _elimination_step(jac: Array, value: Array, damping: Array) -> Array:
+    """:func:`damped_step` by one elimination over the whole batch (n, E, d), with the batch axis
+    fastest.
+
+    No pivoting, because the normal matrices are positive definite. If rounding makes one singular,
+    its step is not finite.
     """
     d = jac.shape[-1]
     j, r = _last(jac), _last(value)
-    # upper half of the normal matrix, and the right side as its last column
+    # Normal equations: row k holds columns k..d-1 of the normal matrix, then the right-hand side.
     a = [np.empty((d - k + 1, jac.shape[0])) for k in range(d)]
     part = np.empty_like(a[0])
     with np.errstate(all="ignore"):
@@ -146,13 +150,15 @@ def _eliminated(jac: Array, value: Array, damping: Array) -> Array:
             np.einsum("en,en->n", j[:, k], r, out=row[-1])
             row[0] *= 1 + damping
             row[0] += 1e-300
+        # Forward elimination.
         for k, row in enumerate(a):
             row[1:] /= row[0]
             for i in range(k + 1, d):
-                # what is left of row i: row_i - (a_ki / a_kk) row_k
+                # row_i - (a_ki / a_kk) row_k
                 share = np.multiply(row[i - k], row[0], out=part[-1])
                 np.multiply(row[i - k :], share, out=part[: d - i + 1])
                 a[i] -= part[: d - i + 1]
+        # Back substitution.
         x = np.empty((d, jac.shape[0]))
         for k in range(d - 1, -1, -1):
             x[k] = a[k][-1]

@@ -1,11 +1,11 @@
-"""Lines and cylinders before a central camera: the planes of a leg's two silhouette edges.
+"""Lines and cylinders in front of a central camera: the planes of a leg's two silhouette edges.
 
-A line is a unit direction ``u`` and a moment ``m = p x u`` for any of its points p. A
-cylinder of radius R around it shows two edges to a camera at the origin; each edge and the
-camera's centre span a plane, whose unit normal ``n`` points away from the axis: for every
-point a of the axis ``n . a = -R`` ([B] 12-13). Side 0 is ``n = cos m - sin a_perp``, side 1
-``n = -cos m - sin a_perp`` ([B] eq. 3 in its consistent form), so with the direction u away
-from the viewer's feet, u = n_1 x n_0 normalised.
+A line is a unit direction ``u`` and a moment ``m = p x u`` for any of its points p. A cylinder of
+radius R about the line shows two edges to a camera at the origin. Each edge spans a plane with the
+camera's centre. The plane's unit normal ``n`` points away from the axis: ``n . a = -R`` for every
+point a of the axis ([B] 12-13). With the unit moment m and w = u x m, side 0 is
+``n_0 = cos m - sin w`` and side 1 is ``n_1 = -cos m - sin w``, where sin = R / (distance of the
+line) ([B] eq. 3 in its consistent form). Then u = n_1 x n_0, normalised.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 
 SIDE_SIGNS = np.array([1.0, -1.0])
-"""Sign of the moment's part of the normal, by side."""
+"""Sign of the moment's term in the edge normal, by side."""
 
 
 class EdgeNormals(NamedTuple):
-    """Normals n (..., 3) of edges, and how they move with the axis's points a, b and with R.
+    """Edge normals n (..., 3), with derivatives by the axis points a, b and the radius R.
 
-    ``dn = by_a (n.da) + by_b (n.db) + (by_a + by_b) dR``, by_a and by_b (..., 3): an edge's plane
-    does not mind what a point does within it, so each derivative is of rank one.
+    ``dn = by_a (n.da) + by_b (n.db) + (by_a + by_b) dR``, with by_a and by_b (..., 3). A point that
+    moves within the edge plane does not change the plane, so each derivative has rank one.
     """
 
     n: Array
@@ -34,12 +34,12 @@ class EdgeNormals(NamedTuple):
 
     @property
     def dn_da(self) -> Array:
-        """(..., 3, 3)."""
+        """Derivative (..., 3, 3) of n by a."""
         return self.by_a[..., :, None] * self.n[..., None, :]
 
     @property
     def dn_db(self) -> Array:
-        """(..., 3, 3)."""
+        """Derivative (..., 3, 3) of n by b."""
         return self.by_b[..., :, None] * self.n[..., None, :]
 
 
@@ -51,19 +51,24 @@ def line_through(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def has_silhouette(m: Array, radius: Array) -> Booleans:
-    """False where the camera's centre lies in the cylinder: it has no silhouette there.
+    """Whether a cylinder has silhouette edges, that is, the camera's centre is outside it (by 2 %
+    of its radius).
 
-    m : (..., 3) moment of its axis.
+    m : (..., 3) moment of the axis, m.
+    radius : (...) m.
     """
     return dot(m, m) > (1.02 * radius) ** 2
 
 
 def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
-    """Tangent planes of cylinders through the camera's centre, n = s cos m - sin u x m, [B] eq. 3.
+    """Unit normals (..., 3) of the tangent planes of cylinders through the camera's centre, n = s
+    cos m - sin u x m ([B] eq. 3).
 
-    u, m : (..., 3) the axes' Pluecker coordinates, camera frame, as of :func:`line_through`.
-    radius : (...,) m. sign : (...,) of SIDE_SIGNS.
-    Returns unit n (..., 3), NaN where the centre of projection lies inside the cylinder.
+    u, m : (..., 3) direction and moment of the axes in the camera frame, as :func:`line_through`
+        returns them.
+    radius : (...,) m.
+    sign : (...,) of SIDE_SIGNS.
+    Returns NaN where the centre of projection is inside the cylinder.
     """
     distance = np.sqrt(dot(m, m))
     sine, cosine = (x[..., None] for x in edge_planes(distance, radius, sign))
@@ -72,11 +77,14 @@ def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
 
 
 class LineSilhouettes(NamedTuple):
-    """Lines from a to b before a camera at the origin, and how the edges around them move.
+    """Lines from a to b in front of a camera at the origin, prepared for the normals of the edges
+    around them.
 
-    u : (..., 3) direction from a to b. m : unit moment, along ``a x u``. w : ``u x m``, towards the
-    line's nearest point. distance, length, before, behind : (...) m, with
-    ``a = distance w + before u`` and ``b = distance w + behind u``.
+    u : (..., 3) unit direction from a to b.
+    m : (..., 3) unit moment, along ``a x u``.
+    w : (..., 3) ``u x m``, towards the line's nearest point.
+    distance, length, before, behind : (...) m, with ``a = distance w + before u`` and
+        ``b = distance w + behind u``.
     """
 
     u: Array
@@ -89,7 +97,7 @@ class LineSilhouettes(NamedTuple):
 
     @classmethod
     def between(cls, a: Array, b: Array) -> LineSilhouettes:
-        """Those of points (..., 3)."""
+        """Lines between points a and b (..., 3), in the camera frame."""
         line = b - a
         length = np.sqrt(dot(line, line))
         u = line / length[..., None]
@@ -100,15 +108,15 @@ class LineSilhouettes(NamedTuple):
         return cls(u, m, cross(u, m), distance, length, before, before + length)
 
     def edges(self, radius: Array, side: Integers) -> EdgeNormals:
-        """Their edges' normals with exact derivatives.
+        """Edge normals with exact derivatives, radius (...) m and side (...) 0 or 1.
 
-        The normal obeys n.a = -R, n.b = -R, n.n = 1. Differentiating these three,
-        ``[a b n]^T dn = (-dR - n.da, -dR - n.db, 0)``. With ``v = w + (sine / cosine) m``, which is
-        square to u and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) /
-        length + v ((before n.db - behind n.da) / length - dR) / distance``.
+        The normal satisfies n.a = -R, n.b = -R, n.n = 1. Differentiation gives ``[a b n]^T dn =
+        (-dR - n.da, -dR - n.db, 0)``. With ``v = w + (sine / cosine) m``, which is orthogonal to u
+        and n and has v.a = v.b = distance, the solution is ``dn = u (n.da - n.db) / length + v
+        ((before n.db - behind n.da) / length - dR) / distance``.
         """
-        value = edge_planes(self.distance, radius, SIDE_SIGNS[side])
-        sine, cosine = (x[..., None] for x in value)
+        planes = edge_planes(self.distance, radius, SIDE_SIGNS[side])
+        sine, cosine = (x[..., None] for x in planes)
         turn = (self.w + (sine / cosine) * self.m) / self.distance[..., None]
         shift = self.u / self.length[..., None]
         by_a = shift - (self.behind / self.length)[..., None] * turn
@@ -117,35 +125,39 @@ class LineSilhouettes(NamedTuple):
 
 
 def edge_planes(distance: Array, radius: Array, sign: Array) -> tuple[Array, Array]:
-    """Sine and signed cosine of the angle between an edge's plane and its axis's, so that the
-    normal is ``n = cosine m - sine w``, [B] eq. 3; NaN where the centre of projection lies inside
-    the cylinder. distance, radius : (...) m. sign : (...) of SIDE_SIGNS.
+    """Sine and signed cosine in an edge's normal ``n = cosine m - sine w`` ([B] eq. 3), for unit
+    moment m and w = u x m.
+
+    distance, radius : (...) m.
+    sign : (...) of SIDE_SIGNS.
+    Returns NaN cosines where the centre of projection is inside the cylinder.
     """
     sine = radius / distance
     return sine, sign * np.sqrt(np.where(np.abs(sine) < 1, 1 - sine**2, np.nan))
 
 
 def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> EdgeNormals:
-    """One edge's normal and its exact derivatives, from two points of the axis.
+    """Edge normals with exact derivatives, from two points of the axis.
 
-    a, b : (..., 3) points of the axis in the camera frame, a towards the base (m).
-    radius, side : (...,) m, and 0 or 1. Where the centre of projection is inside the cylinder the
-    values are NaN: the caller leaves such edges out with :func:`has_silhouette`.
+    a, b : (..., 3) points of the axis in the camera frame, a towards the base, m.
+    radius, side : (...,) m, and 0 or 1.
+    Returns NaN where the centre of projection is inside the cylinder; the caller excludes these
+    edges with :func:`has_silhouette`.
     """
     return LineSilhouettes.between(a, b).edges(radius, side)
 
 
 def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:
-    """Points of a cylinder where the view ray grazes it: a + s u + R n, (..., 3)."""
+    """Points (..., 3) of a cylinder where the viewing ray is tangent to it: a + s u + R n."""
     return a + along[..., None] * u + np.asarray(radius)[..., None] * n
 
 
 def tangent_basis(n: Array, along: Array) -> Array:
-    """Orthonormal bases (..., 3, 2) of the planes orthogonal to unit vectors n.
+    """Orthonormal bases (..., 3, 2) of the planes orthogonal to unit vectors n (..., 3).
 
-    The first column is the part of ``along`` orthogonal to n (the ray to the middle of the
-    edge), so a turn of n towards it shifts the whole edge sideways; the second is
-    n x first, and a turn towards it tilts the edge about its middle.
+    The first column is the part of ``along`` (the ray to the middle of the edge) orthogonal to n: a
+    rotation of n towards it shifts the edge sideways. The second is n x first: a rotation of n
+    towards it tilts the edge about its middle.
     """
     first = along - dot(along, n)[..., None] * n
     first = first / np.sqrt(dot(first, first))[..., None]

@@ -1,11 +1,11 @@
-"""Rigid motions, batched.
+"""Rigid motions, in batches.
 
 A pose is a 4x4 matrix ``T_a_b`` that maps coordinates of frame ``b`` to frame ``a``:
 ``p_a = T_a_b p_b``, so inner names cancel in products.
 
-Perturbation, stated once for the whole project: six numbers ``delta = (omega, tau)``
-change ``T = (R, t)`` from the left into ``(Exp(omega) R, t + tau)``; ``omega`` is a
-rotation vector (rad), ``tau`` a translation (m), both in the outer frame.
+Perturbation, defined here for the whole project: six numbers ``delta = (omega, tau)`` change
+``T = (R, t)`` from the left to ``(Exp(omega) R, t + tau)``; ``omega`` is a rotation vector (rad),
+``tau`` a translation (m), both in the outer frame.
 """
 
 from __future__ import annotations
@@ -17,22 +17,24 @@ from pkmcal.arrays import Array
 _CROSSED = -np.array([[[0, 0, 0], [0, 0, 1], [0, -1, 0]],
                       [[0, 0, -1], [0, 0, 0], [1, 0, 0]],
                       [[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], dtype=float).reshape(3, 9)  # fmt: skip
-"""Cross-product matrices of the axes: one product makes that of any vector."""
+"""Cross-product matrices of the three axes, flattened: v @ _CROSSED is the cross-product matrix of
+v."""
 LEAST_ANGLE = 1e-150
-"""rad; below it a turn is none."""
+"""Rotation angle (rad) below which the rotation is the identity."""
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrices: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
+    """Cross-product matrices, (..., 3) -> (..., 3, 3): ``skew(v) @ w == cross(v, w)``."""
     v = np.asarray(v)
     return (v @ _CROSSED).reshape(*v.shape, 3)
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross product over the last axis; several times faster than ``np.cross``, same result.
+    """Cross product over the last axis; several times faster than ``np.cross``, with the same
+    result.
 
-    In memory it lies as its factors do: of arrays with the components slowest, NumPy makes one
-    with the components slowest, and runs along many vectors at once.
+    The result has the memory order of its factors. If the components are slowest in memory, NumPy
+    iterates over many vectors at once.
     """
     shape = a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape)
     like = a if a.shape == shape else b
@@ -44,9 +46,10 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Inner product over the last axis, (..., n) x (..., n) -> (...); n is small.
+    """Inner product over a short last axis, (..., n) x (..., n) -> (...).
 
-    Term by term: NumPy's reductions over a short last axis take several times as long.
+    The sum is written out because NumPy's reductions over a short last axis are several times
+    slower.
     """
     out = a[..., 0] * b[..., 0]
     for k in range(1, a.shape[-1]):
@@ -55,11 +58,11 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def of_components(*parts: Array) -> Array:
-    """The array (..., k) of its k components, each (...), which broadcast.
+    """Array (..., k) from its k components (...), which broadcast.
 
-    In memory the components are slowest, so that NumPy runs along many vectors at once.
+    The components are slowest in memory, so that NumPy iterates over many vectors at once.
     """
-    shape = parts[0].shape  # nearly always that of all, and asking NumPy takes a third of the time
+    shape = parts[0].shape  # usually all alike; NumPy's check takes a third of the time
     if any(part.shape != shape for part in parts):
         shape = np.broadcast_shapes(*(part.shape for part in parts))
     out = np.empty((len(parts), *shape), dtype=np.result_type(*parts))
@@ -71,7 +74,7 @@ def of_components(*parts: Array) -> Array:
 def rotation(omega: Array) -> Array:
     """Rotation matrices Exp(omega) of rotation vectors (rad), (..., 3) -> (..., 3, 3).
 
-    Rodrigues' formula by half the angle; the least length keeps its limit at zero exact.
+    Rodrigues' formula in the half angle; LEAST_ANGLE keeps the limit at zero exact.
     """
     omega = np.asarray(omega, dtype=float)
     angle = np.sqrt(dot(omega, omega))[..., None]
@@ -80,7 +83,9 @@ def rotation(omega: Array) -> Array:
 
 
 def axial(matrix: Array) -> Array:
-    """The vector (..., 3) of M - M^T (..., 3, 3); of a rotation, twice its axis times the sine."""
+    """Axial vectors (..., 3) of M - M^T for matrices (..., 3, 3); for a rotation, 2 sin(angle)
+    times the axis.
+    """
     out = np.empty(matrix.shape[:-1])
     for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
         out[..., k] = matrix[..., i, j] - matrix[..., j, i]
@@ -90,13 +95,13 @@ def axial(matrix: Array) -> Array:
 def rotation_vector(rot: Array) -> Array:
     """Rotation vectors (rad, norm at most pi) of rotation matrices, (..., 3, 3) -> (..., 3).
 
-    Twice the axis times the sine, from the differences across the diagonal, with the angle from
-    sine and cosine: as good as SciPy's and forty times as fast. Those differences vanish at a half
-    turn, near which it is SciPy's.
+    The axial vector, scaled by angle / sine with the angle from sine and cosine: as accurate as
+    SciPy's function and forty times as fast. The axial vector vanishes at a half turn, near which
+    SciPy's function is used.
     """
     rot = np.asarray(rot, dtype=float)
     v = axial(rot)
-    sine, cosine = np.sqrt(dot(v, v)), np.trace(rot, axis1=-2, axis2=-1) - 1  # twice each
+    sine, cosine = np.sqrt(dot(v, v)), np.trace(rot, axis1=-2, axis2=-1) - 1  # both doubled
     small = sine < 1e-7
     out = np.where(small, 0.5, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))[..., None] * v
     half = cosine < -1.9
@@ -108,9 +113,7 @@ def rotation_vector(rot: Array) -> Array:
 
 
 def quaternion(rot: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, of rotations (..., 3, 3); the scalar is not
-    negative.
-    """
+    """Unit quaternions (..., 4), scalar first and not negative, of rotations (..., 3, 3)."""
     omega = rotation_vector(rot)
     angle = np.sqrt(dot(omega, omega))[..., None]
     axis = omega / np.where(angle > 0, angle, 1.0)
@@ -126,8 +129,10 @@ def from_quaternion(q: Array) -> Array:
 
 
 def roll_pitch_yaw(rot: Array) -> Array:
-    """Angles (3,) of a rotation (3, 3), rad: R = Rz(yaw) Ry(pitch) Rx(roll), as URDF and SDF have
-    them; |pitch| is 90 degrees at most, and there the roll takes the yaw's share.
+    """Angles (3,) in rad of a rotation (3, 3), with R = Rz(yaw) Ry(pitch) Rx(roll) as in URDF and
+    SDF.
+
+    |pitch| is at most 90 degrees; at 90 degrees the yaw is zero and the roll holds both.
     """
     across = float(np.hypot(rot[0, 0], rot[1, 0]))
     yaw = float(np.arctan2(rot[1, 0], rot[0, 0])) if across > 1e-12 else 0.0
@@ -143,7 +148,7 @@ def from_roll_pitch_yaw(angles: Array) -> Array:
 
 
 def pose(rot: Array, t: Array) -> Array:
-    """4x4 poses from rotations (..., 3, 3) and translations (..., 3)."""
+    """Poses (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     same = rot.shape[:-2] == t.shape[:-1]
     shape = t.shape[:-1] if same else np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
     out = np.zeros((*shape, 4, 4))
@@ -158,19 +163,21 @@ def inverse(transform: Array) -> Array:
 
 
 def apply(transform: Array, points: Array) -> Array:
-    """Points (..., 3) mapped by poses (..., 4, 4); leading axes broadcast."""
+    """Points (..., 3) transformed by poses (..., 4, 4); leading axes broadcast."""
     turned = (transform[..., :3, :3] @ points[..., None])[..., 0]
     return turned + transform[..., :3, 3]
 
 
 def perturb(transform: Array, delta: Array) -> Array:
-    """Poses moved by six numbers each (module docstring), (..., 4, 4), (..., 6)."""
+    """Poses (..., 4, 4) retracted along six numbers each (..., 6), as defined in the module's
+    docstring.
+    """
     rot = rotation(delta[..., :3]) @ transform[..., :3, :3]
     return pose(rot, transform[..., :3, 3] + delta[..., 3:])
 
 
 def pose_difference(transform: Array, reference: Array) -> Array:
-    """The six numbers with ``perturb(reference, delta) == transform``; (..., 6)."""
+    """Six numbers (..., 6) with ``perturb(reference, delta) == transform``."""
     rot = transform[..., :3, :3] @ reference[..., :3, :3].mT
     return np.concatenate(
         [rotation_vector(rot), transform[..., :3, 3] - reference[..., :3, 3]], axis=-1
@@ -178,13 +185,13 @@ def pose_difference(transform: Array, reference: Array) -> Array:
 
 
 def angle_between(one: Array, other: Array) -> Array:
-    """Angles (...) rad by which poses (..., 4, 4) are turned against others."""
+    """Rotation angles (...) in rad between poses (..., 4, 4)."""
     turned = one[..., :3, :3] @ other[..., :3, :3].mT
     return np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotations R (..., 3, 3) that maximise tr(R^T M); reflections are excluded."""
+    """Rotations R (..., 3, 3) that maximise tr(R^T M); reflections are excluded."""
     u, _, vt = np.linalg.svd(matrix)
     u = u.copy()
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
@@ -192,12 +199,12 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def register(source: Array, target: Array, weights: Array | None = None) -> Array:
-    """Rigid motions that lay points on points: min sum w |T source - target|^2.
+    """Rigid motions (..., 4, 4) that register points: min sum w |T source - target|^2 (Kabsch).
 
-    source, target : (..., n, 3), n >= 3 and not on one line for a unique answer.
-    weights : (..., n), none for equal ones.
-    Returns (..., 4, 4). Kabsch's solution; reflections are excluded.
-    [A] 9 and 16 in their corrected form, [B] eq. 15.
+    source, target : (..., n, 3), n >= 3, not on one line for a unique solution.
+    weights : (..., n), equal by default.
+
+    Reflections are excluded. [A] 9 and 16 in their corrected form, [B] eq. 15.
     """
     w = np.ones(source.shape[:-1]) if weights is None else weights
     w = w / w.sum(axis=-1, keepdims=True)
@@ -209,10 +216,11 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
 
 
 def look_at(position: Array, target: Array, up: Array) -> Array:
-    """``T_camera_base`` of a camera at ``position`` that looks at ``target`` (base frame, m).
+    """``T_camera_base`` (4, 4) of a camera at ``position`` that looks at ``target``
+    (base frame, m).
 
-    Camera axes as OpenCV: z forward, x right, y down; ``up`` shows upwards in the image.
-    The caller checks that target and up are not degenerate.
+    Camera axes as in OpenCV: z forward, x right, y down; ``up`` points upwards in the image. The
+    caller ensures that ``up`` is not parallel to the viewing direction.
     """
     forward = np.asarray(target, dtype=float) - position
     forward = forward / np.linalg.norm(forward)

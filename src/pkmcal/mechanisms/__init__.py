@@ -1,4 +1,6 @@
-"""Machines as limbs between a base and a platform: closure, kinematics, parameters, files."""
+"""Machines with limbs between a base and a platform: closure equations, kinematics, parameters,
+files.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from pkmcal.files import (
     validated_document,
     yaml_text,
 )
-from pkmcal.mechanisms.document import DocumentModel, MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import listed
@@ -39,12 +41,13 @@ __all__ = [
 
 
 LARGEST_DEVIATION_SHARE = 0.25
-"""Of a machine's size. The distance of two points that are each uncertain by more would be known to
-hardly more than its order; the tolerances of real drawings are a hundredth of it at most."""
+"""Largest prior sigma as a share of the machine's size. If two points are each uncertain by more,
+only the order of magnitude of their distance is known; prior sigmas of real machines are a
+hundredth of it at most."""
 
 
 def catalogue() -> dict[str, Path]:
-    """The built-in machines' files by name."""
+    """Files of the built-in machines by name."""
     folder = resources.files("pkmcal.mechanisms") / "catalog"
     return {Path(str(f)).stem: Path(str(f)) for f in folder.iterdir() if f.name.endswith(".yaml")}
 
@@ -66,7 +69,7 @@ def load_mechanism(
     Raises
     ------
     pkmcal.errors.InputError
-        Anything that the schema does not allow, with file, line and field.
+        Any content that the schema does not allow, with file, line and field.
 
     """
     built_in = catalogue()
@@ -79,12 +82,19 @@ def load_mechanism(
             found=str(source),
             expected=guess or f"a mechanism file, or {listed(sorted(built_in), len(built_in))}",
         )
-    document, checked = _drawing(path, label) if str(source) in built_in else _read(path, label)
+    document, checked = _built_in(path, label) if str(source) in built_in else _read(path, label)
     if model is not None:
-        try:
-            chosen = _model(checked, model)
-        except InputError as error:
-            raise error.located(document.label) from None
+        if model not in checked.models:
+            names = sorted(checked.models)
+            raise InputError(
+                what=f"mechanism {checked.name!r} has no model of this name",
+                where=document.label,
+                found=model,
+                expected=closest(model, names) or (listed(names) if names else "no model at all"),
+                next_step="name a model under models in the mechanism file, with what it fixes and"
+                " ties",
+            )
+        chosen = checked.models[model]
         if chosen.mechanism is not None:
             beside = path.parent / chosen.mechanism
             return load_mechanism(chosen.mechanism if chosen.mechanism in built_in else beside)
@@ -93,19 +103,20 @@ def load_mechanism(
 
 
 def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
-    """A file's fields, as they stand there and as the schema has them."""
+    """Document of a mechanism file, raw and validated."""
     document = read_yaml(path, label)
     return document, validated_document(document, MechanismDocument)
 
 
-_drawing = cache(_read)
-"""The same of a built-in machine, read once: the package's own files stay as they are."""
+_built_in = cache(_read)
+""":func:`_read` for built-in machines, cached because the package's own files do not change."""
 
 
 def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:
-    """The machine of a file's fields, which stand under `keys` in it.
+    """Machine from a validated document whose fields are under `keys` in its file.
 
-    Raises InputError with file and field for a drawing that cannot be a machine's.
+    Raises InputError with file and field if the nominal model is not a machine, or is likely in
+    millimetres.
     """
     try:
         machine = machine_from_document(checked, lambda *inner: document.where(*keys, *inner))
@@ -113,7 +124,7 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
     except InputError as error:
         if (error.where or "").startswith(document.label):
             raise
-        raise error.located(document.where(*keys, *_role(checked, str(error)))) from None
+        raise error.located(document.where(*keys, *_role_keys(checked, str(error)))) from None
     table = machine.parameters
     lengths = np.where(np.array(table.units) == "m", np.abs(table.drawing), 0.0)
     longest = int(np.argmax(lengths))
@@ -133,8 +144,11 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
 
 
 def check_plausible(value: float, machine: Machine, where: str, what: str) -> None:
-    """Raise InputError for a deviation, m, with which nothing would be known of a machine's size;
-    as a rule it was meant in millimetres. where : its place in a file. what : what it is called.
+    """Raise InputError for a standard deviation of a length, m, above LARGEST_DEVIATION_SHARE of
+    the machine's size; usually the value was meant in millimetres.
+
+    where : location of the value in its file.
+    what : name of the value in the message.
     """
     most = LARGEST_DEVIATION_SHARE * machine.size
     if value <= most:
@@ -150,8 +164,10 @@ def check_plausible(value: float, machine: Machine, where: str, what: str) -> No
     )
 
 
-def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
-    """The entry under ``fixed`` or ``tied`` that a sentence is about, if it names one."""
+def _role_keys(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
+    """Path of the entry under ``fixed`` or ``tied`` that an error's sentence names, empty if it
+    names none.
+    """
     entries: list[tuple[tuple[str | int, ...], str]] = [
         (("fixed", k), name) for k, name in enumerate(checked.fixed)
     ]
@@ -167,19 +183,6 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
     return next((keys for keys, name in entries if is_named(name)), ())
 
 
-def _model(document: MechanismDocument, name: str) -> DocumentModel:
-    """One of a machine's models by its name."""
-    if name in document.models:
-        return document.models[name]
-    names = sorted(document.models)
-    raise InputError(
-        what=f"mechanism {document.name!r} has no model of this name",
-        found=name,
-        expected=closest(name, names) or (listed(names) if names else "no model at all"),
-        next_step="name a model under models in the mechanism file, with what it fixes and ties",
-    )
-
-
 def mechanism_text(machine: Machine) -> str:
-    """The machine as the text of a mechanism file, present values in it."""
+    """Text of a mechanism file with the machine's present values."""
     return yaml_text(machine.to_document())

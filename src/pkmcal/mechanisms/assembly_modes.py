@@ -1,7 +1,7 @@
-"""All poses that close a machine at one set of readings: its assembly modes.
+"""Assembly modes: all poses that close a machine at one set of readings.
 
-A search from random starts, continued until nothing new is likely to come. It proves nothing: what
-it can say is how small the share of starts must be that lead to a mode that it did not find.
+The search uses random starts and stops when further modes are unlikely. It is no proof; the result
+states a bound on the share of starts that lead to a mode not found.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import assembly_sign, sign_of
 
 STARTS_A_BATCH = 1000
-"""Starts at a time."""
+"""Starts in one batch."""
 RAREST_MODE_FINDS = 10
-"""Times that the rarest mode must have been found before the search ends. Were the next rarest
-half as likely to be met, it would have been missed with a chance of exp(-5), 0.7 percent."""
+"""Number of times that each mode must be found before the search ends. A mode half as likely as the
+rarest one would have been missed with probability exp(-5), 0.7 percent."""
 MISSED_MODE_CHANCE = 1e-3
-"""Chance left that a mode of the share :attr:`AssemblyModes.missing` was missed."""
+"""Probability that a mode with the share :attr:`AssemblyModes.missing` was missed."""
 SAME_MODE_DISTANCE = 1e-6
-"""Poses (1 and m) nearer than this are one: where two modes merge, a closure that is right to
-1e-14 m leaves 1e-7."""
+"""Largest difference of coordinates (1 and m) of one mode. Where two modes merge, a closure error
+of 1e-14 m leaves an uncertainty of 1e-7."""
 
 
 @dataclass(frozen=True)
 class AssemblyModes:
-    """Poses (k, 4, 4) that close the machine, the nearest to home first.
+    """Poses (k, 4, 4) that close the machine, in the order of their distance from home.
 
-    internal : (k, n) the hinges' turns of an articulated platform, rad.
-    mode_numbers : (k,) how many starts led to each. sign : (k,) 1 where the Jacobian's determinant
-    has
-        home's sign, -1 where not: such a mode cannot be reached from home without crossing a
-        singular pose; with home's sign it may be. 0 where there is no determinant.
-    starts, closed : how many starts were tried, and how many of them led to any pose.
-    missing : a mode that is not listed is met by less than this share of the starts that close the
-        machine, with 99.9 percent probability; 1 where no start did.
-    complete : every mode was found so often that another is unlikely; False where the search was
-        stopped by the number of starts before.
+    internal : (k, n) hinge angles of an articulated platform, rad.
+    mode_numbers : (k,) number of starts that led to each mode.
+    sign : (k,) 1 if the Jacobian's determinant has the sign it has at home, -1 if not: such a mode
+        cannot be reached from home without crossing a singular pose, others may be. 0 without a
+        determinant.
+    starts, closed : number of starts, and of those that led to any pose.
+    missing : upper bound, with 99.9 percent probability, of the share of closed starts that lead to
+        a mode not listed; 1 if no start closed.
+    complete : whether each mode was found RAREST_MODE_FINDS times; False if the number of starts
+        ended the search.
     """
 
     poses: Array
@@ -72,25 +72,28 @@ def assembly_modes(
     rng: np.random.Generator,
     most: int = 100_000,
 ) -> AssemblyModes:
-    """Distinct poses that close the machine at readings (m,); home (4, 4) has its assembly's sign.
+    """Distinct poses that close the machine at readings (m,).
 
-    theta : (P,). most : the largest number of starts. Poses whose readings are those of two modes
-    that merge, nearer than 1e-6, count as one.
+    theta : (P,).
+    home : (4, 4) pose of the assembly that defines the sign.
+    most : largest number of starts.
+
+    Modes that nearly merge, nearer than SAME_MODE_DISTANCE, count as one.
     """
     modes, count = np.zeros((0, 12 + 2 * layout.n_internal)), np.zeros(0, dtype=int)
     starts = closed = 0
     complete = False
     while not complete and starts < most:
-        begin, internal = _starts(layout, theta, readings, home, rng)
+        begin, internal = _random_starts(layout, theta, readings, home, rng)
         at = np.broadcast_to(readings, (STARTS_A_BATCH, readings.shape[-1]))
         result = close(layout, theta, at, begin, internal)
         good = _coordinates(result)[result.error < CONVERGED_CLOSURE_ERROR]
-        modes, count = _counted(modes, count, good)
+        modes, count = _count_by_mode(modes, count, good)
         starts, closed = starts + STARTS_A_BATCH, closed + len(good)
         complete = bool(count.size) and bool(count.min() >= RAREST_MODE_FINDS)
         if not closed and starts >= most // 10:
             break
-    poses, internal = _of_coordinates(modes)
+    poses, internal = _poses_of_coordinates(modes)
     near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
     poses, internal, count = poses[near], internal[near], count[near]
     own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
@@ -99,12 +102,12 @@ def assembly_modes(
     return AssemblyModes(poses, internal, count, sign, starts, closed, missing, complete)
 
 
-def _starts(
+def _random_starts(
     layout: LimbLayout, theta: Array, readings: Array, home: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Poses (n, 4, 4) anywhere that the motion allows, and any turns of the hinges (n, k).
+    """Random poses (n, 4, 4) in the motion's freedoms, and random hinge angles (n, k).
 
-    Turns are evenly spread; the platform's joints come to lie about the base's, at distances of
+    Rotations are uniform. Positions put the platform's joints around the base's, at distances of
     about the rods' lengths.
     """
     free = layout.free
@@ -121,31 +124,33 @@ def _starts(
 
 
 def _coordinates(result: Closed) -> Array:
-    """Numbers (n, 12 + 2 k) that are the same where the platform stands the same: the pose's, and
-    the hinges' turns as cosines and sines.
+    """Coordinates (n, 12 + 2 k) that are unique to a configuration of the platform: rows of the
+    pose, cosines and sines of the hinge angles.
     """
     phi = result.internal
     return np.concatenate([result.poses[:, :3].reshape(-1, 12), np.cos(phi), np.sin(phi)], axis=-1)
 
 
-def _of_coordinates(modes: Array) -> tuple[Array, Array]:
-    """Poses (k, 4, 4) and hinges' turns (k, n)."""
+def _poses_of_coordinates(modes: Array) -> tuple[Array, Array]:
+    """Poses (k, 4, 4) and hinge angles (k, n) of :func:`_coordinates`."""
     matrix = modes[:, :12].reshape(-1, 3, 4)
     cos, sin = np.split(modes[:, 12:], 2, axis=1)
     return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
 
 
-def _counted(modes: Array, value: Integers, more: Array) -> tuple[Array, Integers]:
-    """Modes (k, c) and their counts (k,) with more coordinates (n, c) that close the machine."""
-    remainder = more
-    retained, counts = list(modes), list(value)
+def _count_by_mode(modes: Array, count: Integers, closed: Array) -> tuple[Array, Integers]:
+    """Modes (k, c) and their counts (k,), updated with the coordinates (n, c) of further closed
+    starts.
+    """
+    unassigned = closed
+    distinct, counts = list(modes), list(count)
     k = 0
-    while len(remainder):  # a loop over modes, not over starts
-        if k == len(retained):
-            retained.append(remainder[0])
+    while len(unassigned):  # one round for each mode, not for each start
+        if k == len(distinct):
+            distinct.append(unassigned[0])
             counts.append(0)
-        same: Booleans = np.abs(remainder - retained[k]).max(axis=-1) < SAME_MODE_DISTANCE
+        same: Booleans = np.abs(unassigned - distinct[k]).max(axis=-1) < SAME_MODE_DISTANCE
         counts[k] += int(np.count_nonzero(same))
-        remainder = remainder[~same]
+        unassigned = unassigned[~same]
         k += 1
-    return np.array(retained).reshape(len(retained), modes.shape[1]), np.array(counts, dtype=int)
+    return np.array(distinct).reshape(len(distinct), modes.shape[1]), np.array(counts, dtype=int)

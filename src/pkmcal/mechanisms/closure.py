@@ -1,12 +1,21 @@
-"""The closure of every machine, |B_j - A_j| = length_j and what its joints' axes add.
+"""Closure equations of all machines: |B_j - A_j| = length_j, and equations from joints' axes.
 
-:func:`closure` gives the rows, how they change with the pose, and, where somebody asks, with the
-readings and the parameters. What moves with the readings only, :func:`base_ends`, is apart, so that
-a search for the pose finds it once. Where each limb finds its carriers, its parameters and its
-reading says its :class:`~pkmcal.mechanisms.layout.LimbLayout`.
+There are E rows, the lengths of the legs that close, then the axes' equations, with derivatives::
 
-All functions take the parameter vector as an array (..., P), so that a whole Monte-Carlo batch of
-machines is one call: leading axes of parameters, readings and poses broadcast.
+    row                pose           hinges    own reading       parameters
+    |B - A| - length   (arm x u, u)   u . dB    -u . dA - scale   of A, B, rod, scale
+    (B - A) . w        (arm x w, w)   w . dB    -w . dA           of A, B, two axes
+
+(w of an axis on the platform rotates with the pose, which adds a term in omega.)
+
+A row depends on one leg only, so derivatives by readings and parameters are stored by row, with the
+indices of the parameters (``index``), not as dense matrices. :func:`base_ends` evaluates the part
+that depends on the readings alone, so that a search for the pose needs it once.
+:class:`~pkmcal.mechanisms.layout.LimbLayout` holds the indices of each limb's carriers, parameters
+and reading.
+
+All functions accept parameters of shape (..., P), so a batch of machines in a Monte-Carlo study is
+one call: leading axes of parameters, readings and poses broadcast.
 """
 
 from __future__ import annotations
@@ -26,9 +35,9 @@ from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 
 class BaseEnds(NamedTuple):
-    """What the readings decide; leading axes broadcast.
+    """Base side of the limbs at given readings; leading axes broadcast.
 
-    a, by_reading : (..., L, 3), the limbs' ends, m, and their derivatives by the legs' readings.
+    a, by_reading : (..., L, 3) ends A, m, base frame, and their derivatives by each leg's reading.
     length : (..., L) of the rods, m; NaN for passive ones.
     """
 
@@ -38,9 +47,10 @@ class BaseEnds(NamedTuple):
 
 
 class PlatformEnds(NamedTuple):
-    """What the pose decides: b, arm (..., L, 3), m, base frame; B moves by ``omega x arm + tau``.
+    """Platform side of the limbs at a given pose, m, base frame.
 
-    by_internal : (..., L, 3, n) by the pose's internal coordinates.
+    b, arm : (..., L, 3) ends B, and the lever arms: B moves by ``omega x arm + tau``.
+    by_internal : (..., L, 3, n) derivatives of b by the pose's internal coordinates.
     """
 
     b: Array
@@ -49,11 +59,14 @@ class PlatformEnds(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
+    """Residuals of the closure (..., E), m: lengths of the legs that close, then the axes'
+    equations.
 
-    value : m. by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
-    u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
-    w : (..., A, 3) what the limbs' lines are square to, by the axes' equations.
+    by_pose : (..., E, 6).
+    by_internal : (..., E, n), n = 0 for a rigid platform.
+    u : (..., L, 3) unit directions from A to B of all legs.
+    distance : (..., L) |B - A|, m.
+    w : (..., A, 3) directions to which the axes' equations make the limbs' lines orthogonal.
     """
 
     value: Array
@@ -65,11 +78,11 @@ class Rows(NamedTuple):
 
 
 def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
-    """The base side at readings (..., m), m or rad."""
+    """Base side of the limbs at readings (..., m), m or rad."""
     q = joint_values(layout, theta, readings)
     placed = [g.carrier.place(g.of(theta), q[..., g.legs]) for g in layout.base]
-    a, by_value = (_gathered(layout.base, side) for side in zip(*placed, strict=True))
-    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _lengths(layout, theta, q))
+    a, by_value = (_leg_points(layout.base, side) for side in zip(*placed, strict=True))
+    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _rod_lengths(layout, theta, q))
 
 
 def platform_ends(
@@ -79,9 +92,10 @@ def platform_ends(
     internal: Array | None = None,
     parameters: tuple[Array, ...] | None = None,
 ) -> PlatformEnds:
-    """The platform side at poses T_base_platform (..., 4, 4) and internal coordinates (..., n).
+    """Platform side of the limbs at poses T_base_platform (..., 4, 4) and internal coordinates
+    (..., n).
 
-    parameters : each group's out of theta, for whoever asks often.
+    parameters : :func:`platform_parameters` of theta, if already evaluated.
     """
     at_legs = poses[..., None, :, :]
     parameters = platform_parameters(layout, theta) if parameters is None else parameters
@@ -89,7 +103,7 @@ def platform_ends(
         g.carrier.place(own, at_legs, own_internal(layout, g, internal))
         for g, own in zip(layout.platform, parameters, strict=True)
     ]
-    b, arm = (_gathered(layout.platform, side) for side in zip(*placed, strict=True))
+    b, arm = (_leg_points(layout.platform, side) for side in zip(*placed, strict=True))
     if not layout.n_internal:
         return PlatformEnds(b, arm, b[..., None][..., :0])
     by_internal = fresh(b, (*b.shape, layout.n_internal))
@@ -102,12 +116,12 @@ def platform_ends(
 
 
 def platform_parameters(layout: LimbLayout, theta: Array) -> tuple[Array, ...]:
-    """Each platform group's parameters (..., g, n)."""
+    """Parameters (..., g, n) of each group of platform carriers."""
     return tuple(g.of(theta) for g in layout.platform)
 
 
 def own_internal(layout: LimbLayout, group: CarrierGroup, internal: Array | None) -> Array | None:
-    """The internal coordinates (..., g) of a group's legs."""
+    """Internal coordinates (..., g) of a group's legs; None without any."""
     if internal is None or not group.carrier.turns:
         return None
     return internal[..., layout.internal[group.legs]]
@@ -116,7 +130,9 @@ def own_internal(layout: LimbLayout, group: CarrierGroup, internal: Array | None
 def rows_between(
     layout: LimbLayout, theta: Array, base: BaseEnds, platform: PlatformEnds, poses: Array
 ) -> Rows:
-    """|B - A| - length, and the axes' equations; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4."""
+    """Closure rows |B - A| - length and the axes' equations; [B] eq. 4, [A] eq. 7 and 13, [C] eq.
+    4.
+    """
     line, distance = limb_lines(base, platform)
     u = line / distance[..., None]
     rows = Rows(
@@ -137,7 +153,7 @@ def rows_between(
 
 
 def limb_lines(base: BaseEnds, platform: PlatformEnds) -> tuple[Array, Array]:
-    """B - A (..., L, 3) and how long it is (..., L), m."""
+    """Vectors B - A (..., L, 3) and their lengths (..., L), m."""
     line = platform.b - base.a
     return line, np.sqrt(dot(line, line))
 
@@ -145,7 +161,7 @@ def limb_lines(base: BaseEnds, platform: PlatformEnds) -> tuple[Array, Array]:
 def _with_angles(
     layout: LimbLayout, theta: Array, poses: Array, line: Array, platform: PlatformEnds, rows: Rows
 ) -> Rows:
-    """The same with the axes' equations below."""
+    """Closure rows extended by the axes' equations."""
     leg = layout.angles.leg
     angles = angle_rows(layout.angles, theta, poses[..., :3, :3], line[..., leg, :])
     by_pose = _by_pose(platform.arm[..., leg, :], angles.by_line)
@@ -160,7 +176,9 @@ def _with_angles(
 
 
 def _by_pose(arm: Array, w: Array) -> Array:
-    """Rows (..., 6) of a point's motion along directions w (..., 3): (arm x w, w)."""
+    """Derivatives (..., 6) by the pose of points' coordinates along directions w (..., 3):
+    (arm x w, w).
+    """
     out = fresh(w, (*np.broadcast_shapes(arm.shape, w.shape)[:-1], 6))
     moments(arm, w, out[..., :3])
     out[..., 3:] = w
@@ -168,7 +186,11 @@ def _by_pose(arm: Array, w: Array) -> Array:
 
 
 def _by_internal(w: Array, by_internal: Array) -> Array:
-    """Derivatives (..., 3, n) of the points, along directions w (..., 3): (..., n)."""
+    """Derivatives (..., n) by internal coordinates of points' coordinates along directions w
+    (..., 3).
+
+    by_internal : (..., 3, n) derivatives of the points.
+    """
     if not by_internal.shape[-1]:
         return by_internal[..., 0, :]
     out = w[..., 0, None] * by_internal[..., 0, :]
@@ -178,46 +200,47 @@ def _by_internal(w: Array, by_internal: Array) -> Array:
 
 
 def joint_values(layout: LimbLayout, theta: Array, readings: Array) -> Array:
-    """What the legs' motors have moved, (..., L) m or rad, at readings (..., m): scale * reading,
-    zero for legs without one.
+    """Motion of each leg's motor (..., L), m or rad, at readings (..., m): scale * reading, zero
+    for legs without a reading.
     """
     return scales(layout, theta) * _leg_readings(layout, readings)
 
 
 def scales(layout: LimbLayout, theta: Array) -> Array:
-    """The scale of each leg's reading, (..., L), or (L,) where all are exact."""
+    """Scale of each leg's reading, (..., L), or (L,) if all are exact."""
     if not layout.some_scales_unsure:
         return layout.exact_scale
-    reference_values = theta[..., layout.scale_or_first]
-    return np.where(layout.unsure_scales, reference_values, layout.exact_scale)
+    estimated = theta[..., layout.scale_or_first]
+    return np.where(layout.unsure_scales, estimated, layout.exact_scale)
 
 
 def rod_rates(layout: LimbLayout, theta: Array) -> Array:
-    """How much longer each rod becomes by its leg's reading, (..., L): the scale, or zero."""
+    """Derivative of each rod's length by its leg's reading (..., L): the scale, or zero."""
     return np.where(layout.rod_reads, scales(layout, theta), 0.0)
 
 
 def _leg_readings(layout: LimbLayout, readings: Array) -> Array:
-    """Readings (..., m) spread over the legs (..., L), zero for legs without one."""
+    """Readings (..., m) by leg (..., L), zero for legs without a reading."""
     own = readings[..., layout.reading_or_first]
     return own if layout.all_read else np.where(layout.actuated >= 0, own, 0.0)
 
 
 def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
-    """Length of every rod (..., L), m: scale * reading + offset, or the constant; [B] eq. 4.
+    """Length of each rod (..., L), m: scale * reading + offset, or the constant; [B] eq. 4.
 
-    NaN for passive rods, whose length nobody knows.
+    NaN for passive rods, whose length is unknown.
     """
-    return _lengths(layout, theta, joint_values(layout, theta, readings))
+    return _rod_lengths(layout, theta, joint_values(layout, theta, readings))
 
 
-def _lengths(layout: LimbLayout, theta: Array, joint_value: Array) -> Array:
+def _rod_lengths(layout: LimbLayout, theta: Array, joint_value: Array) -> Array:
+    """Length of each rod (..., L), m, from the motions (..., L) of the legs' motors."""
     own = np.where(layout.closing, theta[..., layout.rod], np.nan)
     return own + np.where(layout.rod_reads, joint_value, 0.0)
 
 
-def _gathered(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
-    """Groups' points (..., g, 3) in the order of the legs, (..., L, 3)."""
+def _leg_points(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
+    """Points of groups (..., g, 3) in the order of the legs, (..., L, 3)."""
     if len(groups) == 1:
         return points[0]
     count = sum(len(g.legs) for g in groups)
@@ -229,7 +252,7 @@ def _gathered(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Ar
 
 
 def stacked(first: Array, second: Array) -> Array:
-    """Rows (..., E, n) of both, one below the other; leading axes broadcast."""
+    """Rows (..., E, n) of two arrays, one below the other; leading axes broadcast."""
     shape = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
     split = first.shape[-2]
     out = fresh(first, (*shape, split + second.shape[-2], first.shape[-1]))
@@ -238,10 +261,10 @@ def stacked(first: Array, second: Array) -> Array:
 
 
 def skeletons(layout: LimbLayout, theta: Array, joint_value: Array) -> tuple[Array, ...]:
-    """What carries each leg's end on the base, for pictures: L arrays (..., k, 3), m, base frame.
+    """Points along each leg's arm on the base, for drawings: L arrays (..., k, 3), m, base frame.
 
-    From where a motor holds an arm to the end A, which is the last point; A alone where there is
-    no arm. joint_value : (..., L), see :func:`joint_values`.
+    Each begins where a motor holds the arm and ends at A; only A without an arm.
+    joint_value : (..., L), see :func:`joint_values`.
     """
     out: dict[int, Array] = {}
     for g in layout.base:
@@ -252,11 +275,15 @@ def skeletons(layout: LimbLayout, theta: Array, joint_value: Array) -> tuple[Arr
 
 @dataclass(frozen=True)
 class LimbEnds:
-    """Both ends of all limbs; leading axes broadcast, then L legs.
+    """Ends of all limbs with their derivatives; leading axes broadcast, then L legs.
 
-    Made from the machine (layout, theta), readings, poses and internal coordinates: what the
-    readings decide (base), and what the pose decides (platform). Derivatives are found when they
-    are asked for: a search that only tries a step, and a picture, do not.
+    theta : (..., P).
+    readings : (..., m).
+    poses : T_base_platform (..., 4, 4).
+    internal : (..., n), None for zero.
+    base, platform : the parts that depend on the readings, and on the pose.
+
+    Derivatives are evaluated on first use; a trial step of a search, or a drawing, needs none.
     """
 
     layout: LimbLayout
@@ -269,35 +296,36 @@ class LimbEnds:
 
     @cached_property
     def a(self) -> Array:
-        """(..., L, 3) m, base frame."""
+        """Ends A (..., L, 3), m, base frame."""
         return self._at_readings(self.base.a)
 
     @property
     def b(self) -> Array:
-        """(..., L, 3) m, base frame."""
+        """Ends B (..., L, 3), m, base frame."""
         return self.platform.b
 
     @cached_property
     def a_by_reading(self) -> Array:
-        """(..., L, 3) derivatives of a by the legs' readings."""
+        """Derivatives (..., L, 3) of a by the legs' readings."""
         return self._at_readings(self.base.by_reading)
 
     def _at_readings(self, values: Array) -> Array:
+        """Values of the base side (..., L, 3), broadcast to the batch's shape."""
         shape = np.broadcast_shapes(self.theta.shape[:-1], self.readings.shape[:-1])
         return np.broadcast_to(values, (*shape, self.layout.n_legs, 3))
 
     @cached_property
     def b_by_pose(self) -> Array:
-        """(..., L, 3, 6) derivatives of b by the pose's six numbers."""
+        """Derivatives (..., L, 3, 6) of b by the pose's six numbers."""
         return by_pose(self.platform.arm)
 
     @cached_property
     def a_by(self) -> Array:
-        """(..., L, 3, n) derivatives of a by the parameters at the layout's ``a_index``."""
+        """Derivatives (..., L, 3, n) of a by the parameters at the layout's ``a_index``."""
         layout, theta = self.layout, self.theta
         q = joint_values(layout, theta, self.readings)
         by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
-        padded = _padded_to(layout.n_legs, layout.base, by)
+        padded = _leg_derivatives(layout.n_legs, layout.base, by)
         if not layout.scales_move_a:
             return padded
         raw = _leg_readings(layout, self.readings) / scales(layout, theta)
@@ -305,7 +333,7 @@ class LimbEnds:
 
     @cached_property
     def b_by(self) -> Array:
-        """(..., L, 3, n) derivatives of b by the parameters at the layout's ``b_index``."""
+        """Derivatives (..., L, 3, n) of b by the parameters at the layout's ``b_index``."""
         layout, at_legs = self.layout, self.poses[..., None, :, :]
         by = [
             g.carrier.by_parameters(
@@ -313,34 +341,34 @@ class LimbEnds:
             )
             for g in layout.platform
         ]
-        return _padded_to(layout.n_legs, layout.platform, by)
+        return _leg_derivatives(layout.n_legs, layout.platform, by)
 
 
 @dataclass(frozen=True)
 class Closure(LimbEnds):
-    """The closure's rows, with the limbs' ends that they are between."""
+    """Closure rows with the limbs' ends."""
 
     rows: Rows
 
     @cached_property
     def by_reading(self) -> Array:
-        """(..., E) by the leg's own reading, zero where it has none."""
-        layout, shifted = self.layout, self.base.by_reading
-        by = -dot(self.rows.u, shifted) - rod_rates(layout, self.theta)
+        """Derivatives (..., E) by the reading of each row's leg, zero without one."""
+        layout, by_own_reading = self.layout, self.base.by_reading
+        by = -dot(self.rows.u, by_own_reading) - rod_rates(layout, self.theta)
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
-        angles = -dot(self.rows.w, shifted[..., layout.angles.leg, :])
+        angles = -dot(self.rows.w, by_own_reading[..., layout.angles.leg, :])
         return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property
     def index(self) -> Integers:
-        """(E, n) parameters that each row depends on, P where there is none."""
+        """Indices (E, n) of the parameters on which each row depends, P as padding."""
         return self.layout.closure_index
 
     @cached_property
     def by_theta(self) -> Array:
-        """(..., E, n) derivatives by them."""
+        """Derivatives (..., E, n) by the parameters at ``index``."""
         lengths = self._by_length()
         if not len(self.layout.angles):
             return lengths
@@ -354,7 +382,7 @@ class Closure(LimbEnds):
         )
 
     def _by_length(self) -> Array:
-        """Of |B - A| - length of the legs that close."""
+        """Derivatives of |B - A| - length, for the legs that close."""
         layout, u = self.layout, self.rows.u
         parts = (-along(u, self.a_by), along(u, self.b_by), np.full((1, 1), -1.0))
         if layout.scales_move_rods:
@@ -364,7 +392,7 @@ class Closure(LimbEnds):
         return by_theta if layout.all_close else by_theta[..., layout.closing, :]
 
     def _by_angles(self) -> Array:
-        """Of the axes' equations."""
+        """Derivatives of the axes' equations."""
         layout, leg = self.layout, self.layout.angles.leg
         line = (self.b - self.a)[..., leg, :]
         rows = angle_rows(layout.angles, self.theta, self.poses[..., :3, :3], line)
@@ -380,18 +408,24 @@ class Closure(LimbEnds):
 def limb_ends(
     layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
 ) -> LimbEnds:
-    """Both ends of every limb.
+    """Ends of all limbs.
 
-    theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
-    internal : (..., n) the poses' internal coordinates; zero where they are not given.
+    theta : (..., P).
+    readings : (..., m).
+    poses : T_base_platform (..., 4, 4).
+    internal : (..., n) internal coordinates of the poses, zero by default.
     """
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     return LimbEnds(layout, theta, readings, poses, internal, base, platform)
 
 
-def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]) -> Array:
-    """Carriers' derivatives in the order of the legs, for as many parameters as the most have."""
+def _leg_derivatives(
+    n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
+) -> Array:
+    """Carriers' derivatives in the order of the legs (..., L, 3, n), padded with zeros to the
+    largest number of parameters.
+    """
     if len(groups) == 1:
         return by_parameters[0]
     lead = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
@@ -404,10 +438,12 @@ def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: lis
 def closure(
     layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
 ) -> Closure:
-    """The closure's residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4.
+    """Closure residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4.
 
-    theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
-    internal : (..., n) the poses' internal coordinates; zero where they are not given.
+    theta : (..., P).
+    readings : (..., m).
+    poses : T_base_platform (..., 4, 4).
+    internal : (..., n) internal coordinates of the poses, zero by default.
     """
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
@@ -416,12 +452,12 @@ def closure(
 
 
 def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
-    """Derivatives (..., E) by the legs' own readings as those by all, (..., E, m)."""
+    """Derivatives (..., E, m) by all readings from derivatives (..., E) by each row's reading."""
     return np.where(layout.of_motor, by_reading[..., None], 0.0)
 
 
 def by_own(layout: LimbLayout, rows: Rows) -> Array:
-    """Derivatives (..., E, d + n) by the pose's own freedoms, internal coordinates last."""
+    """Derivatives (..., E, d + n) of the rows by the pose's freedoms and internal coordinates."""
     by_pose = rows.by_pose[..., layout.freedoms]
     if not layout.n_internal:
         return by_pose
@@ -429,7 +465,7 @@ def by_own(layout: LimbLayout, rows: Rows) -> Array:
 
 
 def _side_by_side(parts: tuple[Array, ...]) -> Array:
-    """Derivatives (..., E, n) joined along their last axis; leading axes broadcast."""
+    """Derivatives (..., E, n) concatenated along their last axis; leading axes broadcast."""
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     out = np.empty((*shape, sum(part.shape[-1] for part in parts)))
     first = 0
@@ -440,13 +476,18 @@ def _side_by_side(parts: tuple[Array, ...]) -> Array:
 
 
 def along(u: Array, by: Array) -> Array:
-    """Derivatives (..., 3, n) of a point, along a direction (..., 3): (..., n)."""
+    """Derivatives (..., n) of a point's coordinate along a direction (..., 3), from the point's
+    (..., 3, n).
+    """
     return (u[..., None, :] @ by)[..., 0, :]
 
 
 def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
-    """Directions among theta (..., P) made as long as they must be to end on the tangent plane of
-    the drawing's (P,); see :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
+    """Parameters (..., P) with direction vectors rescaled to end on the tangent plane at the
+    nominal directions.
+
+    drawing : (P,) nominal values; see
+        :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
     """
     axes = np.concatenate(layout.turning)
     if not axes.size:
@@ -457,7 +498,7 @@ def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
 
 
 def dense(c: Closure, n_parameters: int) -> Array:
-    """Derivatives of the rows by all parameters, (..., E, P)."""
+    """Dense derivatives (..., E, P) of the closure rows by all parameters."""
     out = np.zeros((*c.by_theta.shape[:-1], n_parameters + 1))
     place = np.broadcast_to(c.index, c.by_theta.shape)
     np.put_along_axis(out, place, c.by_theta, axis=-1)

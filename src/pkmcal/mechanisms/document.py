@@ -1,7 +1,7 @@
-"""The schema of ``mechanism.yaml``; docs/files.md spells it out for people.
+"""Schema of ``mechanism.yaml``, documented for users in docs/files.md.
 
-A limb in it: what carries its two ends (a carrier's own schema), the rod between them, and what a
-camera sees of it.
+A limb consists of the carriers of its two ends (each with a schema of its own), the rod between
+them, and its visible tubes.
 """
 
 from __future__ import annotations
@@ -29,39 +29,41 @@ from pkmcal.mechanisms.carriers.contract import (
 from pkmcal.mechanisms.parameters import EVERY_LEG
 
 
-def _increasing(value: tuple[float, float]) -> tuple[float, float]:
+def _check_increasing(value: tuple[float, float]) -> tuple[float, float]:
+    """Validate a range of lengths."""
     if not 0 < value[0] < value[1]:
         raise ValueError("should be two increasing positive lengths [min, max]")
     return value
 
 
 class ActuatedLength(Schema):
-    """``length: {actuated: true, offset: 0.0, range: [min, max]}``; length = reading's true value +
-    offset.
+    """Rod with a reading, ``length: {actuated: true, offset: 0.0, range: [min, max]}``; length =
+    scale * reading + offset.
     """
 
     actuated: Literal[True]
     offset: Metres = 0.0
-    range: Annotated[tuple[Metres, Metres], AfterValidator(_increasing)] | None = None
+    range: Annotated[tuple[Metres, Metres], AfterValidator(_check_increasing)] | None = None
 
 
 class ConstantLength(Schema):
-    """``length: {actuated: false, constant: 0.48}``: a rod of one length, metres."""
+    """Rod of constant length, ``length: {actuated: false, constant: 0.48}``, m."""
 
     actuated: Literal[False]
     constant: Annotated[Metres, Field(gt=0, description="the rod's length in metres")]
 
 
 class PassiveLength(Schema):
-    """``length: {passive: true}``: free to change, nobody reads it; it adds no equation."""
+    """Rod of free, unmeasured length, ``length: {passive: true}``; it adds no equation."""
 
     passive: Literal[True]
 
 
 def rod_kind(value: Any) -> str:
-    """Which of the three a ``length`` in the file is, told apart so that errors name its fields.
+    """Tag of the schema that applies to a ``length``, so that errors name fields of the right
+    schema.
 
-    Tags are no keys of a file, or an error's place would be taken for the key.
+    Tags must not be keys of the file, else an error's location would be mistaken for the key.
     """
     if isinstance(value, Schema):
         value = value.model_dump()
@@ -82,9 +84,10 @@ Rod = Annotated[
 OFFSET_KIND = ParameterKind("offset", "m", "offset", part="zero")
 CONSTANT_LENGTH_KIND = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
 READING_SCALE_KIND = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
+"""Parameters of a leg's rod and reading."""
 EXACT_TURNS, LEAD_TOLERANCE = 0.0, 0.0005
-"""Tolerances of a reading's scale where the file gives none: of readings in rad, since an encoder
-counts whole turns and a gear has whole teeth; of readings in m, a ground screw's or a tape's."""
+"""Default prior sigmas of a reading's scale: of readings in rad, zero because encoders count whole
+turns and gears have whole teeth; of readings in m, that of a ground screw or a tape."""
 
 
 PlatformMotion = Literal["spatial", "planar", "translation", "schoenflies", "planar-translation"]
@@ -95,23 +98,25 @@ MOTION_DIRECTIONS: dict[str, Array] = {
     "schoenflies": np.eye(6)[:, 2:],
     "planar-translation": np.eye(6)[:, [3, 4]],
 }
-"""Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
+"""Columns: directions (omega, tau) in which the platform can move, base frame; they are adjacent
+among the six."""
 
 
 class _OneOfTheCarriers:
-    """A part that is in the schema of one of the carriers known when a file is read, told apart by
-    ``joint``, so that errors name the right field.
+    """Annotation of a field that has the schema of one of the carriers, selected by ``joint``.
+
+    The union is built when a file is read. The discriminator makes errors name the right field.
     """
 
     def __init__(self, carriers: Callable[[], Mapping[str, type[Carrier]]]) -> None:
         self.carriers = carriers
 
     def adapter(self) -> TypeAdapter[Any]:
-        """What reads the union of the carriers' schemas."""
-        return _union(tuple(dict.fromkeys(c.schema for c in self.carriers().values())))
+        """Adapter for the union of the carriers' schemas."""
+        return _union_adapter(tuple(dict.fromkeys(c.schema for c in self.carriers().values())))
 
     def read(self, value: Any) -> Any:
-        """The part, from a file's content or from another machine's document."""
+        """Validated field, from a file's content or from another machine's document."""
         if isinstance(value, Schema):
             return value
         return self.adapter().validate_json(
@@ -128,7 +133,8 @@ class _OneOfTheCarriers:
 
 
 @cache
-def _union(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
+def _union_adapter(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
+    """Adapter for a union of schemas, discriminated by ``joint``."""
     one: Any = reduce(or_, schemas)
     if len(schemas) > 1:
         one = Annotated[one, Field(discriminator="joint")]
@@ -140,20 +146,20 @@ PlatformNode = Annotated[Any, _OneOfTheCarriers(platform_carriers)]
 
 
 class Tube(Schema):
-    """One visible cylinder of a leg; ``from`` and ``to`` in metres from A along the leg."""
+    """Visible cylinder of a leg; ``from`` and ``to`` in metres from A along the leg."""
 
     radius: Annotated[Metres, Field(gt=0)]
     start: Annotated[Metres, Field(alias="from", ge=0)]
     stop: Annotated[Metres, Field(alias="to")]
 
     def model_post_init(self, _context: Any) -> None:
-        """A tube has a length."""
+        """Refuse tubes without positive length."""
         if self.stop <= self.start:
             raise ValueError("tube's 'to' should be greater than its 'from'")
 
 
 class Leg(Schema):
-    """One limb: its carriers, its rod, its reading's scale, and what a camera sees of it."""
+    """Limb: carriers, rod, scale of its reading, and visible tubes."""
 
     base: BaseNode
     platform: PlatformNode
@@ -166,12 +172,13 @@ class Leg(Schema):
 
 
 TOLERANCE_RANGE = Field(ge=1e-12)
-"""m; nothing is made better, and it would be exact. The most depends on the machine's size."""
+"""Range of prior sigmas of lengths, m. Smaller values would be exact; the upper bound depends on
+the machine's size."""
 
 
 class DrawingTolerance(Schema):
-    """Standard deviations of the drawing's values, metres; of axes and angles, radians; of scales,
-    parts of one, where 0 is exact.
+    """Prior sigmas of the nominal values: lengths in metres, axes and angles in radians, scales
+    relative, where 0 is exact.
     """
 
     center: Annotated[Metres, TOLERANCE_RANGE] = 0.002
@@ -184,13 +191,14 @@ class DrawingTolerance(Schema):
 
 
 class Home(Schema):
-    """A pose in the middle of the workspace; it decides which assembly the machine has."""
+    """Pose in the middle of the workspace, which selects the machine's assembly mode."""
 
     position: Point
     rotation_vector: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
 
 
-def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+def _check_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+    """Validate the number of legs and that one is actuated."""
     if len(legs) < 2:
         raise ValueError("a parallel machine has at least two legs")
     carriers = base_carriers()
@@ -199,37 +207,37 @@ def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     return legs
 
 
-def _several(group: tuple[str, ...]) -> tuple[str, ...]:
-    """A tie has two members at least; one that stands for all legs counts as several."""
+def _check_members(group: tuple[str, ...]) -> tuple[str, ...]:
+    """Validate that a tie has at least two members; an entry for all legs counts as several."""
     if len(group) < 2 and not any(EVERY_LEG in entry for entry in group):
         counts = {"field_type": "Tuple", "min_length": 2, "actual_length": len(group)}
         raise PydanticKnownError("too_short", counts)
     return group
 
 
-Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_several)], ...]
+Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_check_members)], ...]
 
 
 class DocumentModel(Schema):
-    """What a machine's model holds and ties, or the other file that describes it."""
+    """Model of a machine: fixed and tied parameters, or another file that describes it."""
 
     fixed: tuple[str, ...] = ()
     tied: Ties = ()
     mechanism: str | None = None
 
     def model_post_init(self, _context: Any) -> None:
-        """Another file has roles of its own."""
+        """Refuse roles beside another file, which has its own."""
         if self.mechanism is not None and (self.fixed or self.tied):
             raise ValueError("a model with 'mechanism' takes 'fixed' and 'tied' from that file")
 
 
 class MechanismDocument(Schema):
-    """A whole mechanism file."""
+    """Mechanism file."""
 
     name: Annotated[str, Field(max_length=LONGEST_NAME)]
     motion: PlatformMotion
     legs: Annotated[
-        tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_some_legs)
+        tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_check_legs)
     ]
     tolerance: DrawingTolerance = DrawingTolerance()
     home: Home | None = None

@@ -1,6 +1,6 @@
-"""What a mechanism file's schema cannot say: whether its legs can be those of its motion.
+"""Checks of a mechanism file beyond its schema: whether the legs allow the stated motion.
 
-What only one kind of part can have wrong stands in its carrier's ``check``.
+Checks that concern one kind of joint are in its carrier's ``check``.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
 
 SAME_NUMBER_ROUNDING = 1e-9
-"""Metres, or parts of a direction, by which equal numbers of a file differ when written."""
+"""Difference (m, or of components of directions) between equal numbers of a file due to the
+rounding of text."""
 
 PlaceInDocument: TypeAlias = Callable[..., str]
 
 
 def check_drawing(document: MechanismDocument, where: PlaceInDocument | None = None) -> None:
-    """Raise InputError for a drawing whose joints and rods cannot make its motion.
+    """Raise InputError for a nominal model whose joints and rods do not allow its motion.
 
-    where : names a field's place in the file by its keys.
+    where : function that returns a field's location in the file from its keys.
     """
     place = where or (lambda *keys: field_path(keys))
     for j, leg in enumerate(document.legs):
@@ -68,14 +69,14 @@ def check_drawing(document: MechanismDocument, where: PlaceInDocument | None = N
 
 
 def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDocument) -> None:
-    """A planar machine's legs lie in planes z = const."""
+    """Check that a leg of a planar machine is in a plane z = const."""
     if document.home and np.hypot(*document.home.rotation_vector[:2]) > IN_PLANE:
         raise InputError(
             "the home pose of a planar machine is turned out of its plane",
             where=place("home", "rotation_vector"),
             expected="[0, 0, angle]",
         )
-    # height of the platform frame above the base frame; by most legs where no home is given
+    # Height of the platform frame above the base frame: of the home pose, or the legs' median.
     rise = median(leg.base.center[2] - leg.platform.center[2] for leg in document.legs)
     if document.home is not None:
         rise = document.home.position[2]
@@ -91,7 +92,9 @@ def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: PlaceInDo
 
 
 def _check_parallel(j: int, leg: Leg, place: PlaceInDocument) -> None:
-    """A platform that only translates keeps axes parallel; unequal ones would turn it."""
+    """Check that a leg's two universal joints have parallel axes, without which the platform would
+    rotate.
+    """
     roles = (
         base_carriers()[leg.base.joint].axis_role(leg.base),
         platform_carriers()[leg.platform.joint].axis_role(leg.platform),
@@ -109,6 +112,7 @@ def _check_parallel(j: int, leg: Leg, place: PlaceInDocument) -> None:
 
 
 def _check_motors(document: MechanismDocument, place: PlaceInDocument) -> None:
+    """Check that motors are numbered without gaps."""
     used = {int(c) + 1 for c in motor_columns(document) if c >= 0}
     missing = sorted(set(range(1, max(used, default=0) + 1)) - used)
     if missing:
@@ -121,7 +125,7 @@ def _check_motors(document: MechanismDocument, place: PlaceInDocument) -> None:
 
 
 def _check_scales(document: MechanismDocument, place: PlaceInDocument) -> None:
-    """A scale belongs to a reading, and a reading has one, however many legs it moves."""
+    """Check that only legs with a reading have a scale, and legs on one motor the same."""
     columns = motor_columns(document)
     for j, leg in enumerate(document.legs):
         first = document.legs[int(np.argmax(columns == columns[j]))]
@@ -148,7 +152,7 @@ def _check_equal(
     field: str,
     place: PlaceInDocument,
 ) -> None:
-    """Legs on one motor, or on one body of the platform, are drawn with the same axis or hinge."""
+    """Check that legs on one motor, or on one body of the platform, share an axis or hinge."""
     nodes = [getattr(document.legs[j], side) for j in legs]
     values = [getattr(node, field) for node in nodes]
     for j, value in zip(legs[1:], values[1:], strict=True):
@@ -166,7 +170,9 @@ def _check_equal(
 
 
 def _check_equations(document: MechanismDocument, place: PlaceInDocument) -> None:
-    """Lengths and axes hold all freedoms of the platform, and of what turns on it."""
+    """Check that there are at least as many closure equations as freedoms of the platform and its
+    hinges.
+    """
     passive = [
         j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
     ]

@@ -1,14 +1,14 @@
-"""The pose of a machine at one set of readings after the other, as a control loop asks for it.
+"""Forward kinematics for control loops: the pose at one set of readings after another.
 
-Forward kinematics with as few calls of NumPy as can be: at a single pose they cost more than their
-arithmetic. Newton's steps on ``|B - A|^2 - length^2 = 0``, from the last pose. The first step takes
-the factors that the last search ended with; a step that leaves too much finds new ones.
+At a single pose, NumPy's calls cost more than their arithmetic, so there are as few calls as
+possible. The method is Newton's on ``|B - A|^2 - length^2 = 0``, from the last pose. The first step
+uses the LU factors of the last search; a step that reduces the error too little triggers a new
+factorisation.
 
-Fast are machines of as many rods as freedoms whose ends stand on elementary joints
-(:class:`~pkmcal.mechanisms.carriers.contract.Chain`) and, on the platform, have no hinge: A is
-``foot + along q + across cos q + ahead sin q``, and B is ``R p + t + f``. All others, and steps
-that do not lead there, go to the search for any machine and any start
-(:func:`~pkmcal.mechanisms.kinematics.forward`).
+The fast path covers machines with as many rods as freedoms whose ends are on elementary joints
+(:class:`~pkmcal.mechanisms.carriers.contract.Chain`), without hinges on the platform: A is ``foot +
+along q + across cos q + ahead sin q``, and B is ``R p + t + f``. All other machines, and steps that
+do not converge, use the general search (:func:`~pkmcal.mechanisms.kinematics.forward`).
 """
 
 from __future__ import annotations
@@ -27,23 +27,25 @@ from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR, forward
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 MOST_FOLLOWER_STEPS = 8
-"""A pose a millimetre away takes three or four."""
+"""Most Newton steps; a pose 1 mm away takes three or four."""
 FOLLOWED_CLOSURE_ERROR = 0.1 * CONVERGED_CLOSURE_ERROR
-"""Closure error (m) at which a search ends, of all rods together."""
+"""Closure error (m) of all rods together at which a search ends."""
 REUSED_FACTORS_SHRINK = 1e-8
-"""Squared error that a step leaves, of that before it, beyond which the next finds new factors."""
+"""Ratio of squared errors after and before a step above which the next step needs new factors."""
 POSES_BETWEEN_SQUARINGS = 512
-"""Poses after which rounding is taken out of the rotation: by then less than 1e-12."""
+"""Number of poses after which the rotation is orthonormalised; rounding is below 1e-12 by then."""
 
 
 @dataclass(frozen=True)
 class Rods:
-    """Rods of n freedoms' machine on elementary joints; vectors as columns, (3, n), m.
+    """Rods of a machine with n freedoms on elementary joints; vectors are columns, (3, n), m.
 
-    along, across, ahead : of A by the joints' values q, see the module. turns : whether any motor
-    turns, moves : whether any moves A. on_body : (4, n) p, and ones. still : f - foot.
-    column, scale : q is ``scale * readings[column]``. length, grows : the rods' are
-    ``length + grows q``.
+    along, across, ahead : coefficients of A in the joints' values q, see the module.
+    turns, moves : whether any motor rotates A, and whether any moves it.
+    on_body : (4, n) points p of the platform in homogeneous coordinates.
+    still : f - foot.
+    column, scale : q is ``scale * readings[column]``.
+    length, grows : rods' lengths are ``length + grows q``.
     """
 
     along: Array
@@ -59,7 +61,7 @@ class Rods:
     grows: Array
 
     def ends(self, readings: Array) -> tuple[Array, Array]:
-        """What B - A is without R p + t, (3, n), and the squares of the lengths, (n,)."""
+        """B - A without R p + t, (3, n), and the squared lengths, (n,)."""
         q = readings[self.column] * self.scale
         length = self.length + self.grows * q
         length *= length
@@ -73,12 +75,12 @@ class Rods:
 
 
 def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
-    """The rods of a machine with values theta (P,); None where it is not of the fast kind."""
+    """Rods of a machine with values theta (P,); None if the fast path does not cover it."""
     legs = np.flatnonzero(layout.closing)
     square = layout.n_equations == layout.motion.shape[1]
     if not square or len(layout.angles) or layout.n_internal:
         return None
-    base, platform = (_chains(groups, theta) for groups in (layout.base, layout.platform))
+    base, platform = (_leg_chains(groups, theta) for groups in (layout.base, layout.platform))
     if base is None or platform is None:
         return None
     n = layout.n_legs
@@ -116,27 +118,27 @@ def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
     )
 
 
-def _chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
-    """Each leg's elementary joint; None where one has none."""
-    results: dict[int, Chain] = {}
+def _leg_chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
+    """Elementary joint of each leg; None if any leg has none."""
+    chains: dict[int, Chain] = {}
     for group in groups:
         chain = group.carrier.chain(group.of(theta))
         if chain is None:
             return None
         for k, leg in enumerate(group.legs.tolist()):
-            results[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
-    return results
+            chains[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+    return chains
 
 
 class Follower:
-    """Gives a machine's pose T_base_platform (4, 4) at readings (m,), called again and again.
+    """Forward kinematics of a moving machine: pose T_base_platform (4, 4) at readings (m,).
 
-    It remembers where the machine is, and finds the pose that is near that: readings are to be
-    those of a machine that moves, a millimetre or a few between two calls, and not across a
-    singular pose. Made by :meth:`pkmcal.mechanisms.Machine.follower`.
+    Each call starts from the last pose, so readings should be those of a machine that moves by a
+    few millimetres between calls and does not cross a singular pose. Made by
+    :meth:`pkmcal.mechanisms.Machine.follower`.
 
-    T_base_platform : the last pose. Raises GeometryError where the readings close at no pose, and
-    stays where it was.
+    T_base_platform : the last pose. A call raises GeometryError if the machine cannot be closed at
+        the readings; the last pose then stays.
     """
 
     def __init__(self, layout: LimbLayout, theta: Array, start: Array) -> None:
@@ -144,17 +146,17 @@ class Follower:
 
         self._layout, self._theta, self._rods = layout, theta, rods_of(layout, theta)
         functions: Any = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
-        self._factored, self._solved = functions
+        self._getrf, self._getrs = functions
         self._ones, self._twist, self._free = np.ones(3), np.zeros(6), layout.freedoms
-        self._put(np.array(start, dtype=float))
+        self._reset(np.array(start, dtype=float))
 
     @property
     def T_base_platform(self) -> Array:
-        """The last pose, (4, 4)."""
+        """Last pose, (4, 4)."""
         return self._pose.copy()
 
     def __call__(self, joints: Array) -> Array:
-        """The pose T_base_platform (4, 4) at readings (m,), m or rad, new memory each time."""
+        """Pose T_base_platform (4, 4) at readings (m,), m or rad; a new array each time."""
         readings = np.asarray(joints, dtype=float)
         if readings.shape != (self._layout.n_readings,):
             raise InputError(
@@ -162,18 +164,18 @@ class Follower:
                 found=str(readings.shape),
                 expected=f"({self._layout.n_readings},): one configuration at a time",
             )
-        if self._rods is None or not self._followed(self._rods, readings):
+        if self._rods is None or not self._newton(self._rods, readings):
             self._search(readings)
         return self._pose.copy()
 
-    def _put(self, T_base_platform: Array) -> None:
-        """Stand at a pose."""
+    def _reset(self, T_base_platform: Array) -> None:
+        """Set the pose, orthonormalised, and drop the factors."""
         self._pose = pose(nearest_rotation(T_base_platform[:3, :3]), T_base_platform[:3, 3])
         self._factors: tuple[Array, Array] | None = None
         self._enough, self._since = 0.0, 0
 
     def _search(self, readings: Array) -> None:
-        """The pose by the search for any machine, and stand there."""
+        """Set the pose found by the general search; raises GeometryError."""
         fk = forward(self._layout, self._theta, readings, self._pose)
         if not np.isfinite(readings).all() or not fk.converged:
             raise GeometryError(
@@ -182,13 +184,16 @@ class Follower:
                 expected="readings that the machine can reach, near those before them",
                 next_step="check the readings, or begin anew with a start near the pose",
             )
-        self._put(fk.T_base_platform)
+        self._reset(fk.T_base_platform)
 
-    def _followed(self, rods: Rods, readings: Array) -> bool:
-        """Newton's steps from the last pose; False, and nothing changed, where they do not close.
+    def _newton(self, rods: Rods, readings: Array) -> bool:
+        """Newton steps from the last pose; returns False, with no state changed, if they do not
+        converge.
 
-        The pose moves by a turn about the base frame's origin and a shift, (omega, tau), by which
-        the row ``|line|^2 - length^2`` of a line B - A changes by 2 (B x line, line).
+        The pose is perturbed from the left by a rotation omega about the base frame's origin and a
+        shift tau, which change the row ``|line|^2 - length^2`` of a line B - A by 2
+        (B x line, line) . (omega, tau). The factors are of half the derivatives, so the solution is
+        twice the step.
         """
         off, square = rods.ends(readings)
         now, factors, twist = self._pose, self._factors, self._twist
@@ -196,48 +201,44 @@ class Follower:
         for _ in range(MOST_FOLLOWER_STEPS):
             b = now[:3].dot(rods.on_body)
             line = b + off
-            remainder = self._ones.dot(line * line)
-            remainder -= square
-            error = float(remainder.dot(remainder))
+            residual = self._ones.dot(line * line)
+            residual -= square
+            error = float(residual.dot(residual))
             if not error < before:
                 return False
             if factors is None or (error > REUSED_FACTORS_SHRINK * before and before < np.inf):
                 factors = self._factors_at(b, line)
                 self._enough = 4 * FOLLOWED_CLOSURE_ERROR**2 * float(square.min())
             if error <= self._enough:
-                self._pose, self._factors = now, factors
-                self._rest()
+                self._factors, self._since = factors, self._since + 1
+                if self._since == POSES_BETWEEN_SQUARINGS:
+                    # Remove the rounding of many steps from the rotation.
+                    self._since, now = 0, pose(nearest_rotation(now[:3, :3]), now[:3, 3])
+                self._pose = now
                 return True
             before = error
-            twist[self._free] = self._solved(*factors, remainder)[0]
-            now = _moved_back(now, twist)
+            twist[self._free] = self._getrs(*factors, residual)[0]
+            now = _retracted_half_back(now, twist)
         return False
 
     def _factors_at(self, b: Array, line: Array) -> tuple[Array, Array]:
-        """LU factors of half the rows' derivatives by the freedoms, (n, n)."""
+        """LU factors of half the derivatives of the rows by the freedoms, (n, n)."""
         rows = np.empty((6, line.shape[1]))
         rows[:3] = b[FIRST_CROSS_COMPONENTS] * line[SECOND_CROSS_COMPONENTS]
         rows[:3] -= b[SECOND_CROSS_COMPONENTS] * line[FIRST_CROSS_COMPONENTS]
         rows[3:] = line
-        return self._factored(rows[self._free].T)[:2]
-
-    def _rest(self) -> None:
-        """Take the rounding of many steps out of the rotation."""
-        self._since += 1
-        if self._since == POSES_BETWEEN_SQUARINGS:
-            self._since, self._pose = (
-                0,
-                pose(nearest_rotation(self._pose[:3, :3]), self._pose[:3, 3]),
-            )
+        return self._getrf(rows[self._free].T)[:2]
 
 
 FIRST_CROSS_COMPONENTS, SECOND_CROSS_COMPONENTS = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""Of two vectors' components those whose products are their cross product's, less the others."""
+"""Indices of the components in a cross product: a[FIRST] b[SECOND] - a[SECOND] b[FIRST]."""
 
 
-def _moved_back(T_base_platform: Array, twice: Array) -> Array:
-    """A pose (4, 4) moved from the left by minus half of (omega, tau), (6,): Cayley's map, as in
-    :func:`pkmcal.geometry.batches.stepped`, in plain numbers, which are faster one by one.
+def _retracted_half_back(T_base_platform: Array, twice: Array) -> Array:
+    """Pose (4, 4) moved from the left by minus half of (omega, tau), (6,).
+
+    Cayley's map as in :func:`pkmcal.geometry.batches.stepped`, in plain Python numbers, which are
+    faster for one pose.
     """
     x, y, z, a, b, c = twice.tolist()
     x, y, z = -0.25 * x, -0.25 * y, -0.25 * z

@@ -1,17 +1,18 @@
-"""The equations that joints' axes add to the closure, with exact derivatives; metres.
+"""Closure equations from joints' axes, with exact derivatives; metres.
 
-A joint at a limb's end may have an axis. On a spatial machine the axes add equations between the
-limb's line and the two bodies, by what each end's carrier says that its axis does:
+A joint at a limb's end may have an axis. On a spatial machine, axes add equations between the
+limb's line and the two bodies, by the role that each end's carrier assigns to its axis:
 
-- ``square``, a revolute joint: the limb is square to the axis ([A] eq. 7);
+- ``square``, a revolute joint: the limb is orthogonal to the axis ([A] eq. 7);
 - ``twist`` at both ends, universal joints: the limb does not twist, so the two first axes and the
-  limb's line lie in one plane (errata, 3-UPU).
+  limb's line are in one plane (errata, 3-UPU).
 
-Each says that the limb's line d = B - A has no part along a direction w: ``d . w = 0``. A revolute
-joint on the base has w = v, its unit axis; on the platform w = R v'. A limb that cannot twist has
-``w = v x R v'``. In metres, so that they stand beside lengths in one least-squares problem.
+Each equation states that the limb's line d = B - A is orthogonal to a direction w: ``d . w = 0``. A
+revolute joint on the base has w = v, its unit axis; on the platform w = R v'. A limb that cannot
+twist has ``w = v x R v'``. Values are in metres, like the lengths in the same least-squares
+problem.
 
-Planar and translational machines move as their file says, whatever the axes: there they add none.
+Planar and translational machines move as their file states, so axes add no equations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
-from pkmcal.mechanisms.document import Leg, MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 
 JOINT_AXIS_KINDS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
@@ -32,27 +33,24 @@ Equation = Literal["revolute base", "revolute platform", "torsion"]
 
 
 def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
-    """The angle equations of a machine, (leg from 0, which), in the order of the legs."""
+    """Angle equations of a machine, (leg from 0, kind), in the order of the legs."""
     if document.motion != "spatial":
         return ()
-    return tuple((j, e) for j, leg in enumerate(document.legs) for e in _equations(leg))
-
-
-def _equations(leg: Leg) -> list[Equation]:
-    base = base_carriers()[leg.base.joint].axis_role(leg.base)
-    platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
-    results: list[Equation] = []
-    if base == "square":
-        results.append("revolute base")
-    if platform == "square":
-        results.append("revolute platform")
-    if base == platform == "twist":
-        results.append("torsion")
-    return results
+    out: list[tuple[int, Equation]] = []
+    for j, leg in enumerate(document.legs):
+        base = base_carriers()[leg.base.joint].axis_role(leg.base)
+        platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
+        if base == "square":
+            out.append((j, "revolute base"))
+        if platform == "square":
+            out.append((j, "revolute platform"))
+        if base == platform == "twist":
+            out.append((j, "torsion"))
+    return tuple(out)
 
 
 def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
-    """Ends (leg from 0, side) whose axis takes part in an equation, so is a parameter."""
+    """Ends (leg from 0, side) whose axis is in an equation and hence a parameter."""
     sides: dict[Equation, tuple[str, ...]] = {
         "revolute base": ("base",),
         "revolute platform": ("platform",),
@@ -63,10 +61,11 @@ def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
 
 @dataclass(frozen=True)
 class AngleLayout:
-    """The E angle equations of a machine.
+    """Indices of the E angle equations of a machine.
 
-    leg : (E,). base, platform : (E, 3) positions of the axes' parameters (0 where there is none).
-    on_base, on_platform : (E,) which of the axes each equation has; both for a torsion.
+    leg : (E,).
+    base, platform : (E, 3) indices of the axes' parameters, 0 for an axis that is not used.
+    on_base, on_platform : (E,) axes used by each equation; a torsion uses both.
     """
 
     leg: Integers
@@ -80,8 +79,8 @@ class AngleLayout:
 
 
 class AngleRows(NamedTuple):
-    """Values (..., E) m, derivatives by the limb's line (..., E, 3), by the platform's turn
-    (..., E, 3), and by the base and platform axes' parameters (..., E, 3) each.
+    """Angle equations: values (..., E), m, and derivatives (..., E, 3) by the limb's line, by the
+    platform's rotation, and by the parameters of the base and platform axes.
     """
 
     value: Array
@@ -92,10 +91,13 @@ class AngleRows(NamedTuple):
 
 
 def angle_layout(document: MechanismDocument, base: Integers, platform: Integers) -> AngleLayout:
-    """The equations of a document; base, platform : (L, 3) axes' positions, -1 for none."""
-    values = equations(document)
-    leg = np.array([j for j, _ in values], dtype=int)
-    kinds = np.array([kind for _, kind in values], dtype=object)
+    """Angle equations of a document.
+
+    base, platform : (L, 3) indices of the axes' parameters, -1 for none.
+    """
+    pairs = equations(document)
+    leg = np.array([j for j, _ in pairs], dtype=int)
+    kinds = np.array([kind for _, kind in pairs], dtype=object)
     on_base = np.isin(kinds, ["revolute base", "torsion"])
     on_platform = np.isin(kinds, ["revolute platform", "torsion"])
     return AngleLayout(
@@ -108,16 +110,19 @@ def angle_layout(document: MechanismDocument, base: Integers, platform: Integers
 
 
 def angle_rows(layout: AngleLayout, theta: Array, rot: Array, line: Array) -> AngleRows:
-    """The equations of the limbs' lines.
+    """Angle equations evaluated.
 
-    theta : (..., P). rot : platform's rotation (..., 3, 3). line : (..., E, 3) B - A of each
-    equation's leg, m.
+    theta : (..., P).
+    rot : (..., 3, 3) rotation of the platform.
+    line : (..., E, 3) B - A of each equation's leg, m.
     """
+    # Unit axes in the base frame, and the direction w to which the line is orthogonal.
     first, second = layout.on_base[:, None], layout.on_platform[:, None]
     v, v_size = _unit(theta[..., layout.base], first)
     own, own_size = _unit(theta[..., layout.platform], second)
     turned = (rot[..., None, :, :] @ own[..., None])[..., 0]
     w = np.where(first & second, cross(v, turned), np.where(first, v, turned))
+    # Derivatives of line . w by the unit axes, in the base frame.
     by_v = np.where(second, cross(turned, line), line)
     by_turned = np.where(first, cross(line, v), line)
     by_own = (rot.mT[..., None, :, :] @ by_turned[..., None])[..., 0]
@@ -131,12 +136,12 @@ def angle_rows(layout: AngleLayout, theta: Array, rot: Array, line: Array) -> An
 
 
 def _unit(axis: Array, used: Booleans) -> tuple[Array, Array]:
-    """Unit axes and their sizes (..., E, 1); z where an equation has none."""
+    """Unit axes (..., E, 3) and their lengths (..., E, 1); the z axis if an equation has none."""
     axis = np.where(used, axis, np.array([0.0, 0.0, 1.0]))
     size = np.sqrt(dot(axis, axis))[..., None]
     return axis / size, size
 
 
 def _across(gradient: Array, axis: Array) -> Array:
-    """The part of a gradient across a unit axis: its length changes nothing."""
+    """Part of a gradient orthogonal to a unit axis; the length of an axis has no effect."""
     return gradient - dot(gradient, axis)[..., None] * axis

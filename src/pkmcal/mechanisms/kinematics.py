@@ -1,9 +1,9 @@
 """Inverse and forward kinematics of any machine, batched over poses.
 
-Forward kinematics is a search for poses that close the machine, from a start in the right assembly:
-Levenberg-Marquardt, each row of the batch on its own. A row has its own damping and stops on its
-own. With little damping the steps are Newton's, so most rows are solved in four or five; what is
-solved is taken out, and the rest goes on.
+Forward kinematics is a Levenberg-Marquardt search for poses that close the machine, from a start in
+the right assembly mode. Each row of the batch has its own damping and stops on its own. With little
+damping the steps are Newton's, so most rows converge in four or five; converged rows are removed
+from the batch.
 """
 
 from __future__ import annotations
@@ -41,34 +41,40 @@ from pkmcal.mechanisms.closure import (
 from pkmcal.mechanisms.layout import LimbLayout
 
 MAX_STEPS = 60
+"""Most steps of a search."""
 CONVERGED_CLOSURE_ERROR = 1e-12
 """Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
 CONFIGURATIONS_A_CHUNK = 2048
-"""Rows of a batch at a time: their numbers stay in a processor's second cache."""
+"""Rows of a batch processed at a time; their data fit into a processor's second-level cache."""
 HOPELESS_DAMPING = 1e3
-"""Damping at which a step that does not help is the last."""
+"""Damping above which a row stops after a rejected step."""
 CLOSURE_ROUNDING = 16 * float(np.finfo(float).eps)
-"""Of the longest rod: where a step does not help, a closure error below it is rounding."""
+"""Closure error due to rounding, as a share of the longest rod; a row below it stops after a
+rejected step."""
 SECOND_RODS_STEPS = 15
-"""Steps for a machine's second rods; a pose that they all allow takes four."""
+"""Most steps of inverse kinematics with several rods for a motor; a pose that all rods allow takes
+four."""
 SECOND_RODS_SETTLED = 1e-15
-"""A step of readings (rad) and hinges below which nothing changes any more."""
+"""Step of readings (rad) and hinges below which these steps have converged."""
 SAME_EQUATION = 1e-9
-"""Singular value of the scaled rows below which one of them says what the others do."""
+"""Singular value of the scaled rows below which they are linearly dependent."""
 LEVELLING_STEPS = 3
-"""Steps to the pose that closes more rows than it has unknowns best; each leaves of the way what
-the closure error is of a rod."""
+"""Gauss-Newton steps to the least-squares pose of an overdetermined machine. Each multiplies the
+remaining distance by the ratio of the closure error to a rod."""
 OTHER_MACHINE_GAP = 0.05
-"""Of a rod, the closure error beyond which readings are no machine's with errors, but another's."""
+"""Closure error, as a share of a rod, above which readings belong to another machine, not to this
+one with errors."""
 STEPS_OUT_OF_REACH = 5
-"""Steps in a row out of a limb's reach after which no pose is looked for any more."""
+"""Consecutive steps with a limb out of reach after which the search for a pose stops."""
 NEAR_SINGULAR = 0.02
-"""Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
-reading's error then moves the platform fifty times as far."""
+"""Smallest singular value of the scaled inverse Jacobian below which a warning is due: an error of
+a reading then moves the platform fifty times as far."""
 
 
 class Closed(NamedTuple):
-    """Poses (N, 4, 4), internal coordinates (N, n), and the largest closure error (N,), m."""
+    """Result of a search: poses (N, 4, 4), internal coordinates (N, n), and the largest closure
+    error (N,), m.
+    """
 
     poses: Array
     internal: Array
@@ -76,10 +82,13 @@ class Closed(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """Rows of a batch that are worked on: theta (P,) or (n, P), and what the readings decide.
+    """Rows of a batch in progress.
 
-    platform : the platform groups' parameters. number : (n,) where the results belong.
-    rounding : m.
+    theta : (P,) or (n, P).
+    platform : parameters of the platform groups.
+    base : base side of the limbs.
+    number : (n,) rows of the output.
+    rounding : closure error due to rounding, m.
     """
 
     layout: LimbLayout
@@ -91,7 +100,9 @@ class _Task(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Where the rows stand: value (n, E), jac (n, E, d), cost and worst (n,) of the values."""
+    """Current state of the rows: value (n, E), jac (n, E, d), cost (n,) sum of squares, worst (n,)
+    largest residual.
+    """
 
     poses: Array
     internal: Array
@@ -106,8 +117,10 @@ def close(
 ) -> Closed:
     """Poses at readings (N, m) from starts (N, 4, 4) with internal coordinates (N, n).
 
-    theta : (P,) or (N, P). Unknowns are the motion's directions only, so a planar machine stays in
-    its plane, and the internal coordinates.
+    theta : (P,) or (N, P).
+
+    Unknowns are the motion's freedoms, so a planar machine stays in its plane, and the internal
+    coordinates.
     """
     out = Closed(np.empty(start.shape), np.empty(internal.shape), np.empty(len(start)))
     for first in range(0, len(start), CONFIGURATIONS_A_CHUNK):
@@ -124,38 +137,49 @@ def close(
 
 
 def base_batch_last(base: BaseEnds) -> BaseEnds:
-    """What there is of each row, in the batch's order of memory."""
+    """Base side with the arrays that differ between rows in batch-last memory order."""
     a, by_reading = (batch_last(x) if x.ndim > 2 else x for x in (base.a, base.by_reading))
     return BaseEnds(a, by_reading, batch_last(base.length) if base.length.ndim > 1 else base.length)
 
 
 def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
-    """Work on some rows and write their results."""
-    now = _at(task, poses, internal)
+    """Solve the rows of a task and write their results."""
+    now = _state_at(task, poses, internal)
     damping, stuck = np.full(len(poses), 1e-6), np.zeros(len(poses), dtype=bool)
     for _ in range(MAX_STEPS):
+        # Write and remove finished rows once they are a quarter of the batch.
         done = stuck | (now.worst <= CONVERGED_CLOSURE_ERROR * 1e-2)
         if 4 * np.count_nonzero(done) >= len(done):
-            _write(task, now, out)
+            _write_results(task, now, out)
             remaining = np.flatnonzero(~done)
             if not remaining.size:
                 return
             if remaining.size < len(done):
-                task, now = _picked(task, remaining), _State(*(picked(x, remaining) for x in now))
+                task, now = (
+                    _task_rows(task, remaining),
+                    _State(*(picked(x, remaining) for x in now)),
+                )
                 damping, done = damping[remaining], done[remaining]
         step = damped_step(now.jac, now.value, damping)
-        trial = _at(task, *_moved(task.layout, now, step))
+        trial = _state_at(task, *_retracted(task.layout, now, step))
         better = trial.cost < now.cost
         if np.count_nonzero(better) == len(better):
             now, stuck, damping = trial, done, np.maximum(damping * 0.05, 1e-14)
             continue
+        # Rejected steps increase the damping, or end a row that cannot improve.
         stuck = done | (~better & ((damping > HOPELESS_DAMPING) | (now.worst < task.rounding)))
         damping = np.where(better, np.maximum(damping * 0.05, 1e-14), damping * 30)
-        now = _chosen(better, trial, now)
-    _write(task, now, out)
+        now = _State(
+            *(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(trial, now, strict=True)
+            )
+        )
+    _write_results(task, now, out)
 
 
-def _at(task: _Task, poses: Array, internal: Array) -> _State:
+def _state_at(task: _Task, poses: Array, internal: Array) -> _State:
+    """State of the rows at poses (n, 4, 4) and internal coordinates."""
     platform = platform_ends(task.layout, task.theta, poses, internal, task.platform)
     rows = rows_between(task.layout, task.theta, task.base, platform, poses)
     cost = (rows.value * rows.value).sum(axis=-1)
@@ -163,8 +187,8 @@ def _at(task: _Task, poses: Array, internal: Array) -> _State:
     return _State(poses, internal, rows.value, by_own(task.layout, rows), cost, worst)
 
 
-def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
-    """Poses and internal coordinates a step (n, d + n) back."""
+def _retracted(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
+    """Poses and internal coordinates retracted along minus a step (n, d + n)."""
     d = layout.motion.shape[1]
     if d == 6:
         delta = -step[:, :6]
@@ -175,16 +199,8 @@ def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
     return stepped(now.poses, delta), now.internal - step[:, d:]
 
 
-def _chosen(better: Booleans, trial: _State, now: _State) -> _State:
-    """The trial where it is better."""
-    out: list[Array] = []
-    for new, old in zip(trial, now, strict=True):
-        out.append(np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old))
-    return _State(*out)
-
-
-def _picked(task: _Task, rows: Integers) -> _Task:
-    """The same for some rows of the batch."""
+def _task_rows(task: _Task, rows: Integers) -> _Task:
+    """Task restricted to some of its rows."""
     base = task.base
     a, by_reading = (picked(x, rows) if x.ndim > 2 else x for x in (base.a, base.by_reading))
     length = picked(base.length, rows) if base.length.ndim > 1 else base.length
@@ -197,21 +213,23 @@ def _picked(task: _Task, rows: Integers) -> _Task:
     )
 
 
-def _write(task: _Task, now: _State, out: Closed) -> None:
-    """The results of a task's rows, at their places."""
+def _write_results(task: _Task, now: _State, out: Closed) -> None:
+    """Write the results of a task's rows into the output."""
     out.poses[task.number], out.internal[task.number] = now.poses, now.internal
     out.error[task.number] = np.where(np.isfinite(now.cost), now.worst, np.inf)
 
 
 @dataclass(frozen=True)
 class ForwardResult:
-    """Poses found from readings, and how far to trust each.
+    """Forward kinematics: poses with their convergence.
 
-    T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
-    A machine with more rows than unknowns is closed as well as its readings allow, by least
-    squares; converged where that leaves errors of readings and of drawings, see OTHER_MACHINE_GAP.
-    internal : (..., n) the hinges' turns of an articulated platform, rad; n = 0 for a rigid one.
-    layout, theta, readings : the machine, and what it was closed at.
+    T_base_platform : (..., 4, 4).
+    converged : (...). An overdetermined machine (more rows than unknowns) is closed by least
+        squares, and has converged if the residual can be due to errors of readings and geometry,
+        see OTHER_MACHINE_GAP.
+    error : (...) largest closure error, m.
+    internal : (..., n) hinge angles of an articulated platform, rad; n = 0 for a rigid one.
+    layout, theta, readings : the machine, and the readings at which it was closed.
     """
 
     T_base_platform: Array
@@ -226,9 +244,10 @@ class ForwardResult:
 
     @cached_property
     def singularity(self) -> Array:
-        """(...) smallest singular value of the inverse Jacobian with rotations scaled by the
-        platform's radius: 1 is a good machine, 0 a singular pose. Found when first asked for: it
-        takes longer than the poses.
+        """Smallest singular value (...) of the inverse Jacobian with rotations scaled by the
+        platform's radius: 1 for a well-conditioned machine, 0 at a singular pose.
+
+        Evaluated on first use; it takes longer than the poses.
         """
         poses, phi = self.T_base_platform, self.internal
         c = closure(self.layout, self.theta, self.readings, poses, phi)
@@ -238,11 +257,11 @@ class ForwardResult:
 def readings_at_poses(
     layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None
 ) -> Array:
-    """Readings (..., m) at poses T_base_platform (..., 4, 4).
+    """Readings (..., m) at poses T_base_platform (..., 4, 4); NaN out of reach.
 
     Rods: q = (length - offset) / scale, [B] eq. 4. Cranks and sliders: the carrier's closed form,
-    [C] eq. 2, over the scale, nearest to mid-range, or to readings ``near`` (..., m). NaN out of
-    reach.
+    [C] eq. 2, over the scale, with the solution nearest to mid-range, or to readings ``near``
+    (..., m).
     """
     return inverse_result(layout, theta, poses, near)[0]
 
@@ -250,26 +269,32 @@ def readings_at_poses(
 def inverse_result(
     layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None
 ) -> tuple[Array, Array]:
-    """Readings (..., m) and internal coordinates (..., n) at poses (..., 4, 4)."""
+    """Readings (..., m) and internal coordinates (..., n) at poses (..., 4, 4); arguments as for
+    :func:`readings_at_poses`.
+    """
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
-    internal = _upright(layout, theta, poses, shape)
-    legs = _leg_inverse(layout, theta, poses, internal, near)
+    # Each leg on its own, with hinges that keep the bars' directions.
+    internal = _initial_internal(layout, theta, poses, shape)
+    legs = _leg_readings(layout, theta, poses, internal, near)
     if not layout.shares_motors:
         driven = np.flatnonzero(layout.actuated >= 0)
         return legs[..., driven[np.argsort(layout.actuated[driven], kind="stable")]], internal
+    # Several rods for a motor: least squares from the mean over its rods.
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
     readings = legs @ (columns / columns.sum(axis=1, keepdims=True)).T
-    return _settled(layout, theta, poses, readings, internal)
+    return _least_squares_readings(layout, theta, poses, readings, internal)
 
 
 def closure_at(layout: LimbLayout, theta: Array, poses: Array) -> Closure:
-    """The closure at poses (..., 4, 4), with the readings and hinges' turns that close it best."""
+    """Closure at poses (..., 4, 4), with the readings and hinge angles from inverse kinematics."""
     readings, internal = inverse_result(layout, theta, poses)
     return closure(layout, theta, readings, poses, internal)
 
 
-def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]) -> Array:
-    """Internal coordinates (..., n) that leave the bars' directions as they are, about."""
+def _initial_internal(
+    layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]
+) -> Array:
+    """Approximate internal coordinates (..., n) that keep the bars' directions."""
     out = np.zeros((*shape, layout.n_internal))
     for group in layout.platform if layout.n_internal else ():
         if group.carrier.turns:
@@ -278,16 +303,16 @@ def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, .
     return out
 
 
-def _leg_inverse(
+def _leg_readings(
     layout: LimbLayout, theta: Array, poses: Array, internal: Array, readings: Array | None
 ) -> Array:
-    """Each leg's own reading (..., L), zero where it has none; the one nearest to ``readings``
+    """Reading of each leg (..., L), zero without one; the solution nearest to ``readings``
     (..., m), or to mid-range.
     """
     at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
     platform = platform_ends(layout, theta, poses, internal)
     distance = limb_lines(at_zero, platform)[1]
-    # linear in the reading of a rod on a fixed centre
+    # A rod on a fixed centre is linear in its reading.
     out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)
     for group in layout.base:
         if group.carrier.driven:
@@ -300,12 +325,13 @@ def _leg_inverse(
     return out / scale
 
 
-def _settled(
+def _least_squares_readings(
     layout: LimbLayout, theta: Array, poses: Array, readings: Array, internal: Array
 ) -> tuple[Array, Array]:
-    """Readings and internal coordinates that close a machine with several rods a motor best.
+    """Readings and internal coordinates that close a machine with several rods for a motor by least
+    squares.
 
-    Gauss-Newton with the poses held, from each motor's mean of its rods.
+    Gauss-Newton at fixed poses, started from each motor's mean over its rods.
     """
     m = layout.n_readings
     pick = layout.of_motor.astype(float)
@@ -313,7 +339,7 @@ def _settled(
     for _ in range(SECOND_RODS_STEPS):
         c = closure(layout, theta, x[..., :m], poses, x[..., m:])
         jac = np.concatenate([c.by_reading[..., None] * pick, c.rows.by_internal], axis=-1)
-        # what is out of reach is NaN and stays so
+        # x is NaN out of reach, and stays NaN
         jac, value = np.nan_to_num(jac), np.nan_to_num(c.rows.value)
         step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
         x = x - step
@@ -329,10 +355,12 @@ def forward(
     start: Array,
     internal: Array | None = None,
 ) -> ForwardResult:
-    """Poses at readings (..., m), from starts (..., 4, 4); theta (..., P) broadcasts.
+    """Forward kinematics at readings (..., m), from starts (..., 4, 4); theta (..., P) broadcasts.
 
-    Unknowns are the motion's directions only, so a planar machine stays in its plane, and the
-    internal coordinates (..., n), from zero where they are not given.
+    internal : (..., n) initial internal coordinates, zero by default.
+
+    Unknowns are the motion's freedoms, so a planar machine stays in its plane, and the internal
+    coordinates.
     """
     shape = np.broadcast_shapes(readings.shape[:-1], start.shape[:-2], theta.shape[:-1])
     count = math.prod(shape)
@@ -353,18 +381,19 @@ def forward(
     error = fk.error.reshape(shape)
     converged = error < CONVERGED_CLOSURE_ERROR
     if layout.overdetermined:
-        poses, inner, error = _at_least(layout, theta, readings, poses, inner)
+        poses, inner, error = _least_squares_poses(layout, theta, readings, poses, inner)
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
         converged = error < OTHER_MACHINE_GAP * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
 
 
-def _at_least(
+def _least_squares_poses(
     layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
 ) -> Closed:
-    """Poses (..., 4, 4) near the least of the rows' squares, brought to it.
+    """Least-squares poses (..., 4, 4) of an overdetermined machine, from poses near the minimum.
 
-    Gauss-Newton: near it the squares are level to rounding, and tell a search nothing.
+    Gauss-Newton: near the minimum the sum of squares is constant to rounding, so a search by its
+    value stalls.
     """
     for _ in range(LEVELLING_STEPS):
         c = closure(layout, theta, readings, poses, internal)
@@ -377,17 +406,17 @@ def _at_least(
 
 
 def scaled_rows(c: Closure) -> Array:
-    """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
-    hinges' are too, count as the platform's joints' ways.
+    """Derivatives (..., E, d + n) of the closure by the pose's freedoms and hinges, without units:
+    rotations are expressed as displacements of the platform's joints.
     """
     return by_own(c.layout, c.rows) * own_scale(c.layout, c.theta)[..., None, :]
 
 
 def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
-    """Smallest singular value (...) of :func:`scaled_rows`, of which each is about a unit
-    direction: 0 where the platform can move with all joints locked; NaN where they are not known.
+    """Smallest singular value (...) of :func:`scaled_rows`, whose rows are about unit vectors: 0 if
+    the platform can move with all joints locked; NaN if the rows are not finite.
     """
-    if layout.n_equations < scaled.shape[-1]:  # fewer than its freedoms: it can always move
+    if layout.n_equations < scaled.shape[-1]:  # fewer rows than freedoms
         return np.zeros(scaled.shape[:-2])
     finite = np.isfinite(scaled).all(axis=(-1, -2))
     least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]
@@ -395,8 +424,8 @@ def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
 
 
 def own_scale(layout: LimbLayout, theta: Array) -> Array:
-    """What one unit of each of the pose's own freedoms is, (..., d + n): 1 m along the base's
-    axes, and turns, hinges' too, that move the platform's joints by 1 m.
+    """Unit of each of the pose's freedoms (..., d + n) in :func:`scaled_rows`: 1 m along the base's
+    axes, and rotations (of hinges too) that displace the platform's joints by 1 m.
     """
     hinges = np.arange(layout.own_motion.shape[1]) >= layout.motion.shape[1]
     turns = hinges | (np.abs(layout.own_motion[:3]).sum(axis=0) > 0)
@@ -409,41 +438,44 @@ def platform_radius(layout: LimbLayout, theta: Array) -> Array:
     centres = np.concatenate(points, axis=-2)
     spread = centres - centres.mean(axis=-2, keepdims=True)
     radius = np.sqrt(np.mean(np.sum(spread**2, axis=-1), axis=-1))
-    return np.where(radius > 0, radius, 1.0)  # legs that meet in a point turn nothing
+    return np.where(radius > 0, radius, 1.0)  # legs that meet in one point
 
 
 def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
-    """Starts for a machine whose file names no home pose: the platform unturned, its joints'
-    mean above (and below) the base joints' mean, at the height that the rods reach; (k, 4, 4).
+    """Starting poses (k, 4, 4) for a machine without a home pose in its file.
+
+    The platform is unrotated, with the mean of its joints above (and below) the mean of the base
+    joints, at the height that the rods reach. Planar machines start rotated by several angles, or
+    beside the base's middle.
     """
     a, b = base_ends(layout, theta, readings).a, platform_ends(layout, theta, np.eye(4)).b
     shift = a.mean(axis=-2) - b.mean(axis=-2)
     reach = typical_reach(layout, theta, readings)
-    if not layout.free[5]:  # in its plane: turned a little, or beside the base's middle
+    if not layout.free[5]:  # planar motion
         angles = (0.0, 0.5, -0.5, 1.0, -1.0) if layout.free[2] else (0.0,)
         beside = (0.0,) if layout.free[2] else (0.0, -reach / 3, reach / 3)
         places = [shift + np.array([0.0, y, 0.0]) for y in beside]
         return np.stack([pose(rotation(np.array([0, 0, a])), p) for a in angles for p in places])
+    # Spatial motion: above and below the base.
     flat = float(np.linalg.norm((b + shift - a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
-    sides = (-1, 1) if _hangs(layout, theta, a) else (1, -1)
+    # Cranks whose ends are below their axes on average carry a platform below the base.
+    drops = [(a[g.legs] - g.of(theta)[..., :3])[..., 2] for g in layout.base if g.carrier.driven]
+    hangs = bool(drops) and float(np.concatenate(drops).mean()) < 0
+    sides = (-1, 1) if hangs else (1, -1)
     return np.stack([pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides])
 
 
-def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
-    """Whether cranks reach below their axes at these ends (L, 3), so that the platform does."""
-    drops = [(a[g.legs] - g.of(theta)[..., :3])[..., 2] for g in layout.base if g.carrier.driven]
-    return bool(drops) and float(np.concatenate(drops).mean()) < 0
-
-
 def typical_reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
-    """Mean length of the rods whose length is known, m."""
+    """Mean length of the rods with known length, m."""
     return float(np.abs(rod_lengths(layout, theta, readings)[layout.closing]).mean())
 
 
 def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
-    """In how many ways the machine moves near a pose (4, 4): unknowns and readings together, less
-    the equations between them that differ. A machine with more readings is redundant.
+    """Number of degrees of freedom of the machine near a pose (4, 4).
+
+    The number of unknowns and readings, minus the rank of the equations between them. A machine
+    with more readings than this is redundant.
     """
     c = closure_at(layout, theta, pose)
     every = np.concatenate([scaled_rows(c), c.by_reading[..., None] * layout.of_motor], axis=-1)
@@ -453,26 +485,31 @@ def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
 def on_manifold(
     layout: LimbLayout, theta: Array, poses: Array, steps: int = MAX_STEPS
 ) -> ForwardResult:
-    """Poses (..., 4, 4) moved to where everything closes that no drive can change.
+    """Poses (..., 4, 4) projected onto those that satisfy all constraints which no drive can
+    change.
 
-    Constant rods, joints' axes and second rods of a motor leave a platform only some poses;
-    readings follow from these. Gauss-Newton with the shortest step, so a pose that is right stays
-    where it is; ``steps`` at most.
+    Constant rods, joints' axes and second rods of a motor constrain the platform; the readings
+    follow from the pose. Gauss-Newton with the minimum-norm step, so an admissible pose does not
+    change. At most ``steps`` steps.
     """
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
     current = np.array(np.broadcast_to(poses, (*shape, 4, 4))).reshape(-1, 4, 4)
     every = theta if theta.ndim == 1 else np.broadcast_to(theta, (*shape, theta.shape[-1]))
     every = every if theta.ndim == 1 else every.reshape(-1, theta.shape[-1])
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
-    remaining, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
+    remaining, out_of_reach = np.arange(len(current)), np.zeros(len(current), dtype=int)
     for _ in range(steps if free else 0):
         own = every if every.ndim == 1 else every[remaining]
         c = closure_at(layout, own, current[remaining])
+        # Violated constraints and their derivatives by the pose.
         value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.rows.by_pose @ layout.motion)
-        lost[remaining] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[remaining] + 1)
+        out_of_reach[remaining] = np.where(
+            np.isfinite(c.readings).all(axis=-1), 0, out_of_reach[remaining] + 1
+        )
+        # Continue with poses that are neither converged nor out of reach.
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
-        more &= lost[remaining] < STEPS_OUT_OF_REACH
+        more &= out_of_reach[remaining] < STEPS_OUT_OF_REACH
         remaining = remaining[more]
         if not remaining.size:
             break
@@ -490,16 +527,16 @@ def on_manifold(
 
 
 def undriven(c: Closure) -> tuple[Array, Array]:
-    """Combinations (..., r, E) of the closure's rows that neither drives nor hinges move, and
-    their values (..., r).
+    """Values (..., r) of the combinations of closure rows that neither drives nor hinges change,
+    and these combinations (..., r, E).
     """
     layout = c.layout
     passive = np.flatnonzero(layout.row_motor < 0)
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
         drives = c.by_reading[..., None] * layout.of_motor
-        shifted = np.concatenate([drives, c.rows.by_internal], axis=-1)
-        shifted = np.nan_to_num(shifted)
-        q = np.linalg.qr(shifted, mode="complete")[0]
-        blind = q[..., shifted.shape[-1] :].mT
+        by_driven = np.concatenate([drives, c.rows.by_internal], axis=-1)
+        by_driven = np.nan_to_num(by_driven)
+        q = np.linalg.qr(by_driven, mode="complete")[0]
+        blind = q[..., by_driven.shape[-1] :].mT
     return (blind @ c.rows.value[..., None])[..., 0], blind

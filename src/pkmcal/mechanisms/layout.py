@@ -1,4 +1,4 @@
-"""Where each limb finds its carriers, its parameters and its reading: made once from the file."""
+"""Indices of each limb's carriers, parameters and reading, built once from the document."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 @dataclass(frozen=True)
 class CarrierGroup:
-    """The legs that one carrier kind serves.
+    """Legs with the same kind of carrier on one side.
 
-    legs : (g,) leg numbers from 0. index : (g, n) their parameters' positions, P where the file is
-    silent; there ``constants`` (g, n) has the value.
+    legs : (g,) leg indices from 0.
+    index : (g, n) indices of their parameters, P for numbers that are not parameters, whose values
+        are in ``constants`` (g, n).
+    silent : (g, n) where ``index`` is P.
     """
 
     carrier: Any
@@ -36,34 +38,38 @@ class CarrierGroup:
 
     @cached_property
     def complete(self) -> bool:
-        """Whether the file gives every number."""
+        """Whether all numbers are parameters."""
         return not self.silent.any()
 
     def of(self, theta: Array) -> Array:
-        """The group's parameters (..., g, n) out of all, (..., P)."""
+        """Parameters (..., g, n) of the group from all parameters (..., P)."""
         if self.complete:
             return theta[..., self.index]
-        reference_values = theta[..., np.where(self.silent, 0, self.index)]
-        return np.where(self.silent, self.constants, reference_values)
+        parameters = theta[..., np.where(self.silent, 0, self.index)]
+        return np.where(self.silent, self.constants, parameters)
 
 
 @dataclass(frozen=True)
 class LimbLayout:
-    """Where each leg finds its parameters; made once from the document.
+    """Indices of each leg's parameters, built once from the document.
 
     base, platform : groups of legs by carrier.
-    rod : (L,) position of each rod's offset or constant length, -1 for a passive rod.
-    closing : (L,) legs whose length is an equation; all but the passive ones.
-    actuated : (L,) the reading's column, -1 for a leg without; middle : (L,) its mid-range.
-    internal : (L,) the column of the platform carrier's internal coordinate, -1 without.
-    rod_reads : (L,) whether the reading is the rod's own length (and not the carrier's motion).
-    scale : (L,) position of each reading's scale, P where it is exact; there ``exact_scale`` (L,)
-    has the value, which is 1 for a leg without a reading.
-    base_axis, platform_axis : (L, 3) positions of the axes' parameters, -1 where none is one.
-    angles : the axes' equations. turning : positions (n, 3) of all directions among the
-    parameters that turn with the base frame, and with the platform frame.
-    radius : list of (tubes,) positions of each leg's radii.
-    motion : (6, d) directions in which the platform moves. n_parameters : P.
+    rod : (L,) index of each rod's offset or constant length, -1 for a passive rod.
+    closing : (L,) legs whose length is an equation: all but passive ones.
+    actuated : (L,) column of the reading, -1 without one.
+    middle : (L,) mid-range of the reading.
+    internal : (L,) column of the platform carrier's internal coordinate, -1 without one.
+    rod_reads : (L,) whether the reading is the rod's own length, not the carrier's motion.
+    scale : (L,) index of each reading's scale, P if it is exact; then ``exact_scale`` (L,) holds
+        its value, 1 for a leg without a reading.
+    base_axis, platform_axis : (L, 3) indices of the axes' parameters, -1 for an axis that is not a
+        parameter.
+    angles : the axes' equations.
+    turning : indices (n, 3) of all direction vectors among the parameters, in the base frame and in
+        the platform frame.
+    radius : (tubes,) indices of the radii, for each leg.
+    motion : (6, d) directions in which the platform moves.
+    n_parameters : P.
     """
 
     n_legs: int
@@ -89,7 +95,7 @@ class LimbLayout:
 
     @cached_property
     def n_equations(self) -> int:
-        """Rows of the closure: lengths, then angles."""
+        """Number of closure rows: lengths, then axes' equations."""
         return int(self.closing.sum()) + len(self.angles)
 
     @cached_property
@@ -99,33 +105,33 @@ class LimbLayout:
 
     @cached_property
     def driven_rows(self) -> Integers:
-        """Rows of the closure that belong to legs with a reading, in the legs' order."""
+        """Closure rows of legs with a reading, in the legs' order."""
         return np.flatnonzero(self.actuated[self.closing] >= 0)
 
     @cached_property
     def n_readings(self) -> int:
-        """Readings of a configuration, m."""
+        """Number of readings of a configuration, m."""
         return int(self.actuated.max(initial=-1)) + 1
 
     @cached_property
     def n_internal(self) -> int:
-        """Internal coordinates of a pose."""
+        """Number of internal coordinates of a pose."""
         return int(self.internal.max(initial=-1)) + 1
 
     @cached_property
     def row_motor(self) -> Integers:
-        """The reading's column that enters each row of the closure, (E,), -1 where none."""
+        """Column of the reading in each closure row, (E,), -1 for none."""
         angles = np.full(len(self.angles), -1)
         return np.concatenate([self.actuated[self.closing], angles])
 
     @cached_property
     def row_is_rod(self) -> Booleans:
-        """(E,) rows of the closure whose rod a reading is of."""
+        """Whether each closure row (E,) is the length of a rod with a reading."""
         return np.append(self.rod_reads[self.closing], np.zeros(len(self.angles), dtype=bool))
 
     @cached_property
     def of_motor(self) -> Booleans:
-        """(E, m) which reading enters each row."""
+        """Whether each closure row depends on each reading, (E, m)."""
         return self.row_motor[:, None] == np.arange(self.n_readings)
 
     @cached_property
@@ -135,15 +141,15 @@ class LimbLayout:
 
     @cached_property
     def reads_lengths(self) -> bool:
-        """Whether a reading is a rod's length wherever there is one, so that the closures' noise is
-        the same everywhere.
+        """Whether all readings are rods' lengths, so that the noise of the closure is the same at
+        all poses.
         """
         lengths = np.all(self.row_is_rod | (self.row_motor < 0))
         return bool(lengths) and not self.shares_motors
 
     @cached_property
     def own_motion(self) -> Array:
-        """(6 + n, d + n): the pose's directions, then its internal coordinates."""
+        """Directions (6 + n, d + n) of the pose's freedoms, then of the internal coordinates."""
         n, d = self.n_internal, self.motion.shape[1]
         out = np.eye(6 + n, d + n)
         out[:6, :d], out[6:, d:] = self.motion, np.eye(n)
@@ -152,22 +158,24 @@ class LimbLayout:
 
     @cached_property
     def overdetermined(self) -> bool:
-        """Whether there are more rows than unknowns, so that readings with errors close none."""
+        """Whether there are more rows than unknowns, so that readings with errors close only
+        approximately.
+        """
         return self.n_equations > self.own_motion.shape[1]
 
     @cached_property
     def unsure_scales(self) -> Booleans:
-        """(L,) readings whose scale is a parameter."""
+        """Whether the scale of each leg's reading (L,) is a parameter."""
         return self.scale < self.n_parameters
 
     @cached_property
     def some_scales_unsure(self) -> bool:
-        """Whether the scale of any reading is a parameter."""
+        """Whether any reading's scale is a parameter."""
         return bool(self.unsure_scales.any())
 
     @cached_property
     def scale_or_first(self) -> Integers:
-        """(L,) where each scale stands among the parameters; the first where it is none."""
+        """Index of each scale among the parameters (L,), 0 for exact scales."""
         return np.where(self.unsure_scales, self.scale, 0)
 
     @cached_property
@@ -177,23 +185,23 @@ class LimbLayout:
 
     @cached_property
     def reading_or_first(self) -> Integers:
-        """(L,) each leg's reading; the first where it has none."""
+        """Column of each leg's reading (L,), 0 without one."""
         return np.maximum(self.actuated, 0)
 
     @cached_property
     def scales_move_a(self) -> bool:
-        """Whether a scale that is a parameter moves a limb's end A, and not a rod."""
+        """Whether any scale that is a parameter moves an end A (and not a rod)."""
         return bool((self.unsure_scales & ~self.rod_reads).any())
 
     @cached_property
     def scales_move_rods(self) -> bool:
-        """Whether one changes a rod's length."""
+        """Whether any scale that is a parameter changes a rod's length."""
         return bool((self.unsure_scales & self.rod_reads).any())
 
     @cached_property
     def a_index(self) -> Integers:
-        """(L, n) parameters that each limb's end A depends on, P where there are fewer; the last is
-        the reading's scale, where one moves A.
+        """Indices (L, n) of the parameters of each end A, P as padding; the last is the reading's
+        scale if any scale moves an end A.
         """
         index = self._ends_index(self.base)
         if not self.scales_move_a:
@@ -203,18 +211,20 @@ class LimbLayout:
 
     @cached_property
     def b_index(self) -> Integers:
-        """(L, n) the same of B."""
+        """Indices (L, n) of the parameters of each end B, P as padding."""
         return self._ends_index(self.platform)
 
     @cached_property
     def closure_index(self) -> Integers:
-        """(E, n) parameters that each row of the closure depends on, P where there are fewer."""
+        """Indices (E, n) of the parameters of each closure row, P as padding."""
         none, keep, leg = self.n_parameters, self.closing, self.angles.leg
         rod = np.where(keep, self.rod, none)[:, None]
         parts = [self.a_index, self.b_index, rod]
         if self.scales_move_rods:
             parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
+        # Rows of lengths: A, B, rod and the rod's scale.
         lengths = np.concatenate(parts, axis=1)[keep]
+        # Rows of axes: A, B and the two axes.
         angles = np.concatenate(
             [
                 self.a_index[leg],
@@ -234,6 +244,7 @@ class LimbLayout:
         return np.concatenate(list(wide))
 
     def _ends_index(self, groups: tuple[CarrierGroup, ...]) -> Integers:
+        """Indices (L, n) of the carriers' parameters on one side, P as padding."""
         width = max(g.index.shape[1] for g in groups)
         index = np.full((self.n_legs, width), self.n_parameters)
         for group in groups:
@@ -241,25 +252,25 @@ class LimbLayout:
         return index
 
     def radius_of(self, legs: Integers, tubes: Integers) -> Integers:
-        """Positions (n,) of the radii of legs' tubes, by the numbers of both, (n,) each."""
+        """Indices (n,) of the radii of tubes, from the indices of legs and tubes, (n,) each."""
         count = np.array([len(own) for own in self.radius])
         every = np.array([place for own in self.radius for place in own], dtype=int)
         return every[(np.cumsum(count) - count)[legs] + tubes]
 
     @cached_property
     def free(self) -> Booleans:
-        """(6,) which of (omega, tau) the motion has."""
+        """Whether the motion has each component (6,) of (omega, tau)."""
         return np.asarray(self.motion.any(axis=1))
 
     @cached_property
     def freedoms(self) -> slice:
-        """The same as a slice of the six."""
+        """Slice of the components of (omega, tau) that the motion has."""
         used = np.flatnonzero(self.free)
         return slice(int(used[0]), int(used[-1]) + 1)
 
 
 def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLayout:
-    """The layout of a document whose parameters stand at ``positions``."""
+    """Layout of a document, with the indices of its parameters in ``positions``."""
     legs = document.legs
     carriers = base_carriers()
     reads = np.array([isinstance(leg.length, ActuatedLength) for leg in legs])
@@ -267,8 +278,8 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
     base_axis, platform_axis = (_axis_index(document, s, positions) for s in ("base", "platform"))
     return LimbLayout(
         n_legs=len(legs),
-        base=_groups(document, "base", carriers, positions),
-        platform=_groups(document, "platform", platform_carriers(), positions),
+        base=_carrier_groups(document, "base", carriers, positions),
+        platform=_carrier_groups(document, "platform", platform_carriers(), positions),
         rod=np.array(
             [
                 positions.get(f"{rod}.offset", positions.get(f"{rod}.constant", -1))
@@ -278,7 +289,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         closing=closing,
         actuated=motor_columns(document),
         middle=middles(document),
-        internal=_internal(document),
+        internal=_internal_columns(document),
         rod_reads=reads,
         scale=np.array(
             [positions.get(f"legs[{j + 1}].scale", len(positions)) for j in range(len(legs))]
@@ -287,7 +298,10 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         base_axis=base_axis,
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
-        turning=(_turning(document, "base", positions), _turning(document, "platform", positions)),
+        turning=(
+            _direction_index(document, "base", positions),
+            _direction_index(document, "platform", positions),
+        ),
         radius=tuple(
             np.array(
                 [positions[f"legs[{j + 1}].tubes[{t + 1}].radius"] for t in range(len(leg.tubes))],
@@ -301,13 +315,13 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
 
 
 def _axis_index(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
-    """Positions (L, 3) of the axes' parameters on one side, -1 where there is none."""
+    """Indices (L, 3) of the axes' parameters on one side, -1 for none."""
     names = [[f"legs[{j + 1}].{side}.axis.{c}" for c in "xyz"] for j in range(len(document.legs))]
     return np.array([[positions.get(name, -1) for name in row] for row in names], dtype=int)
 
 
-def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
-    """Positions (n, 3) of the directions on one side, whoever has them; three in a row."""
+def _direction_index(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
+    """Indices (n, 3) of the components of all direction vectors on one side; they are adjacent."""
     carriers = base_carriers() if side == "base" else platform_carriers()
     names = (
         f"legs[{j}].{side}.{kind.path}"
@@ -321,9 +335,10 @@ def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) 
     return np.array(first, dtype=int)[:, None] + np.arange(3)
 
 
-def _groups(
+def _carrier_groups(
     document: MechanismDocument, side: str, carriers: dict[str, Any], positions: dict[str, int]
 ) -> tuple[CarrierGroup, ...]:
+    """Groups of legs by carrier on one side, in the order of first use."""
     nodes = [getattr(leg, side) for leg in document.legs]
     kinds = [carriers[node.joint] for node in nodes]
     groups: list[CarrierGroup] = []
@@ -331,19 +346,19 @@ def _groups(
         legs = np.flatnonzero([k is kind for k in kinds])
         names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
         index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
-        indices = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
+        numbers = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
         constants = np.array(
             [
                 [p.otherwise if v is None else v for p, v in zip(kind.parameters, row, strict=True)]
-                for row in indices
+                for row in numbers
             ]
         )
         groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))
     return tuple(groups)
 
 
-def _internal(document: MechanismDocument) -> Integers:
-    """The column of each leg's internal coordinate, by the body that it ends on; -1 without."""
+def _internal_columns(document: MechanismDocument) -> Integers:
+    """Column of each leg's internal coordinate (L,), by the body on which it ends, or -1."""
     kinds = platform_carriers()
     turns = np.array([kinds[leg.platform.joint].turns for leg in document.legs])
     on = np.where(turns, bodies(document), -1)

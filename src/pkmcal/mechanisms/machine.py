@@ -1,4 +1,4 @@
-"""A machine: its document, its parameter table and its values; kinematics as methods."""
+"""Machine: its document, parameter table and parameter values, with kinematics as methods."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ if TYPE_CHECKING:
 
 
 class _Row(NamedTuple):
-    """One parameter, as :class:`ParameterTable` has all; kind : the tolerance's name."""
+    """Row of the :class:`ParameterTable`; kind : name of the prior sigma."""
 
     name: str
     unit: str
     kind: str
     label: str
     part: str
-    drawing: float
-    tolerance: float
+    nominal: float
+    prior_sigma: float
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,15 @@ class Machine:
     Attributes
     ----------
     document :
-        The mechanism file it was read from.
+        The mechanism file from which the machine was read.
     parameters :
-        Names, drawing values, tolerances, roles.
+        Names, nominal values, prior sigmas, roles.
+    layout :
+        Indices of the limbs' parameters and readings.
     values :
         Present values (P,), in the table's order.
     model :
-        The name of the file's model whose ``fixed`` and ``tied`` hold, None for the file's own.
+        Name of the file's model whose ``fixed`` and ``tied`` apply, None for the file's own.
 
     """
 
@@ -89,7 +91,7 @@ class Machine:
 
     @property
     def name(self) -> str:
-        """The machine's name in its file."""
+        """Name of the machine in its file."""
         return self.document.name
 
     @property
@@ -99,54 +101,50 @@ class Machine:
 
     @property
     def n_joints(self) -> int:
-        """Number of readings in a configuration: one a motor, be it a rod's, a crank's or a
-        slider's.
-        """
+        """Number of readings in a configuration: one for each motor of a rod, crank or slider."""
         return self.layout.n_readings
 
     @property
     def redundancy(self) -> int:
-        """Readings that a configuration has beyond its freedoms, at home: what readings alone can
-        be held against.
+        """Number of readings beyond the degrees of freedom, at home: constraints among the readings
+        alone.
         """
         return self.n_joints - kinematics.mobility(self.layout, self.values, self.home())
 
     @property
     def joint_units(self) -> tuple[str, ...]:
-        """``m`` or ``rad`` of each reading, (m,)."""
+        """Unit of each reading, ``m`` or ``rad``, (m,)."""
         return motor_units(self.document)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """What a table of readings calls them where nobody says otherwise: by legs, or by motors
-        where legs share these.
-        """
+        """Default names of the readings' columns: by leg, or by motor if legs share motors."""
         if self.layout.shares_motors:
             return tuple(f"motor{k + 1}" for k in range(self.n_joints))
         return tuple(f"leg{j + 1}" for j in np.flatnonzero(self.layout.actuated >= 0))
 
     @property
     def joint_ranges(self) -> Array:
-        """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
+        """Smallest and largest reading of the file (m, 2), m or rad; NaN if not stated.
 
-        A rod's ``range`` bounds its length, so the drawing's offset and scale are taken off.
+        A rod's ``range`` bounds its length, so the nominal offset and scale are removed.
         """
         return motor_ranges(self.document)
 
     @property
     def most_turn(self) -> tuple[float, str]:
-        """How far the platform may turn about z to either side, rad, and what is then in the way;
-        infinity for a rigid one.
+        """Largest rotation of the platform about z to either side, rad, and the obstacle; infinity
+        for a rigid platform.
         """
         return min((g.carrier.most_turn, g.carrier.obstacle) for g in self.layout.platform)
 
     def with_values(self, values: Array) -> Machine:
-        """The same machine with other parameter values (P,)."""
+        """Copy with other parameter values (P,)."""
         return replace(self, values=np.array(values, dtype=float))
 
     @cached_property
     def size(self) -> float:
-        """The largest of its lengths, coordinates and readings' ranges, m."""
+        """Largest of the lengths, coordinates and ranges of readings, m."""
         lengths = self.values[np.array(self.parameters.units) == "m"]
         ranges = self.joint_ranges[np.array(self.joint_units) == "m"].ravel()
         home = self.document.home.position if self.document.home else ()
@@ -154,9 +152,9 @@ class Machine:
         return float(each.max(initial=0.0))
 
     def check_free(self, where: str) -> None:
-        """Raise InputError where nothing is left to be estimated but radii, which move nothing.
+        """Raise InputError if no parameter but radii, which do not move the platform, is free.
 
-        where : the mechanism file's field, for the message.
+        where : field of the mechanism file, for the message.
         """
         if any(self.parameters.kinds[k] != "radius" for k in self.parameters.first_of_free()):
             return
@@ -168,39 +166,47 @@ class Machine:
         )
 
     def base_centers(self) -> Array:
-        """Limbs' ends on the base side, (L, 3) m, base frame: joint centres, or, where a crank
-        or slider moves them, where they are at mid-range.
+        """Ends A (L, 3) on the base, m, base frame: joint centres, at mid-range if a crank or
+        slider moves them.
         """
         return self._ends()[0]
 
     def platform_centers(self) -> Array:
-        """Joint centres on the platform, (L, 3) m, platform frame; of an articulated one, with
-        both frames parallel and no hinge turned.
+        """Joint centres (L, 3) on the platform, m, platform frame; of an articulated platform with
+        both frames parallel and hinges at zero.
         """
         return self._ends()[1]
 
     def base_axes(self) -> Array:
-        """Unit axes of the joints on the base, (L, 3), base frame; NaN where none is unknown."""
+        """Unit axes of the joints on the base, (L, 3), base frame; NaN if the axis is not a
+        parameter.
+        """
         return self._axes(self.layout.base_axis)
 
     def platform_axes(self) -> Array:
-        """Unit axes of the joints on the platform, (L, 3), platform frame; NaN where none."""
+        """Unit axes of the joints on the platform, (L, 3), platform frame; NaN if the axis is not a
+        parameter.
+        """
         return self._axes(self.layout.platform_axis)
 
     def radii(self) -> tuple[Array, ...]:
-        """Each leg's tube radii, m."""
+        """Tube radii of each leg, m."""
         return tuple(self.values[index] for index in self.layout.radius)
 
     def radii_of(self, legs: Integers, tubes: Integers) -> Array:
-        """Radii (n,) m of legs' tubes, by the numbers of both, (n,) each, from 0."""
+        """Radii (n,) m of tubes, from the indices of legs and tubes, (n,) each, from 0."""
         return self.values[self.layout.radius_of(legs, tubes)]
 
     def home(self) -> Array:
-        """A start for forward kinematics: the file's home, or the platform above the base."""
+        """Starting pose (4, 4) of forward kinematics: the file's home, or one with the legs at
+        mid-range.
+        """
         return self._home.copy()
 
     def check_home(self) -> None:
-        """Raise InputError where the file says nothing of a pose to start from."""
+        """Raise InputError if neither a home pose nor the ranges of all readings are in the
+        file.
+        """
         if self.document.home is None and not np.isfinite(self.joint_ranges).all():
             raise InputError(
                 what=f"mechanism {self.name!r} gives neither a home pose nor every leg's range",
@@ -210,6 +216,7 @@ class Machine:
 
     @cached_property
     def _home(self) -> Array:
+        """Cached home pose."""
         if self.document.home is not None:
             h = self.document.home
             return pose(rotation(np.array(h.rotation_vector)), np.array(h.position))
@@ -228,19 +235,20 @@ class Machine:
         return fk.T_base_platform[good[0]]
 
     def inverse(self, T_base_platform: Array, near: Array | None = None) -> Array:
-        """Readings (n, m) at platform poses (n, 4, 4), m or rad.
+        """Inverse kinematics: readings (n, m) at platform poses (n, 4, 4), m or rad.
 
-        Of a crank's or slider's two solutions the one nearest to mid-range, or to readings ``near``
-        (n, m); NaN where a limb cannot reach. An articulated platform's hinges turn as they must.
+        A crank or slider has two solutions, of which the one nearest to mid-range, or to readings
+        ``near`` (n, m), is returned. NaN if a limb cannot reach. Hinges of an articulated platform
+        follow.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return kinematics.readings_at_poses(self.layout, self.values, poses, near)
 
     def forward(self, joints: Array, start: Array | None = None) -> Array:
-        """Platform poses T_base_platform (n, 4, 4) at readings (n, m).
+        """Forward kinematics: platform poses T_base_platform (n, 4, 4) at readings (n, m).
 
-        start : (4, 4) or (n, 4, 4), near the wanted assembly; the home pose when absent.
-        Raises GeometryError where the machine cannot be closed at the readings.
+        start : (4, 4) or (n, 4, 4), near the wanted assembly mode; by default the home pose.
+        Raises GeometryError if the machine cannot be closed at the readings.
         """
         fk = self.forward_result(joints, start)
         if not fk.converged.all():
@@ -255,51 +263,55 @@ class Machine:
         return fk.T_base_platform
 
     def forward_result(self, joints: Array, start: Array | None = None) -> kinematics.ForwardResult:
-        """As :meth:`forward`, with convergence and nearness to singularity, nothing raised."""
-        readings = _checked(joints, (self.n_joints,), "joints")
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        """Result of :meth:`forward` with convergence and singularity; raises nothing for failed
+        rows.
+        """
+        readings = _finite_array(joints, (self.n_joints,), "joints")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return kinematics.forward(self.layout, self.values, readings, begin)
 
     def follower(self, start: Array | None = None) -> Follower:
-        """Forward kinematics for a control loop: a function of readings (m,) that gives the pose
-        (4, 4) and begins at the last one; see :class:`~pkmcal.mechanisms.follower.Follower`.
+        """Forward kinematics for a control loop: a function from readings (m,) to the pose (4, 4),
+        which starts from its last result; see :class:`~pkmcal.mechanisms.follower.Follower`.
 
-        start : (4, 4), where the machine is; the home pose when absent.
+        start : (4, 4), present pose of the machine; by default the home pose.
         """
         from pkmcal.mechanisms.follower import Follower
 
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return Follower(self.layout, self.values, begin)
 
     def inverse_jacobian(self, T_base_platform: Array) -> Array:
-        """Readings' rates from the platform's twist, (n, m, 6), at poses (n, 4, 4).
+        """Derivatives (n, m, 6) of the readings by the platform's twist, at poses (n, 4, 4).
 
         The twist is (omega, tau), base frame; see :func:`velocities.inverse_jacobian`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return velocities.inverse_jacobian(self.layout, self.values, poses)
 
     def forward_jacobian(self, T_base_platform: Array) -> Array:
-        """The platform's twist from the readings' rates, (n, 6, m), at poses (n, 4, 4).
+        """Derivatives (n, 6, m) of the platform's twist by the readings' rates, at poses (n, 4, 4).
 
-        NaN where the pose is singular; see :func:`velocities.forward_jacobian`.
+        NaN at singular poses; see :func:`velocities.forward_jacobian`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return velocities.forward_jacobian(self.layout, self.values, poses)
 
     def amplification(
         self, T_base_platform: Array, p_platform: Array | None = None
     ) -> velocities.Amplification:
-        """Speeds, forces and conditioning at poses (n, 4, 4), of a point (3,) of the platform, m;
-        see :mod:`pkmcal.mechanisms.velocities`.
+        """Speeds, forces and condition numbers at poses (n, 4, 4), of a point (3,) of the platform,
+        m; see :mod:`pkmcal.mechanisms.velocities`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        point = None if p_platform is None else _checked(p_platform, (3,), "p_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
+        point = None if p_platform is None else _finite_array(p_platform, (3,), "p_platform")
         return velocities.amplification(self.layout, self.values, poses, point)
 
     def limits(self) -> workspace.Limits:
-        """The machine with its ranges and home's assembly, for the functions of workspaces. Home is
-        put where rods and axes allow it: a file's may be the drawing's.
+        """Machine with its ranges and home assembly, for the functions of workspaces.
+
+        Home is projected onto poses that rods and axes allow, because with calibrated parameters
+        the file's home is not exact.
         """
         home = kinematics.on_manifold(self.layout, self.values, self._home)
         return workspace.Limits(
@@ -311,46 +323,50 @@ class Machine:
         )
 
     def reachable(self, T_base_platform: Array) -> workspace.Reach:
-        """Which poses (n, 4, 4) the machine can take, and why not the others."""
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        """Whether the machine can take poses (n, 4, 4), and the obstacles where it cannot."""
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return workspace.reachable(self.limits(), poses)
 
     def extents(
         self, directions: Array, start: Array | None = None, most: float | None = None
     ) -> workspace.Extents:
-        """How far the platform comes along directions (k, 3) or twists (k, 6) from a pose (4, 4),
-        home when absent; see :func:`pkmcal.mechanisms.workspace.extents`.
+        """Reach of the platform along directions (k, 3) or twists (k, 6) from a pose (4, 4), by
+        default home; see :func:`pkmcal.mechanisms.workspace.extents`.
         """
         axes = np.asarray(directions, dtype=float)
-        axes = _checked(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
-        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        axes = _finite_array(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
+        begin = self._home if start is None else _finite_array(start, (4, 4), "start")
         return workspace.extents(self.limits(), axes.reshape(-1, axes.shape[-1]), begin, most)
 
     def grid(
         self, directions: Array | None = None, middle: Array | None = None, count: int = 25
     ) -> workspace.Grid:
-        """The workspace at the orientation of a pose (4, 4), home when absent: along all of the
-        motion's directions, or a section along two (2, 3); see
+        """Workspace at the orientation of a pose (4, 4), by default home: a volume along all
+        translations of the motion, or a section along two directions (2, 3); see
         :func:`pkmcal.mechanisms.workspace.workspace_grid`.
         """
         own = np.eye(3)[self.layout.free[3:]]
-        axes = own if directions is None else _checked(directions, (3,), "directions")
-        begin = self._home if middle is None else _checked(middle, (4, 4), "middle")
+        axes = own if directions is None else _finite_array(directions, (3,), "directions")
+        begin = self._home if middle is None else _finite_array(middle, (4, 4), "middle")
         return workspace.workspace_grid(self.limits(), begin, axes, count)
 
     def check_path(self, T_base_platform: Array) -> workspace.PathCheck:
         """Whether a path of poses (n, 4, 4) stays in the workspace and crosses no singular pose,
-        and where not.
+        and where it fails.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
         return workspace.check_path(self.limits(), poses)
 
     def same_assembly(self, T_base_platform: Array, T_reference: Array | None = None) -> Booleans:
-        """Whether poses (n, 4, 4) may belong to the assembly of a reference (4, 4), home when
-        absent. False is sure, True is not; see :func:`pkmcal.mechanisms.velocities.same_assembly`.
+        """Whether poses (n, 4, 4) may belong to the assembly mode of a reference (4, 4), by default
+        home.
+
+        False is certain, True is not; see :func:`pkmcal.mechanisms.velocities.same_assembly`.
         """
-        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        other = self._home if T_reference is None else _checked(T_reference, (4, 4), "T_reference")
+        poses = _finite_array(T_base_platform, (4, 4), "T_base_platform")
+        other = (
+            self._home if T_reference is None else _finite_array(T_reference, (4, 4), "T_reference")
+        )
         return velocities.same_assembly(self.layout, self.values, poses, other)
 
     def assembly_modes(self, joints: Array, rng: np.random.Generator) -> Array:
@@ -360,24 +376,26 @@ class Machine:
     def assembly_modes_result(
         self, joints: Array, rng: np.random.Generator, most: int = 100_000
     ) -> AssemblyModes:
-        """As :meth:`assembly_modes`, with signs, counts and what may be missing; most : starts."""
+        """Result of :meth:`assembly_modes` with signs, counts and completeness. most : largest
+        number of starts.
+        """
         from pkmcal.mechanisms.assembly_modes import assembly_modes
 
-        readings = _checked(joints, (self.n_joints,), "joints")
+        readings = _finite_array(joints, (self.n_joints,), "joints")
         return assembly_modes(self.layout, self.values, readings, self._home, rng, most)
 
     def middle_readings(self) -> Array:
-        """Readings (m,) at mid-range, zero where the file gives no range."""
+        """Readings (m,) at mid-range, zero for unknown ranges."""
         return np.nan_to_num(self.joint_ranges.mean(axis=1))
 
     def to_document(self) -> dict[str, Any]:
-        """The mechanism file's fields with the present values."""
+        """Fields of a mechanism file with the present values."""
         out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
         if not self.document.models:
             del out["models"]
         for leg, exact in zip(out["legs"], ~self.layout.unsure_scales, strict=True):
             if exact and leg["scale"] == 1:
-                del leg["scale"]  # of no reading, or of one that is what it says
+                del leg["scale"]  # the default: no reading, or an exact scale of 1
         values = self.parameters.unit_axes(self.values)
         for name, value in zip(self.parameters.names, values, strict=True):
             node, key = field_of(out, name)
@@ -385,12 +403,15 @@ class Machine:
         return out
 
     def _axes(self, index: Integers) -> Array:
+        """Unit axes (L, 3) from the indices of their parameters, NaN for index -1."""
         axes = np.where(index >= 0, self.parameters.unit_axes(self.values)[index], np.nan)
         return axes.reshape(-1, 3)
 
     def ends_at(self, joints: Array, T_base_platform: Array) -> LimbEnds:
-        """Both ends of every limb at readings (..., m) and poses (..., 4, 4); hinges of an
-        articulated platform turn as its limbs make them, or not at all where these cannot reach.
+        """Ends of all limbs at readings (..., m) and poses (..., 4, 4).
+
+        Hinges of an articulated platform are from inverse kinematics, zero where limbs cannot
+        reach.
         """
         internal = None
         if self.layout.n_internal:
@@ -399,13 +420,14 @@ class Machine:
         return limb_ends(self.layout, self.values, joints, T_base_platform, internal)
 
     def arms_at(self, joints: Array) -> tuple[Array, ...]:
-        """What carries each leg's end on the base at readings (..., m), for pictures; as
+        """Points along each leg's arm on the base at readings (..., m), for drawings; see
         :func:`~pkmcal.mechanisms.closure.skeletons`.
         """
-        shifted = joint_values(self.layout, self.values, joints)
-        return skeletons(self.layout, self.values, shifted)
+        motions = joint_values(self.layout, self.values, joints)
+        return skeletons(self.layout, self.values, motions)
 
     def _ends(self) -> tuple[Array, Array]:
+        """Ends of all limbs at mid-range readings, each in the frame of its body, (L, 3) m."""
         ends = limb_ends(self.layout, self.values, self.middle_readings(), np.eye(4))
         return np.array(ends.a), np.array(ends.b)
 
@@ -413,15 +435,15 @@ class Machine:
 def machine_from_document(
     document: MechanismDocument, where: Callable[..., str] | None = None
 ) -> Machine:
-    """Build a machine from a checked mechanism file.
+    """Machine from a validated mechanism file, with nominal values.
 
-    where : names a field's place in the file by its keys. Raises InputError for a drawing that
-    cannot be a machine's.
+    where : function that returns a field's location in the file from its keys.
+    Raises InputError if the nominal model is not a machine.
     """
     check_drawing(document, where)
     rows = list(_parameter_rows(document))
     ties = (*document.tied, *built_in_ties(document))
-    # a scale that is exact is held already
+    # exact scales are no parameters
     exact = not (scale_tolerances(document) > 0).any()
     held = [entry for entry in document.fixed if not (exact and entry.endswith("].scale"))]
     table = ParameterTable(
@@ -430,21 +452,21 @@ def machine_from_document(
         kinds=tuple(row.kind for row in rows),
         labels=tuple(row.label for row in rows),
         parts=tuple(row.part for row in rows),
-        drawing=np.array([row.drawing for row in rows]),
-        tolerance=np.array([row.tolerance for row in rows]),
+        drawing=np.array([row.nominal for row in rows]),
+        tolerance=np.array([row.prior_sigma for row in rows]),
     ).with_roles((*held, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(table.names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
 
 def with_exact_scales(document: MechanismDocument) -> MechanismDocument:
-    """The same drawing with readings that are what they say, or what their scales make of them."""
+    """Copy of a document in which all scales of readings are exact at their nominal values."""
     tolerance = document.tolerance.model_copy(update={"scale": 0.0})
     return document.model_copy(update={"tolerance": tolerance})
 
 
 def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
-    """Rows leg by leg; of a scale the tolerance is the one that its reading has."""
+    """Rows of the parameter table, leg by leg; a scale's prior sigma is that of its reading."""
     axes, scales = axes_in_use(document), scale_tolerances(document)
     usual = document.tolerance.model_dump()
     for j, leg in enumerate(document.legs):
@@ -454,12 +476,12 @@ def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
             kinds = carriers[node.joint].parameters + (
                 JOINT_AXIS_KINDS if (j, side) in axes else ()
             )
-            yield from _rows_of(f"{path}.{side}", node, kinds, usual)
+            yield from _part_rows(f"{path}.{side}", node, kinds, usual)
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET_KIND if isinstance(leg.length, ActuatedLength) else CONSTANT_LENGTH_KIND
-            yield from _rows_of(f"{path}.length", leg.length, (kind,), usual)
+            yield from _part_rows(f"{path}.length", leg.length, (kind,), usual)
         if scales[j] > 0:
-            yield from _rows_of(
+            yield from _part_rows(
                 path, leg, (READING_SCALE_KIND,), {READING_SCALE_KIND.tolerance: scales[j]}
             )
         for t, tube in enumerate(leg.tubes, start=1):
@@ -467,10 +489,10 @@ def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
             yield _Row(name, "m", "radius", label, "", tube.radius, usual["radius"])
 
 
-def _rows_of(
+def _part_rows(
     path: str, node: Any, kinds: tuple[ParameterKind, ...], tolerances: Mapping[str, float]
 ) -> Iterator[_Row]:
-    """Rows of one part: what its file gives, and not what is a constant."""
+    """Rows for the parameters of one part of a document; constants and absent values have none."""
     for kind in kinds:
         value = of_part(node, kind)
         if kind.tolerance and value is not None:
@@ -484,8 +506,8 @@ def _rows_of(
 
 
 def field_of(document: Any, name: str) -> tuple[Any, Any]:
-    """Where a parameter stands among a file's fields, at the path that is its name, such as
-    ``legs[1].base.center.x``: what holds it, and its key or index there.
+    """Container and key of a parameter among a file's fields, from its name, such as
+    ``legs[1].base.center.x``.
     """
     *keys, last = name.replace("]", "").replace("[", ".").split(".")
     node = document
@@ -494,7 +516,8 @@ def field_of(document: Any, name: str) -> tuple[Any, Any]:
     return node, "xyz".index(last) if isinstance(node, list) else last
 
 
-def _checked(values: Array, tail: tuple[int, ...], name: str) -> Array:
+def _finite_array(values: Array, tail: tuple[int, ...], name: str) -> Array:
+    """Finite array with trailing axes ``tail``; raises InputError."""
     array = np.asarray(values, dtype=float)
     if array.shape[-len(tail) :] != tail:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Which column of the readings moves which leg, over which range; what legs of one motor share."""
+"""Motors: which reading moves which leg, over which range, and what legs of one motor share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pkmcal.mechanisms.document import (
 
 
 def motor_columns(document: MechanismDocument) -> Integers:
-    """The reading's column of each leg, (L,); -1 for a leg without a reading.
+    """Column of each leg's reading, (L,); -1 for a leg without one.
 
     A leg that names no motor has the column after the last one in use.
     """
@@ -32,15 +32,15 @@ def motor_columns(document: MechanismDocument) -> Integers:
 
 
 def is_driven(leg: Leg) -> bool:
-    """Whether a reading belongs to the leg, of its rod's length or of its carrier's motion."""
+    """Whether the leg has a reading, of its rod's length or of its carrier's motion."""
     return isinstance(leg.length, ActuatedLength) or base_carriers()[leg.base.joint].driven
 
 
 def reading_range(leg: Leg) -> tuple[float, float]:
-    """Smallest and largest reading by the file, m or rad; NaN where it is silent.
+    """Smallest and largest reading of a leg by its file, m or rad; NaN if not stated.
 
-    A rod's ``range`` bounds its length, so the drawing's offset is taken off, and what is left is
-    told as the drawing's scale has it.
+    A rod's ``range`` bounds its length, so the nominal offset is subtracted, and the rest divided
+    by the nominal scale.
     """
     none = (np.nan, np.nan)
     length: Any = leg.length
@@ -51,7 +51,7 @@ def reading_range(leg: Leg) -> tuple[float, float]:
 
 
 def motor_ranges(document: MechanismDocument) -> Array:
-    """Ranges (m, 2) of the readings; legs on one motor narrow each other's."""
+    """Ranges (m, 2) of the readings, intersected over the legs of a motor."""
     columns = motor_columns(document)
     ranges = np.array([reading_range(leg) for leg in document.legs])
     out = np.full((columns.max(initial=-1) + 1, 2), np.nan)
@@ -62,7 +62,7 @@ def motor_ranges(document: MechanismDocument) -> Array:
 
 
 def motor_units(document: MechanismDocument) -> tuple[str, ...]:
-    """``m`` or ``rad`` of each reading: of a rod m, of a driven carrier its own."""
+    """Unit of each reading, ``m`` or ``rad``: m for rods, else the driven carrier's unit."""
     columns = motor_columns(document)
     out = ["m"] * (int(columns.max(initial=-1)) + 1)
     for leg, column in zip(document.legs, columns.tolist(), strict=True):
@@ -73,8 +73,10 @@ def motor_units(document: MechanismDocument) -> tuple[str, ...]:
 
 
 def scale_tolerances(document: MechanismDocument) -> Array:
-    """Standard deviation of each leg's reading's scale, (L,): the file's for all, or what the
-    reading's unit says; 0 where it is exact, and for a leg without a reading.
+    """Prior sigma of the scale of each leg's reading, (L,).
+
+    The file's, or the default for the reading's unit; 0 for exact scales and for legs without a
+    reading.
     """
     tolerance, columns = document.tolerance.scale, motor_columns(document)
     usual = [LEAD_TOLERANCE if unit == "m" else EXACT_TURNS for unit in motor_units(document)]
@@ -83,8 +85,8 @@ def scale_tolerances(document: MechanismDocument) -> Array:
 
 
 def bodies(document: MechanismDocument) -> Integers:
-    """On which body of an articulated platform each leg ends, (L,), counted in the order of their
-    numbers in the file; -1 where on the platform itself.
+    """Index of the body of an articulated platform on which each leg ends, (L,), in the order of
+    their numbers in the file; -1 for the platform itself.
     """
     fields = [platform_carriers()[leg.platform.joint].body for leg in document.legs]
     own = [
@@ -96,21 +98,22 @@ def bodies(document: MechanismDocument) -> Integers:
 
 
 def middles(document: MechanismDocument) -> Array:
-    """Mid-range reading of each leg, (L,); zero where the file is silent."""
+    """Mid-range reading of each leg, (L,); zero if not stated."""
     columns = motor_columns(document)
     middle = np.nan_to_num(motor_ranges(document).mean(axis=1))
     return np.where(columns >= 0, np.append(middle, 0.0)[columns], 0.0)
 
 
 Group = tuple[str, ...]
+"""Names of parameters that are tied."""
 
 
 def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
-    """Entries that change together.
+    """Groups of parameters that are equal by construction.
 
-    Legs on one motor turn about one axis and have one reading, whose scale is one; legs on one body
-    of the platform hang on one hinge. A
-    leg of a planar machine stays in its plane, so both of its ends have one height.
+    Legs on one motor share an axis and a reading, hence a scale; legs on one body of the platform
+    share a hinge. A leg of a planar machine stays in its plane, so both of its ends have one
+    height.
     """
     shared = tuple(
         tuple(f"legs[{j + 1}].{side}.{field}" for j in legs)
@@ -129,7 +132,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
 
 
 def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
-    """Entries that are no unknowns: what leaves a planar machine's plane."""
+    """Parameters fixed by construction: those that would leave a planar machine's plane."""
     if document.motion not in PLANAR_MOTIONS:
         return ()
     return tuple(
@@ -141,8 +144,8 @@ def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
 
 
 def sharing(document: MechanismDocument) -> Iterator[tuple[str, tuple[int, ...], tuple[str, ...]]]:
-    """Sides with the legs (from 0) that stand on one motor, or on one body of the platform, and
-    what they share.
+    """Groups of legs (from 0) on one motor, or on one body of the platform, as
+    (side, legs, fields shared).
     """
     columns = motor_columns(document)
     for column in range(columns.max(initial=-1) + 1):

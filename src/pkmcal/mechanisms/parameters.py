@@ -1,8 +1,8 @@
-"""A machine's parameters: names, units, drawing values, tolerances, and which are free.
+"""Parameters of a machine: names, units, nominal values, prior sigmas, and which are free.
 
-A parameter's name is its path in the mechanism file: ``legs[1].base.center.z``. Legs are
-counted from 1, as people do. The estimator works on the free vector z; a tie makes several
-parameters move together and an axis has two turns, so values = drawing + M z, M constant.
+A parameter's name is its path in the mechanism file, ``legs[1].base.center.z``, with legs counted
+from 1. The estimator works on the vector z of free unknowns. A tie makes several parameters change
+together, and an axis has two rotations, so values = nominal values + M z with a constant matrix M.
 """
 
 from __future__ import annotations
@@ -17,24 +17,26 @@ from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 
 EVERY_LEG = "legs[*]"
+"""Beginning of an entry that stands for all legs."""
 PARALLEL_AXES_TOLERANCE = 1e-9
-"""Axes whose components differ by less are one direction in the drawing."""
+"""Largest difference between components of parallel axes in the nominal model."""
 
 
 @dataclass(frozen=True)
 class ParameterTable:
-    """Every parameter of a machine, in one order.
+    """All parameters of a machine, in a fixed order.
 
-    names, units, kinds : P entries; units are m, rad, 1 of a direction's components and nothing of
-    a ratio; ``kinds`` is the tolerance's name: center, offset, radius,
-    axis, arm, angle, scale. labels : what people call them, the leg apart: ``base centre z``.
-    parts : what of its leg each changes: its ``base`` or ``platform`` joint, its ``rod``, the
-    ``zero`` or the ``lead`` of its reading, or what its carrier names; empty for a tube's radius,
-    which is no part of the mechanism.
-    drawing, tolerance : (P,) drawing values and their standard deviations.
-    fixed : names that keep their drawing value.
-    tied : groups of names that change by the same amount. opposed : for each group, the names that
-    change by its opposite.
+    names, units, kinds : P entries. Units are m, rad, 1 for components of directions, empty for
+        ratios. ``kinds`` are names of prior sigmas: center, offset, radius, axis, arm, angle,
+        scale.
+    labels : names for people, without the leg: ``base centre z``.
+    parts : part of the leg that a parameter changes: its ``base`` or ``platform`` joint, its
+        ``rod``, the ``zero`` or the ``lead`` of its reading, or a part named by its carrier; empty
+        for a tube's radius, which is no part of the mechanism.
+    drawing, tolerance : (P,) nominal values and their prior sigmas.
+    fixed : names that keep their nominal value.
+    tied : groups of names that change by the same amount.
+    opposed : for each group, the names that change by the opposite amount.
     """
 
     names: tuple[str, ...]
@@ -54,7 +56,7 @@ class ParameterTable:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """Position of a parameter; an InputError names the closest one otherwise."""
+        """Index of a parameter; raises InputError with the closest name."""
         try:
             return self.names.index(name)
         except ValueError:
@@ -66,22 +68,25 @@ class ParameterTable:
             ) from None
 
     def in_words(self, name: str) -> str:
-        """A parameter's name for people: ``leg 3 base centre z``."""
+        """Name of a parameter for people: ``leg 3 base centre z``."""
         leg = name.partition("]")[0].removeprefix("legs[")
         return f"leg {leg} {self.labels[self.index(name)]}"
 
     def with_roles(
         self, fixed: tuple[str, ...] = (), tied: tuple[tuple[str, ...], ...] = ()
     ) -> ParameterTable:
-        """The same table with other fixed and tied parameters; all names are checked.
+        """Copy with other fixed and tied parameters; all names are checked.
 
-        ``legs[1].base.axis`` and ``legs[1].base.center`` mean all their components, ``legs[*]``
-        all legs that have the rest, and a name after ``-`` in a tie changes by the opposite. Of an
-        axis a single component can be held where the drawing has it at zero: the axis then turns
-        square to it. Otherwise it is one direction.
+        ``legs[1].base.axis`` and ``legs[1].base.center`` stand for all their components,
+        ``legs[*]`` for all legs that have the rest of the path, and a name after ``-`` in a tie
+        changes by the opposite. A single component of an axis can be fixed only if its nominal
+        value is zero: the axis then rotates orthogonally to it. Otherwise the axis is fixed as a
+        whole.
         """
-        fixed = tuple(n for entry in fixed for e in self._of_all(entry) for n in self._members(e))
-        groups = [part for group in tied for part in self._together(group)]
+        fixed = tuple(
+            n for entry in fixed for e in self._for_all_legs(entry) for n in self._members(e)
+        )
+        groups = [part for group in tied for part in self._component_ties(group)]
         return replace(
             self,
             fixed=fixed,
@@ -89,24 +94,26 @@ class ParameterTable:
             opposed=tuple(tuple(name for name, sign in part if sign < 0) for part in groups),
         )
 
-    def _of_all(self, entry: str) -> tuple[str, ...]:
-        """The entries that one with ``legs[*]`` stands for."""
+    def _for_all_legs(self, entry: str) -> tuple[str, ...]:
+        """Entries for which an entry with ``legs[*]`` stands."""
         if EVERY_LEG not in entry:
             return (entry,)
         first, _, rest = entry.partition(EVERY_LEG)
         legs = dict.fromkeys(n[: n.index("]") + 1] for n in self.names)
-        every = [f"{leg}{rest}" for leg in legs if self._whole(f"{leg}{rest}")]
+        every = [f"{leg}{rest}" for leg in legs if self._components(f"{leg}{rest}")]
         if first or not every:
-            self.index(entry)  # says what a name looks like
+            self.index(entry)  # raises the error about a name
         return tuple(every)
 
-    def _whole(self, entry: str) -> tuple[str, ...]:
-        """The names that an entry stands for, empty where it is none's."""
+    def _components(self, entry: str) -> tuple[str, ...]:
+        """Names of the parameters that an entry stands for, possibly none."""
         return tuple(n for n in self.names if n == entry or n.startswith(f"{entry}."))
 
     def _members(self, entry: str) -> tuple[str, ...]:
-        """The names that an entry under ``fixed`` means."""
-        whole = self._whole(entry)
+        """Names of the parameters that an entry under ``fixed`` or ``tied`` stands for; raises
+        InputError.
+        """
+        whole = self._components(entry)
         if len(whole) > 1:
             return whole
         k = self.index(entry)
@@ -117,14 +124,14 @@ class ParameterTable:
             )
         return (entry,)
 
-    def _together(self, group: tuple[str, ...]) -> list[list[tuple[str, int]]]:
-        """The ties that a group means, names with signs: of whole centres or axes, component by
-        component.
+    def _component_ties(self, group: tuple[str, ...]) -> list[list[tuple[str, int]]]:
+        """Ties that a group stands for, as names with signs; whole centres or axes are tied
+        component by component.
         """
         entries = [
             (e, -1 if entry.startswith("-") else 1)
             for entry in group
-            for e in self._of_all(entry.removeprefix("-"))
+            for e in self._for_all_legs(entry.removeprefix("-"))
         ]
         members = [[(name, sign) for name in self._members(e)] for e, sign in entries]
         axes = {self.kinds[self.index(m[0][0])] == "axis" for m in members}
@@ -136,13 +143,14 @@ class ParameterTable:
         elif len({name for m in members for name, _ in m}) < sum(len(m) for m in members):
             what = "a parameter is tied to itself"
         if what:
-            value = ", ".join(group)
-            raise InputError(what, found=value, expected="entries of one kind, each once")
+            text = ", ".join(group)
+            raise InputError(what, found=text, expected="entries of one kind, each once")
         if True in axes:
             self._check_parallel(group, members)
         return [list(tie) for tie in zip(*members, strict=True)]
 
     def _check_parallel(self, group: tuple[str, ...], members: list[list[tuple[str, int]]]) -> None:
+        """Check that tied axes are whole and parallel in the nominal model."""
         axes = np.array([[s * self.drawing[self.index(n)] for n, s in m] for m in members])
         if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL_AXES_TOLERANCE:
             raise InputError(
@@ -153,16 +161,19 @@ class ParameterTable:
 
     @cached_property
     def axes(self) -> Integers:
-        """Positions (n, 3) of the axes' components."""
+        """Indices (n, 3) of the axes' components."""
         return np.flatnonzero(np.array(self.kinds, dtype=object) == "axis").reshape(-1, 3)
 
     @cached_property
     def _free(self) -> Array:
+        """Matrix M of :meth:`free_matrix`, cached."""
         owner, sign = self._owners()
         fixed = [self.index(name) for name in self.fixed]
+        # One column for each group of tied parameters that is not fixed, axes apart.
         still = {owner[k] for k in fixed if self.kinds[k] != "axis"}
         plain = [k for k in np.unique(owner) if k not in still and self.kinds[k] != "axis"]
         matrix = (owner[:, None] == np.array(plain, dtype=int)[None, :]) * sign[:, None]
+        # Up to two columns for each group of tied axes.
         tangents = [
             self._tangent(np.flatnonzero(owner == axis[0]), sign, fixed)
             for axis in self.axes
@@ -171,9 +182,9 @@ class ParameterTable:
         return np.concatenate([matrix.astype(float), *tangents], axis=1)
 
     def _owners(self) -> tuple[Integers, Array]:
-        """The first parameter that each one moves together with, (P,), and the sign, (P,).
+        """First parameter with which each one changes, (P,), and the sign, (P,).
 
-        A name in two ties makes one of them.
+        Ties with a common name are merged.
         """
         owner, sign = np.arange(len(self)), np.ones(len(self))
         opposed = self.opposed or ((),) * len(self.tied)
@@ -185,6 +196,7 @@ class ParameterTable:
                 raise InputError(
                     what="a parameter is tied to its own opposite", found=", ".join(group)
                 )
+            # Merge the groups into the first one's, with signs relative to it.
             first = min(turn)
             for root, flip in turn.items():
                 joined = owner == root
@@ -193,10 +205,11 @@ class ParameterTable:
         return owner, sign
 
     def _tangent(self, first: Integers, sign: Array, fixed: list[int]) -> Array:
-        """Columns (P, 0 to 2): turns of the axes whose x components stand at ``first``.
+        """Columns (P, 0 to 2): rotations of tied axes whose x components are at ``first``.
 
-        Components that are held leave only the turn that is square to them.
+        Fixed components leave only the rotation orthogonal to them.
         """
+        # Orthogonal complement of the axis and the fixed components.
         axis = self.drawing[first[0] : first[0] + 3]
         held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
         span = np.array([axis, *held])
@@ -208,16 +221,17 @@ class ParameterTable:
         return out
 
     def free_matrix(self) -> Array:
-        """M (P, n_free) with values = drawing + M z: one column a free parameter or tie.
+        """Matrix M (P, n_free) with values = nominal values + M z: one column for each free
+        parameter or tie.
 
-        An axis has two: its turns (rad), so its components stay on the tangent plane of the
-        drawing's axis, where no length is free (see :meth:`on_tangents`).
+        An axis has two columns, its rotations (rad). Its components stay on the tangent plane at
+        the nominal axis, where the length is not free (see :meth:`on_tangents`).
         """
         return self._free.copy()
 
     def on_tangents(self, values: Array) -> Array:
-        """The same machine with each axis made as long as it must be to end on the tangent plane
-        of the drawing's; values (..., P). Directions do not change.
+        """Values (..., P) with each axis rescaled to end on the tangent plane at the nominal axis.
+        Directions do not change.
         """
         if not self.axes.size:
             return values
@@ -228,42 +242,44 @@ class ParameterTable:
         return out
 
     def to_free(self, values: Array) -> Array:
-        """Z (..., n_free) of values (..., P); what is fixed or tied otherwise is left out."""
+        """Free unknowns z (..., n_free) of values (..., P) by least squares; deviations from fixed
+        or tied parameters are dropped.
+        """
         change = self.on_tangents(values) - self.drawing
         return change @ np.linalg.pinv(self._free).T
 
     def first_of_free(self) -> Integers:
-        """Position (n_free,) of a parameter that each free unknown moves, the most of all."""
+        """Index (n_free,) of the parameter that each free unknown changes most."""
         return np.argmax(np.abs(self._free), axis=0)
 
     def tolerances_free(self) -> Array:
-        """The drawing's standard deviation of each free unknown, (n_free,)."""
+        """Prior sigma of each free unknown, (n_free,)."""
         return self.tolerance[self.first_of_free()]
 
     def free_names(self) -> tuple[str, ...]:
-        """A name for each free unknown; an axis' turns are numbered."""
-        names, names_so_far = list[str](), dict[str, int]()
+        """Name of each free unknown; rotations of an axis are numbered."""
+        names, counts = list[str](), dict[str, int]()
         for k in self.first_of_free():
             name = self.names[k]
             if self.kinds[k] == "axis":
                 whole = self.names[self.axes[np.any(self.axes == k, axis=1)][0, 0]]
                 whole = whole.rpartition(".")[0]
-                names_so_far[whole] = names_so_far.get(whole, 0) + 1
-                name = f"{whole} ({names_so_far[whole]})"
+                counts[whole] = counts.get(whole, 0) + 1
+                name = f"{whole} ({counts[whole]})"
             names.append(name)
         return tuple(names)
 
     def unit_axes(self, values: Array) -> Array:
-        """Values (..., P) with axes of length one, as files have them."""
+        """Values (..., P) with axes of unit length, as in files."""
         if not self.axes.size:
             return values
         out = np.array(values, dtype=float)
         axis = out[..., self.axes]
         size = np.linalg.norm(axis, axis=-1, keepdims=True)
-        # a unit axis stays what it is, to the last digit
+        # unit axes stay unchanged to the last digit
         out[..., self.axes] = axis / np.where(np.abs(size - 1) < 1e-15, 1.0, size)
         return out
 
     def of_kind(self, kind: str) -> Integers:
-        """Positions of the parameters whose tolerance is ``kind``."""
+        """Indices of the parameters whose prior sigma is ``kind``."""
         return np.flatnonzero(np.array(self.kinds) == kind)

@@ -1,7 +1,7 @@
-"""Mistakes in a table of joint readings, as transformations of the readings.
+"""Hypotheses about mistakes in a table of joint readings, as transformations of the readings.
 
-Boards and trackers weigh these hypotheses by the misfit of platform poses, images by the likelihood
-of edges; the list is one.
+Board and tracker poses compare these hypotheses by their misfit, images by the likelihood of edges;
+the list of hypotheses is the same.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ import numpy as np
 from pkmcal.arrays import Array
 
 RANGE_MARGIN = 0.05
-"""Part of a stroke by which a reading may leave its range: homing shifts a range by the offset's
-tolerance."""
+"""Margin of a reading beyond its range, as a share of the stroke: homing shifts a range by the
+prior sigma of the offset."""
 CONSTANTS_IN_A_STROKE = 16
-"""Constants that are tried for a reversed motor in one stroke. One that is half a step off moves
-the platform by a thirtieth of the stroke, a tenth of what the reversed readings do."""
+"""Constants tried for a reversed motor in one stroke. The nearest is at most half a step off, which
+moves the platform by a thirtieth of the stroke, a tenth of the effect of reversed readings."""
 
 
 @dataclass(frozen=True)
 class ReadingHypothesis:
-    """Readings (K, m) that a session may have in place of its own.
+    """Readings (K, m) that may be the true ones of a session.
 
-    motors : columns that differ. constant : of a reversed motor, the sum (m or rad) of a reading
-    and the joint value that it stands for; 0 is a wrong sign alone.
+    motors : columns that differ.
+    constant : for a reversed motor, the sum (m or rad) of a reading and its true value; 0 for a
+        wrong sign alone.
     """
 
     code: Literal["readings.reversed", "readings.exchanged", "readings.renumbered"]
@@ -37,18 +38,19 @@ class ReadingHypothesis:
 
 
 def reversed_motor(joints: Array, motor: int, constant: float) -> ReadingHypothesis:
-    """Readings (K, m) of which one motor counts the other way."""
+    """Readings (K, m) with one motor reversed."""
     turned = joints.copy()
     turned[:, motor] = constant - joints[:, motor]
     return ReadingHypothesis("readings.reversed", (motor,), turned, constant)
 
 
 def reversed_motors(joints: Array, ranges: Array) -> list[list[ReadingHypothesis]]:
-    """For each motor the constants with which its reversed readings are in range, a wrong sign
-    alone first where that is one of them; an empty list where none is.
+    """Hypotheses for each motor: reversed readings with constants that put them into range.
 
-    joints : (K, m). ranges : (m, 2) smallest and largest reading, NaN where not known: then a wrong
-    sign alone.
+    joints : (K, m).
+    ranges : (m, 2) smallest and largest reading, NaN if unknown.
+    Returns a list for each motor. The wrong sign alone comes first if these readings are in range;
+    for an unknown range it is the only hypothesis. The list is empty if no constant is possible.
     """
     out: list[list[ReadingHypothesis]] = []
     for motor, (low, high) in enumerate(ranges):
@@ -67,7 +69,7 @@ def reversed_motors(joints: Array, ranges: Array) -> list[list[ReadingHypothesis
 
 
 def exchanged_motors(joints: Array) -> list[ReadingHypothesis]:
-    """Readings (K, m) of two motors exchanged, every pair."""
+    """Readings (K, m) with two motors exchanged, for every pair."""
     out: list[ReadingHypothesis] = []
     for one, other in combinations(range(joints.shape[1]), 2):
         order = np.arange(joints.shape[1])

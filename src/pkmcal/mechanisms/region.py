@@ -1,4 +1,4 @@
-"""The part of a workspace that somebody cares for, and poses spread evenly over it."""
+"""Region of interest in a workspace, and poses spread evenly over it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from pkmcal.mechanisms.workspace import (
 RegionSide = tuple[float, float]
 REGION_AXES = ("x", "y", "z")
 TRIES_A_WANTED_POSE = 200
-"""Poses tried for each one wanted, at most: where the machine can take fewer than one in so many,
-fewer are found."""
+"""Most candidate poses for each pose wanted; if the machine can take a smaller share, fewer poses
+are returned."""
 CROOKED_PATH_SHARE = 0.02
-"""Of the longest way: less is no way of its own, but what crooked axes let a platform do."""
+"""Share of the longest path below which a direction does not count as a freedom: misaligned axes
+allow small movements."""
 AT_LEAST = 5000
-"""Poses tried before a region counts as out of reach."""
+"""Fewest candidate poses before a region counts as out of reach."""
 REGION_POSES_AT_ONCE = 4096
-"""Poses at a time, at most."""
+"""Most candidate poses in one batch."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A box of positions of the platform's origin, and how far it turns there.
+    """Box of positions of the platform's origin, with a largest rotation.
 
-    x, y, z : lowest and highest coordinate in the base frame, m; None for as far as the machine
-    comes. turn : largest turn from home's orientation about any axis that the motion has, rad. None
-    for no turn; but where constant rods or axes let the platform not move in all of its motion's
-    directions without turning (a 3-RPS), for as far as it comes.
-    Raises InputError for sides that are no intervals and a turn that is none.
+    x, y, z : lowest and highest coordinate in the base frame, m; None for the machine's full reach.
+    turn : largest rotation from home's orientation about any axis of the motion, rad. None for no
+        rotation; but if constant rods or axes do not allow all translations without rotation (a
+        3-RPS), for the machine's full reach.
+    Raises InputError for invalid intervals or rotations.
     """
 
     x: RegionSide | None = None
@@ -65,12 +66,12 @@ class Region:
 
     @property
     def sides(self) -> tuple[RegionSide | None, RegionSide | None, RegionSide | None]:
-        """x, y and z."""
+        """Intervals of x, y and z."""
         return self.x, self.y, self.z
 
     def holds(self, limits: Limits, poses: Array) -> Booleans:
-        """Which of the poses (..., 4, 4) are in the region, to a micrometre and a microradian;
-        whether the machine can take them is not asked.
+        """Whether poses (..., 4, 4) are in the region, to a micrometre and a microradian, reachable
+        or not.
         """
         out = np.ones(poses.shape[:-2], dtype=bool)
         for k, side in enumerate(self.sides):
@@ -97,8 +98,10 @@ class Region:
 
 @dataclass(frozen=True)
 class Within:
-    """What of a region a machine comes near to, from home: low, high (3,) corners of a box, m, and
-    the largest turn, rad.
+    """Part of a region near which the machine can move from home.
+
+    low, high : (3,) corners of a box, m.
+    turn : largest rotation, rad.
     """
 
     low: Array
@@ -107,10 +110,11 @@ class Within:
 
 
 def within_reach(limits: Limits, region: Region) -> Within:
-    """The box and the turn within which poses of the region are looked for.
+    """Box and rotation in which poses of the region are searched.
 
-    Sides that the region names, as far as straight ways from home come near them without turning.
-    Raises InputError where the region lies beyond them, or home is no pose of the machine.
+    The region's intervals, intersected with the reach of straight paths from home without rotation.
+    Raises InputError if the region is beyond this reach, or if the machine cannot take the home
+    pose.
     """
     free = np.eye(3)[limits.layout.free[3:]]
     low = high = limits.home[:3, 3]
@@ -134,31 +138,38 @@ def within_reach(limits: Limits, region: Region) -> Within:
             low[k], high[k] = np.clip((low[k], high[k]), *side)
     if region.turn is not None:
         return Within(low, high, region.turn)
-    return Within(low, high, _turn(limits) if moves < len(free) else 0.0)
+    if moves == len(free):
+        return Within(low, high, 0.0)
+    # Translation needs rotation: as far as the platform rotates at home about any axis.
+    axes = np.eye(6)[:3][limits.layout.free[:3]]
+    turns = extents(limits, np.concatenate([axes, -axes]), limits.home).distance
+    return Within(low, high, float(turns.max()))
 
 
 def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array:
-    """Poses T_base_platform (n, 4, 4) spread evenly over what the machine can take of a region.
+    """Poses T_base_platform (n, 4, 4), spread evenly over the reachable part of a region.
 
-    n is ``count``, or less where the machine can take fewer than one in two hundred of the poses
-    about home. seed : shifts the sequence; the same gives the same poses. Of machines whose rods
-    and axes hold some freedoms, the nearest poses that they allow.
-    Raises InputError where the machine can take none of them.
+    n is ``count``, or less if the machine can take less than one in two hundred of the candidates.
+    For machines whose rods and axes constrain some freedoms, candidates are projected to the
+    nearest admissible poses.
+
+    seed : shifts the sequence of candidates; equal seeds give equal poses.
+    Raises InputError if the machine can take none of the candidates.
     """
     within = within_reach(limits, region)
-    retained: list[Array] = []
-    value = tried = 0
+    batches: list[Array] = []
+    accepted = tried = 0
     most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
-    while value < count and tried < most:
+    while accepted < count and tried < most:
         more = min(max(count, tried), REGION_POSES_AT_ONCE)
-        poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
+        poses = _candidate_poses(limits, within, np.arange(tried, tried + more), seed)
         closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
         poses = poses[reachable(limits, poses).inside]
-        retained.append(poses)
-        value, tried = value + len(poses), tried + more
-    if not value:
+        batches.append(poses)
+        accepted, tried = accepted + len(poses), tried + more
+    if not accepted:
         home = ", ".join(f"{x:.0f}" for x in np.round(1e3 * limits.home[:3, 3]) + 0.0)
         raise InputError(
             what="the machine can take no pose of the workspace that was asked for",
@@ -166,20 +177,14 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
             expected=f"a part of the machine's own, which is about home, [{home}] mm",
             next_step="widen the workspace, or check the ranges in the mechanism file",
         )
-    return np.concatenate(retained)[:count]
+    return np.concatenate(batches)[:count]
 
 
-def _turn(limits: Limits) -> float:
-    """How far the platform turns at home about any axis of its motion, rad."""
-    axes = np.eye(6)[:3][limits.layout.free[:3]]
-    return float(extents(limits, np.concatenate([axes, -axes]), limits.home).distance.max())
+def _candidate_poses(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:
+    """Members of a low-discrepancy sequence of poses in the box, (n, 4, 4), by their indices.
 
-
-def _candidates(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:
-    """Members of an evenly spread sequence of poses in the box, (n, 4, 4), by their numbers.
-
-    Additive recurrence with the powers of the generalised golden ratio, the root of
-    phi^(d + 1) = phi + 1 (Roberts 2018).
+    Additive recurrence with powers of the generalised golden ratio, the root of phi^(d + 1) = phi +
+    1 (Roberts 2018).
     """
     axes = np.flatnonzero(limits.layout.free[:3]) if within.turn else np.zeros(0, dtype=int)
     d = 3 + len(axes)
@@ -190,7 +195,7 @@ def _candidates(limits: Limits, within: Within, numbers: Integers, seed: int) ->
     delta[:, 3:] = within.low + unit[:, :3] * (within.high - within.low) - limits.home[:3, 3]
     if len(axes) == 1:
         delta[:, axes[0]] = within.turn * (2 * unit[:, 3] - 1)
-    elif len(axes):  # evenly in a ball of rotation vectors
+    elif len(axes):  # uniform in a ball of rotation vectors
         height, angle = 2 * unit[:, 3] - 1, 2 * np.pi * unit[:, 4]
         flat = np.sqrt(1 - height**2)
         direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=-1)

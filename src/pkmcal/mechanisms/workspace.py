@@ -1,8 +1,9 @@
-"""Which poses a machine can take, and why not the others; how far it reaches; along which paths.
+"""Workspace: reachable poses with the obstacles elsewhere, extents along directions, sections, and
+paths.
 
-A pose belongs to the workspace where every limb reaches, every reading is in its range, the
-constant rods, the joints' axes and the file's motion allow it, no singular pose is near, and the
-determinant has home's sign (:mod:`pkmcal.mechanisms.velocities`).
+A pose is in the workspace if every limb reaches it, every reading is in range, constant rods,
+joints' axes and the file's motion allow it, no singular pose is near, and the determinant has
+home's sign (:mod:`pkmcal.mechanisms.velocities`).
 """
 
 from __future__ import annotations
@@ -31,14 +32,18 @@ from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import sign_of
 
 ALLOWED_CONSTRAINT_ERROR = 1e-6
-"""What the constant rods and axes must close to, m, and the motion, m and rad: more than rounding
-of a pose in a file, less than any drive's step."""
+"""Largest violation of constant rods and axes, m, and of the motion, m and rad: above the rounding
+of a pose in a file, below any drive's step."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """A machine with its limits: theta (P,), ranges (m, 2) of the readings, NaN where there is
-    none, their units, and home (4, 4), whose assembly is meant.
+    """Machine with the limits of its workspace.
+
+    theta : (P,).
+    ranges : (m, 2) of the readings, NaN if unlimited.
+    units : of the readings.
+    home : (4, 4), whose assembly mode is used.
     """
 
     layout: LimbLayout
@@ -51,8 +56,9 @@ class Limits:
 
     @cached_property
     def at_home(self) -> tuple[float, float]:
-        """Home's sign and the singularity that counts as near: a machine that is weak at home is
-        not refused everywhere for it.
+        """Sign of the determinant at home, and the singularity measure below which a pose is
+        singular. The latter is at most half of home's, so a machine that is weak at home is not
+        refused everywhere.
         """
         scaled = scaled_rows(closure_at(self.layout, self.theta, self.home))
         least = 0.5 * float(singularity_of(self.layout, scaled))
@@ -61,14 +67,17 @@ class Limits:
 
 @dataclass(frozen=True)
 class Reach:
-    """What stands against each of the poses (...,); see :meth:`why`.
+    """Obstacles to poses (...,); in words by :meth:`why`.
 
-    readings : (..., m), NaN where the motor's limb cannot reach: ``lost`` (..., m).
-    too_short, too_long : (..., m) readings below and above their range.
-    off : (...) how far what no motor moves is from closing, m; ``forbidden`` (...) where that is
-        more than a micrometre, or the pose leaves the file's motion.
-    singularity : (...) the measure of forward kinematics; ``singular`` (...) where it is too small.
-    crossed : (...) the determinant has not home's sign: a singular pose lies between.
+    readings : (..., m), NaN if the motor's limb cannot reach.
+    lost : (..., m) whether the motor's limb cannot reach.
+    too_short, too_long : (..., m) whether the reading is below or above its range.
+    off : (...) closure error of the rows that no motor moves, m.
+    forbidden : (...) whether ``off`` is more than a micrometre, or the pose is outside the file's
+        motion.
+    singularity : (...) as in forward kinematics.
+    singular : (...) whether it is too small.
+    crossed : (...) whether the determinant's sign differs from home's: a singular pose is between.
     """
 
     readings: Array
@@ -86,15 +95,19 @@ class Reach:
 
     @property
     def inside(self) -> Booleans:
-        """(...) whether the machine can take the pose, as far as these conditions tell."""
+        """Whether the machine can take each pose (...), by these conditions."""
         motors = (self.lost | self.too_short | self.too_long).any(axis=-1)
         return ~(motors | self.forbidden | self.singular | self.crossed)
 
     def why(self, *pose: int) -> tuple[str, ...]:
-        """In words what stands against one pose, by its place in the batch; () for none."""
-        words = [text for j, u in enumerate(self.limits.units) for text in self._motor(pose, j, u)]
+        """Obstacles to one pose, by its index in the batch, as text; empty for none."""
+        words = [
+            text
+            for j, u in enumerate(self.limits.units)
+            for text in self._motor_obstacles(pose, j, u)
+        ]
         if self.forbidden[pose]:
-            words.append(self._forbidden(pose))
+            words.append(self._constraint_obstacle(pose))
         if self.singular[pose]:
             words.append(
                 f"the pose is singular or nearly so: {float(self.singularity[pose]):.2g}, where at"
@@ -104,7 +117,8 @@ class Reach:
             words.append("the pose lies beyond a singular one, in another assembly than home")
         return tuple(words)
 
-    def _motor(self, pose: tuple[int, ...], motor: int, unit: str) -> list[str]:
+    def _motor_obstacles(self, pose: tuple[int, ...], motor: int, unit: str) -> list[str]:
+        """Obstacle at one motor as text, in a list of at most one."""
         at, (low, high) = (*pose, motor), self.limits.ranges[motor]
         if self.lost[at]:
             return [f"the limb of motor {motor + 1} cannot reach"]
@@ -119,7 +133,8 @@ class Reach:
             where = f"above its range, which ends at {end:.4g} {unit}"
         return [f"motor {motor + 1} would stand at {reading:.4g} {unit}, {where}"]
 
-    def _forbidden(self, pose: tuple[int, ...]) -> str:
+    def _constraint_obstacle(self, pose: tuple[int, ...]) -> str:
+        """Obstacle by constraints as text."""
         off = float(self.off[pose])
         if off > ALLOWED_CONSTRAINT_ERROR:
             return (
@@ -130,14 +145,14 @@ class Reach:
 
 
 def reachable(limits: Limits, poses: Array) -> Reach:
-    """What stands against poses T_base_platform (..., 4, 4)."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # a platform's joint on a base joint
+    """Check poses T_base_platform (..., 4, 4) against the limits."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a joint B on its A
         c = closure_at(limits.layout, limits.theta, poses)
-        remainder = undriven(c)[0]
+        residual = undriven(c)[0]
     readings, scaled = c.readings, scaled_rows(c)
     singularity = singularity_of(limits.layout, scaled)
     lost = np.isnan(readings)
-    off = np.where(lost.any(axis=-1), 0.0, np.abs(remainder).max(axis=-1, initial=0.0))
+    off = np.where(lost.any(axis=-1), 0.0, np.abs(residual).max(axis=-1, initial=0.0))
     sign, least = limits.at_home
     own = sign_of(scaled)
     return Reach(
@@ -146,7 +161,7 @@ def reachable(limits: Limits, poses: Array) -> Reach:
         too_short=readings < limits.ranges[:, 0],
         too_long=readings > limits.ranges[:, 1],
         off=off,
-        forbidden=(off > ALLOWED_CONSTRAINT_ERROR) | _elsewhere(limits, poses),
+        forbidden=(off > ALLOWED_CONSTRAINT_ERROR) | _outside_motion(limits, poses),
         singularity=singularity,
         singular=~lost.any(axis=-1) & ~(singularity >= least),
         crossed=own * sign < 0,
@@ -154,20 +169,23 @@ def reachable(limits: Limits, poses: Array) -> Reach:
     )
 
 
-def _elsewhere(limits: Limits, poses: Array) -> Booleans:
-    """Whether poses (..., 4, 4) leave the motion that the file names."""
+def _outside_motion(limits: Limits, poses: Array) -> Booleans:
+    """Whether poses (..., 4, 4) are outside the motion that the file states."""
     held = ~limits.layout.free
     if not held.any():
         return np.zeros(poses.shape[:-2], dtype=bool)
-    shifted = np.abs(pose_difference(poses, limits.home)[..., held])
-    return np.asarray(shifted.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
+    deviation = np.abs(pose_difference(poses, limits.home)[..., held])
+    return np.asarray(deviation.max(axis=-1) > ALLOWED_CONSTRAINT_ERROR)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How finely the ends of ways are looked for. steps : poses along a way before the bisection;
-    what is narrower is not seen. halvings : of the bisection. newton : steps that bring a pose
-    where rods and axes allow it. rounds : how often it is then moved on, as far as it was.
+    """Resolution of the search for extents.
+
+    steps : poses along a path before the bisection; narrower gaps are missed.
+    halvings : steps of the bisection.
+    newton : steps of the projection onto admissible poses.
+    rounds : corrections along the direction for the distance that the projection took away.
     """
 
     steps: int = 100
@@ -177,23 +195,24 @@ class Effort:
 
 
 FINE_EFFORT = Effort()
+"""Default resolution."""
 ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
-"""For a box about the workspace."""
+"""Resolution for a bounding box of the workspace."""
 PATH_POSES_AHEAD = 8
-"""Poses of each way at a time."""
+"""Poses of each path in one batch."""
 PATH_DISTANCE_SHARE = 0.99
-"""Share of the way asked for that must be left when constant rods and axes had their say."""
+"""Share of the wanted distance that must remain after projection onto constant rods and axes."""
 GRID_POSES_AT_ONCE = 20_000
-"""Poses of a grid at a time."""
+"""Poses of a grid in one batch."""
 
 
 @dataclass(frozen=True)
 class Extents:
-    """How far each of k directions leads.
+    """Extents of the workspace along k directions.
 
-    distance : (k,) in units of the direction: m for three numbers, which are made a unit vector.
-    poses : (k, 4, 4) the last that the machine can take. why : what stands against the next, of
-    each direction; () where the end of the search was reached.
+    distance : (k,) in units of the direction; m for three numbers, which are normalised.
+    poses : (k, 4, 4) last reachable pose.
+    why : obstacles to the next pose, for each direction; empty if the search reached its end.
     """
 
     distance: Array
@@ -203,13 +222,13 @@ class Extents:
 
 @dataclass(frozen=True)
 class Grid:
-    """Positions on a grid with one orientation.
+    """Workspace on a grid of positions with one orientation.
 
-    axes : the coordinates along each direction, m from the middle pose, (a,) (b,) and, of a
-        volume, (c,).
-    inside : (a, b[, c]) poses that the machine can take and that hang together with the middle
-        pose through neighbours on the grid. singularity : of the same shape, NaN out of reach.
-    size : area (m^2) or volume (m^3) of what is inside, cells counted.
+    axes : coordinates along each direction, m from the middle pose, (a,) (b,) and, for a volume,
+        (c,).
+    inside : (a, b[, c]) reachable poses that are connected to the middle pose through neighbours.
+    singularity : (a, b[, c]), NaN out of reach.
+    size : area (m^2) or volume (m^3) inside, by counting cells.
     """
 
     axes: tuple[Array, ...]
@@ -225,14 +244,17 @@ def extents(
     most: float | None = None,
     effort: Effort = FINE_EFFORT,
 ) -> Extents:
-    """How far one comes from ``start`` (4, 4) along straight ways, until something stands against
-    it: a range, a limb's reach, a singular pose.
+    """Distances from ``start`` (4, 4) along straight paths to the first obstacle: a range, a limb's
+    reach, a singular pose.
 
-    directions : (k, 3) along the base's axes, or (k, 6) twists (omega, tau): then distances count
-    in them, a twist of 1 rad about an axis in rad. most : where the search ends, in the same units;
-    when absent half a turn or twice a rod's length, whichever comes first. On machines whose rods
-    and axes hold some freedoms, the pose next to the straight way is taken.
-    Raises InputError where ``start`` itself is outside, and for a direction of length zero.
+    directions : (k, 3) along the base's axes, or (k, 6) twists (omega, tau), whose multiples are
+        the distances: a twist of 1 rad about an axis gives rad.
+    most : end of the search, in the same units; by default half a turn or twice a rod's length,
+        whichever comes first.
+
+    On machines whose rods and axes constrain some freedoms, paths follow the admissible poses next
+    to the straight line.
+    Raises InputError if ``start`` is outside the workspace, and for a direction of length zero.
     """
     at_start = reachable(limits, start)
     if not at_start.inside:
@@ -242,47 +264,48 @@ def extents(
             next_step="begin at the home pose, or check the ranges in the mechanism file",
         )
     twists = _twists(directions)
-    farthest = _farthest(limits, twists) if most is None else np.full(len(twists), most)
-    direction = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
-    still = np.zeros(direction.shape, dtype=bool)
-    ahead: Integers = np.arange(len(direction))
-    for first in range(
-        0, effort.steps + 1, PATH_POSES_AHEAD
-    ):  # what comes after the end is not looked at
+    if most is not None:
+        farthest = np.full(len(twists), most)
+    else:
+        # Half a turn, or twice a rod's length.
+        turn, move = (np.linalg.norm(part, axis=-1) for part in (twists[:, :3], twists[:, 3:]))
+        with np.errstate(divide="ignore"):  # without rotation, or translation
+            farthest = np.minimum(np.pi / turn, 2 * _reach(limits) / move)
+    # Bracket the first obstacle of each path, in batches that stop with the path.
+    distances = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
+    inside_so_far = np.zeros(distances.shape, dtype=bool)
+    ahead: Integers = np.arange(len(distances))
+    for first in range(0, effort.steps + 1, PATH_POSES_AHEAD):
         at = slice(first, first + PATH_POSES_AHEAD)
-        inside = _along(limits, start, twists[ahead, None], direction[ahead, at], effort)[1].inside
-        still[ahead, at] = np.logical_and.accumulate(inside, axis=1)
+        inside = _reach_along(limits, start, twists[ahead, None], distances[ahead, at], effort)[
+            1
+        ].inside
+        inside_so_far[ahead, at] = np.logical_and.accumulate(inside, axis=1)
         ahead = ahead[inside.all(axis=1)]
         if not ahead.size:
             break
-    last = still.sum(axis=1) - 1
+    # Bisect between the last reachable pose and the next.
+    last = inside_so_far.sum(axis=1) - 1
     rows = np.arange(len(twists))
-    low, high = direction[rows, last], direction[rows, np.minimum(last + 1, effort.steps)]
+    low, high = distances[rows, last], distances[rows, np.minimum(last + 1, effort.steps)]
     for _ in range(effort.halvings):
         middle = (low + high) / 2
-        good = _along(limits, start, twists, middle, effort)[1].inside
+        good = _reach_along(limits, start, twists, middle, effort)[1].inside
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    poses = _along(limits, start, twists, low, effort)[0]
-    beyond = _along(limits, start, twists, high, effort)[1]
+    poses = _reach_along(limits, start, twists, low, effort)[0]
+    beyond = _reach_along(limits, start, twists, high, effort)[1]
     why = tuple(() if last[k] == effort.steps else beyond.why(k) for k in range(len(twists)))
     return Extents(low, poses, why)
 
 
-def _farthest(limits: Limits, twists: Array) -> Array:
-    """Where the search along twists (k, 6) ends, (k,)."""
-    turn, move = (np.linalg.norm(part, axis=-1) for part in (twists[:, :3], twists[:, 3:]))
-    with np.errstate(divide="ignore"):  # without a turn, or without a way: no end by it
-        return np.minimum(np.pi / turn, 2 * _reach(limits) / move)
-
-
 def _reach(limits: Limits) -> float:
-    """A rod's length at home, m."""
+    """Typical rod length at home, m."""
     readings = readings_at_poses(limits.layout, limits.theta, limits.home)
     return typical_reach(limits.layout, limits.theta, readings)
 
 
 def _twists(directions: Array) -> Array:
-    """Directions (k, 3) or (k, 6) as twists (k, 6)."""
+    """Twists (k, 6) from directions (k, 3) or (k, 6)."""
     if not directions.any(axis=-1).all():
         raise InputError(
             what="a direction of length zero leads nowhere",
@@ -294,51 +317,54 @@ def _twists(directions: Array) -> Array:
     return np.concatenate([np.zeros_like(unit), unit], axis=-1)
 
 
-def _along(
-    limits: Limits, start: Array, twists: Array, direction: Array, effort: Effort
+def _reach_along(
+    limits: Limits, start: Array, twists: Array, distances: Array, effort: Effort
 ) -> tuple[Array, Reach]:
-    """Poses (..., 4, 4) after ways (...,) along twists (..., 6), and what stands against them."""
-    poses = perturb(start, twists * direction[..., None])
+    """Poses (..., 4, 4) at distances (...,) along twists (..., 6), and their obstacles."""
+    poses = perturb(start, twists * distances[..., None])
     if limits.layout.row_motor.min(initial=0) < 0 or limits.layout.shares_motors:
-        poses = _settled(limits, start, twists, direction, poses, effort)
+        poses = _projected(limits, start, twists, distances, poses, effort)
     return poses, reachable(limits, poses)
 
 
-def _settled(
-    limits: Limits, start: Array, twists: Array, direction: Array, poses: Array, effort: Effort
+def _projected(
+    limits: Limits, start: Array, twists: Array, distances: Array, poses: Array, effort: Effort
 ) -> Array:
-    """Poses (..., 4, 4) put where rods and axes allow them, as far along the twists as they were.
+    """Poses (..., 4, 4) projected onto those that rods and axes allow, at their distance along the
+    twists.
 
-    In turns to the nearest pose that is allowed, and on along the twist by what that took away.
-    What is then still behind, keeps its own pose, which is forbidden.
+    Alternates the projection with a step along the twist by the distance that it took away. A pose
+    that remains short of its distance is returned without projection, and is then forbidden.
     """
     size = np.sum(twists * twists, axis=-1)
     settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
     for _ in range(effort.rounds):
-        behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * direction):
+        behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * distances):
             break
         ahead = perturb(settled, twists * behind[..., None])
         settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
-    behind = direction - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-    retained_rows = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * direction
-    return np.where(retained_rows[..., None, None], settled, poses)
+    behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
+    reached = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * distances
+    return np.where(reached[..., None, None], settled, poses)
 
 
 def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
-    """Positions about ``middle`` (4, 4), at its orientation.
+    """Workspace around ``middle`` (4, 4), at its orientation.
 
-    directions : (2, 3) or (3, 3) square to each other, base frame, for a section or a volume. The
-    grid spans what straight ways along them and between them reach, and a tenth more, ``count``
-    points along the longest side.
-    Raises InputError where ``middle`` itself is outside, and where the machine cannot move along
-    one of the directions without turning.
+    directions : (2, 3) or (3, 3) orthogonal, base frame, for a section or a volume.
+    count : number of points along the longest side. The grid spans the reach of straight paths
+        along and between the directions, and a tenth more.
+    Raises InputError if ``middle`` is outside the workspace, and if the machine cannot move along
+    one of the directions without rotation.
     """
+    from scipy.ndimage import label
+
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     low, high = straight_path_spans(limits, middle, unit)
     _refuse_flat(limits, unit, high - low)
     cell = float((high - low).max()) / count
-    # the middle pose is one of the points
+    # the middle pose is a grid point
     axes = tuple(
         cell * np.arange(np.floor(a / cell), np.ceil(b / cell) + 1)
         for a, b in zip(low, high, strict=True)
@@ -347,8 +373,11 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
     positions = middle[:3, 3] + points.reshape(-1, len(unit)) @ unit
     inside, singular = _at_positions(limits, middle, positions)
     shape = points.shape[:-1]
+    # Keep the component that contains the middle pose.
+    parts: Integers = np.zeros(shape, dtype=np.int32)
+    label(inside.reshape(shape), output=parts)
     start = tuple(int(np.argmin(np.abs(axis))) for axis in axes)
-    connected = _connected(inside.reshape(shape), start)
+    connected = np.asarray((parts == parts[start]) & inside.reshape(shape))
     size = float(np.count_nonzero(connected)) * cell ** len(unit)
     return Grid(axes, connected, singular.reshape(shape), size)
 
@@ -356,8 +385,8 @@ def workspace_grid(limits: Limits, middle: Array, directions: Array, count: int)
 def straight_path_spans(
     limits: Limits, middle: Array, unit: Array, effort: Effort = FINE_EFFORT
 ) -> tuple[Array, Array]:
-    """How far down and up (k,) along unit vectors (k, 3) straight ways from ``middle`` (4, 4) come,
-    along them and between them, and a tenth more, m.
+    """Lowest and highest coordinate (k,) along unit vectors (k, 3) that straight paths from
+    ``middle`` (4, 4) reach, along the vectors and between them, and a tenth more, m.
     """
     signs = np.array([s for s in itertools.product((-1, 0, 1), repeat=len(unit)) if any(s)])
     ways = extents(limits, signs @ unit, middle, effort=effort)
@@ -366,7 +395,7 @@ def straight_path_spans(
 
 
 def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
-    """A grid needs some way along each of its directions."""
+    """Raise InputError if the reach along a direction of the grid vanishes."""
     flat = np.flatnonzero(sides < 1e-4 * _reach(limits))
     if flat.size:
         raise InputError(
@@ -378,7 +407,7 @@ def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
 
 
 def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Booleans, Array]:
-    """Whether positions (n, 3) belong to the workspace, and their singularity, (n,) each."""
+    """Whether positions (n, 3) are in the workspace, and their singularity measure, (n,) each."""
     inside, singular = np.zeros(len(positions), dtype=bool), np.zeros(len(positions))
     for first in range(0, len(positions), GRID_POSES_AT_ONCE):
         rows = slice(first, first + GRID_POSES_AT_ONCE)
@@ -387,28 +416,20 @@ def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Bool
     return inside, singular
 
 
-def _connected(inside: Booleans, start: tuple[int, ...]) -> Booleans:
-    """The part of a grid that hangs together with one of its points."""
-    from scipy.ndimage import label
-
-    parts: Integers = np.zeros(inside.shape, dtype=np.int32)
-    label(inside, output=parts)
-    return np.asarray((parts == parts[start]) & inside)
-
-
 LOOKS_A_PATH_STEP = 8
-"""Poses looked at from one of the path's to the next."""
+"""Subdivisions of each step of a path that are checked."""
 
 
 @dataclass(frozen=True)
 class PathCheck:
-    """What was found along a path of n poses; places count in poses, 2.5 is half way from the third
-    to the fourth.
+    """Check of a path of n poses; places are fractional indices, 2.5 is half way from the third to
+    the fourth pose.
 
-    inside : (n,) of the path's own poses. leaves : the first place where the path is outside the
-        workspace, None where it stays. why : what stands against it there.
+    inside : (n,) whether the path's own poses are reachable.
+    leaves : first place outside the workspace, None if there is none.
+    why : obstacles at this place.
     crossings : places where the determinant changes its sign: a singular pose.
-    closest : (place, singularity) nearest to a singular pose, of the poses looked at.
+    closest : (place, singularity) of the checked pose nearest to a singular one.
     readings : (n, m) along the path.
     """
 
@@ -441,11 +462,11 @@ class PathCheck:
 
 
 def check_path(limits: Limits, poses: Array) -> PathCheck:
-    """Look along a path T_base_platform (n, 4, 4), n >= 2, straight from each pose to the next.
+    """Check a path T_base_platform (n, 4, 4), n >= 2, straight from each pose to the next.
 
-    A singular pose that is crossed twice within one of the steps looked at, or a corner left so, is
-    not seen.
-    Raises InputError for a path that is none.
+    A singular pose that is crossed twice between two checked poses, or an excursion between them,
+    is missed.
+    Raises InputError for invalid paths.
     """
     if poses.ndim != 3 or len(poses) < 2:
         raise InputError(
@@ -454,8 +475,8 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
             expected="(n, 4, 4)",
         )
     places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * LOOKS_A_PATH_STEP + 1)
-    reach = reachable(limits, _at(poses, places))
-    leaves, why = _leaving(limits, poses, places, reach)
+    reach = reachable(limits, _path_poses(poses, places))
+    leaves, why = _first_exit(limits, poses, places, reach)
     nearest = np.where(np.isfinite(reach.singularity), reach.singularity, np.inf)
     k = int(np.argmin(nearest))
     own = slice(None, None, LOOKS_A_PATH_STEP)
@@ -469,17 +490,17 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
     )
 
 
-def _at(poses: Array, places: Array) -> Array:
-    """Poses at places along the path."""
+def _path_poses(poses: Array, places: Array) -> Array:
+    """Poses at places along a path."""
     first = np.minimum(places.astype(int), len(poses) - 2)
     step = pose_difference(poses[1:], poses[:-1])[first]
     return perturb(poses[first], (places - first)[:, None] * step)
 
 
-def _leaving(
+def _first_exit(
     limits: Limits, poses: Array, places: Array, reach: Reach
 ) -> tuple[float | None, tuple[str, ...]]:
-    """The first place outside and the reason there."""
+    """First place outside the workspace, by bisection, and the obstacles there."""
     outside = np.flatnonzero(~reach.inside)
     if not outside.size:
         return None, ()
@@ -488,19 +509,19 @@ def _leaving(
     low, high = places[outside[0] - 1], places[outside[0]]
     for _ in range(FINE_EFFORT.halvings):
         middle = (low + high) / 2
-        good = bool(reachable(limits, _at(poses, np.array([middle]))).inside[0])
+        good = bool(reachable(limits, _path_poses(poses, np.array([middle]))).inside[0])
         low, high = (middle, high) if good else (low, middle)
-    return float(high), reachable(limits, _at(poses, np.array([high]))).why(0)
+    return float(high), reachable(limits, _path_poses(poses, np.array([high]))).why(0)
 
 
 def _crossings(limits: Limits, poses: Array, places: Array, reach: Reach) -> tuple[float, ...]:
-    """Places where the determinant changes its sign between two poses in reach."""
+    """Places where the determinant changes its sign between two reachable poses, by bisection."""
     reached = np.asarray(~reach.lost.any(axis=-1))
     changes = np.diff(reach.crossed.astype(int)) != 0
     at = np.flatnonzero(changes & reached[1:] & reached[:-1])
     low, high = places[at], places[at + 1]
     for _ in range(FINE_EFFORT.halvings if at.size else 0):
         middle = (low + high) / 2
-        same = reachable(limits, _at(poses, middle)).crossed == reach.crossed[at]
+        same = reachable(limits, _path_poses(poses, middle)).crossed == reach.crossed[at]
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return tuple(float(x) for x in high)

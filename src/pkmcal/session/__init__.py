@@ -1,1 +1,1 @@
-"""A session on disk: its files, photographs, readings and tables, loaded and checked as a whole."""
+"""A session on disk: its images, readings, cameras and tables, loaded and checked as a whole."""

@@ -1,4 +1,4 @@
-"""A camera of which no more is known than the focal length that its photographs' EXIF tells."""
+"""Camera known only by the focal length in the EXIF data of its images."""
 
 from __future__ import annotations
 
@@ -12,36 +12,39 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.errors import InputError
 from pkmcal.files import read_exif
-from pkmcal.session.image_files import photograph_header
+from pkmcal.session.image_files import image_header
 
 EXIF_CAMERA_WORD = "exif"
-"""The word in place of a camera's file."""
+"""Word in session.yaml in place of a camera's file."""
 FILM_DIAGONAL = hypot(36.0, 24.0)
-"""Diagonal (mm) of the film that the focal length is told for."""
+"""Diagonal (mm) of the 35 mm film to which the EXIF focal length refers."""
 EXIF_HEAD_BYTES = 1 << 17
-"""Bytes from a file's beginning that hold its EXIF: a segment has 64 kB at most."""
+"""Bytes at the beginning of a file that contain its EXIF data, of which a segment has at most 64
+kB."""
 FOCAL_SIGMA = 0.03
-"""Standard deviation of that focal length, relative: it is a whole number, 2 % of a telephone's 26
-mm, and some makers go by the width of the film in place of its diagonal, 4 % for 4:3 pictures."""
+"""Prior sigma of the EXIF focal length, relative. It is a whole number, 2 % of a telephone's 26 mm,
+and some makers refer to the width of the film instead of its diagonal, a difference of 4 % for 4:3
+images."""
 ASPECT_SIGMA = 1e-3
-"""The same of one focal length against the other: pixels are square."""
+"""Prior sigma of the ratio of the two focal lengths: pixels are square."""
 CENTER_SIGMA = 0.01
-"""Standard deviation of the centre, in image widths: how far lenses are glued off the middle."""
+"""Prior sigma of the centre, in image widths: the accuracy with which lenses are mounted."""
 DISTORTION_SIGMA = {"k1": 0.1, "k2": 0.1, "p1": 1e-3, "p2": 1e-3, "k3": 0.1}
-"""Standard deviations of the distortion: a tenth is what a telephone's lens has, and most programs
-in a telephone have taken it out."""
+"""Prior sigmas of the distortion coefficients: a tenth is the distortion of a telephone's lens,
+which most telephones have already removed."""
 
 
-def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
-    """The pinhole camera that took some photographs, with the covariance of what EXIF leaves open.
+def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
+    """Pinhole camera from the EXIF data of images, with a covariance for everything that EXIF does
+    not state.
 
-    photographs : paths, and names for messages. Raises `InputError` where one does not tell its
-    focal length, or they do not tell the same.
+    images : paths, and names in messages.
+    Raises InputError if an image has no focal length, or if focal lengths or sizes differ.
     """
-    entries: dict[tuple[float, tuple[int, int]], str] = {}
+    labels: dict[tuple[float, tuple[int, int]], str] = {}
     sizes: list[tuple[int, int]] = []
-    for path, label in photographs:
-        width, height = photograph_header(path, label)
+    for path, label in images:
+        width, height = image_header(path, label)
         with path.open("rb") as stream:
             focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
         if focal is None:
@@ -53,26 +56,27 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
                 next_step="Calibrate the camera with pkmcal camera, and name its file",
             )
         sizes.append((width, height))
-        entries.setdefault((focal, (max(width, height), min(width, height))), label)
-    if len(entries) > 1:
-        (one, first), (other, second) = list(entries.items())[:2]
+        labels.setdefault((focal, (max(width, height), min(width, height))), label)
+    if len(labels) > 1:
+        (one, first), (other, second) = list(labels.items())[:2]
         raise InputError(
             "the photographs of one camera tell different focal lengths or sizes",
             where=second,
-            found=f"{_described(*other)}, where {first} has {_described(*one)}",
+            found=f"{_description(*other)}, where {first} has {_description(*one)}",
             expected="one lens, not zoomed, and uncropped photographs",
             next_step="Give photographs by another lens a station of their own",
         )
-    size = max(sizes, key=sizes.count)  # others were turned by a quarter
-    return _camera(next(iter(entries))[0] / FILM_DIAGONAL * hypot(*size), size)
+    size = max(sizes, key=sizes.count)  # the others are rotated by 90 degrees
+    return _pinhole_camera(next(iter(labels))[0] / FILM_DIAGONAL * hypot(*size), size)
 
 
-def _described(focal: float, size: tuple[int, int]) -> str:
+def _description(focal: float, size: tuple[int, int]) -> str:
+    """Focal length and image size for a message."""
     return f"{focal:g} mm at {size[0]}x{size[1]}"
 
 
-def _camera(focal: float, size: tuple[int, int]) -> Camera:
-    """With its focal length in px."""
+def _pinhole_camera(focal: float, size: tuple[int, int]) -> Camera:
+    """Pinhole camera without distortion, with its prior covariance. focal : px."""
     kind = camera_models()["pinhole"]
     middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
     camera = kind(size, np.array([focal, focal, *middle, 0.0, 0.0, 0.0, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""Photographs of a session: found by their names, and their sizes read without decoding them."""
+"""Image files of a session: found by name patterns, their sizes read without decoding."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _FIELDS = ("configuration", "repeat")
 class Photograph:
     """One image file.
 
-    configuration : row of the session's joints that it belongs to.
-    repeat : the pattern's {repeat} part, where it has one.
+    configuration : row of the session's joint readings that the image belongs to.
+    repeat : text matched by the pattern's {repeat}, None without this placeholder.
     """
 
     configuration: int
@@ -39,25 +39,28 @@ class Photograph:
     path: Path
 
 
-def find_photographs(
+def find_images(
     folder: Path, pattern: str, names: Sequence[str], where: str, *, needed: bool = True
 ) -> tuple[Photograph, ...]:
-    """Find the files that a pattern such as ``images/front/{configuration}.png`` stands for.
+    """Find the image files of a pattern such as ``images/front/{configuration}.png``.
 
+    folder : the session's folder.
     pattern : relative to `folder`, or absolute.
-    names : configurations in joints.csv; a file is paired with its row by name alone, never by
-        order, so that one missing photograph cannot shift the others.
-    where : place of the pattern in session.yaml, for messages. needed : whether none is a fault.
-    Returns photographs by configuration and repeat. A configuration without one is no fault.
+    names : configurations in joints.csv. A file is paired with its row by name only, never by
+        order, so one missing image cannot shift the others.
+    where : location of the pattern in session.yaml, for messages.
+    needed : whether finding no file is an error.
+    Returns images sorted by configuration and repeat; configurations may be without an image.
+    Raises InputError for an invalid pattern and for images of unknown configurations.
     """
-    parts = _parts(pattern, where)
+    parts = _pattern_parts(pattern, where)
     wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
     rows = {name: row for row, name in enumerate(names)}
     lengths = sorted({len(name) for name in names}, reverse=True)
 
-    def above_limit(path: str) -> re.Match[str] | None:
-        """The path as the pattern's, of a configuration that there is; the longest name first."""
-        # only names that stand in it: thousands as one expression would be tried one by one
+    def matched(path: str) -> re.Match[str] | None:
+        """Match of a path with the pattern for any configuration, longest names first."""
+        # Only names that occur in the path: an alternation of thousands is matched one by one.
         within = (path[at : at + n] for n in lengths for at in range(len(path) - n + 1))
         some = dict.fromkeys(name for name in within if name in rows)
         return re.fullmatch(_regex(parts, "|".join(map(re.escape, some))), path) if some else None
@@ -67,34 +70,35 @@ def find_photographs(
     files = [
         path
         for path in (Path(name).as_posix() for name in matches)
-        # A folder or a pipe that has a photograph's name is told; others are nobody's business.
-        if (folder / path).is_file() or above_limit(path)
+        # A folder or pipe with an image's name is kept, and refused when its header is read.
+        if (folder / path).is_file() or matched(path)
     ]
     if not files and not needed:
         return ()
     if not files:
         raise _no_images_error(folder, wildcard, pattern, where)
-    results: list[Photograph] = []
-    strangers: list[str] = []
+    images: list[Photograph] = []
+    unknown: list[str] = []
     for name in sorted(files):
-        match = above_limit(name)
+        match = matched(name)
         if match is None:
-            strangers.append(name)
+            unknown.append(name)
             continue
         fields = match.groupdict()
         row = rows[fields["configuration"]]
-        results.append(Photograph(row, fields.get("repeat"), folder / name))
-    if strangers:
-        raise _stranger(strangers, parts, names, where)
-    return tuple(sorted(results, key=lambda photo: (photo.configuration, photo.repeat or "")))
+        images.append(Photograph(row, fields.get("repeat"), folder / name))
+    if unknown:
+        raise _unknown_configuration(unknown, parts, names, where)
+    return tuple(sorted(images, key=lambda image: (image.configuration, image.repeat or "")))
 
 
-def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
-    """Return an image's (width, height) in pixels as stored, before any EXIF rotation.
+def image_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
+    """Size (width, height) in pixels of an image as stored, before any EXIF rotation.
 
-    From its first bytes; of PNG, JPEG, TIFF, BMP and PGM files.
-    label : the file's name in messages; the path unless told.
-    Raises InputError for what is no file, no image, or states a size that its bytes cannot fill.
+    Reads only the header of PNG, JPEG, TIFF, BMP and PGM files.
+    label : the file's name in messages, by default the path.
+    Raises InputError if the path is no regular file or no image, or if the stated size exceeds the
+    file's data.
     """
     path = Path(path)
     label = label or str(path)
@@ -117,12 +121,14 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
 
 
 def label_of(folder: Path, path: Path) -> str:
-    """A photograph's name in messages: its path inside the session, as session.yaml writes it."""
+    """Name of an image in messages: its path relative to the session, as in session.yaml."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
-    """Split a pattern into (text, None) and ("", field)."""
+def _pattern_parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
+    """Split a pattern into (text, None) and ("", placeholder); raises InputError for unknown or
+    missing placeholders.
+    """
     try:
         pieces = list(Formatter().parse(Path(pattern).as_posix()))
     except ValueError:
@@ -152,67 +158,72 @@ def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
 
 
 def _regex(parts: Sequence[tuple[str, str | None]], configuration: str) -> str:
-    """The pattern as a regular expression; a field's second occurrence repeats its first."""
+    """Pattern as a regular expression. A placeholder's second occurrence repeats its first.
+
+    configuration : expression for the configuration's name.
+    """
     bodies = {"configuration": configuration, "repeat": "[^/]+?"}
-    names_so_far: set[str] = set()
+    used: set[str] = set()
     text = ""
     for literal, field in parts:
         if field is None:
             text += re.escape(literal)
-        elif field in names_so_far:
+        elif field in used:
             text += f"(?P={field})"
         else:
-            names_so_far.add(field)
+            used.add(field)
             text += f"(?P<{field}>{bodies[field]})"
     return text
 
 
 def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> InputError:
-    """Say what stands where the photographs should be."""
-    place = folder / wildcard
-    while "*" in str(place):
-        place = place.parent
-    value = f"no folder {place}"
+    """Error about a pattern without files, with the content of its folder and other suffixes of
+    images there.
+    """
+    parent = folder / wildcard
+    while "*" in str(parent):
+        parent = parent.parent
+    content = f"no folder {parent}"
     try:
-        standing = place.is_dir()
-    except OSError:  # such as a name that no folder can have
-        standing = False
-    if standing:
-        entries = sorted(entry.name for entry in place.iterdir())
-        others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
-        value = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
-    ending = Path(pattern).suffix
-    same = Counter(_endings(folder, wildcard.removesuffix(ending)))
-    others = [other for other, _ in same.most_common() if other != ending]
+        exists = parent.is_dir()
+    except OSError:  # e.g. an invalid folder name
+        exists = False
+    if exists:
+        entries = sorted(entry.name for entry in parent.iterdir())
+        number = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
+        content = f"{number} {entries[0]} in {parent}" if entries else f"nothing in {parent}"
+    suffix = Path(pattern).suffix
+    counts = Counter(_image_suffixes(folder, wildcard.removesuffix(suffix)))
+    others = [other for other, _ in counts.most_common() if other != suffix]
     return InputError(
         "there is no photograph under this pattern",
         where=where,
-        found=value,
+        found=content,
         expected=f"files {pattern}",
         next_step=f"Photographs there end in {others[0]}: write"
-        f" {pattern.removesuffix(ending)}{others[0]}"
+        f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,
     )
 
 
-def _endings(folder: Path, wildcard: str) -> list[str]:
-    """Those of the photographs under a pattern without its ending, .JPG and the like."""
+def _image_suffixes(folder: Path, wildcard: str) -> list[str]:
+    """Suffixes of the images that match a pattern apart from its own suffix, such as .JPG."""
     try:
         names = glob.glob(f"{wildcard}.*", root_dir=folder)
-    except (OSError, ValueError):  # such as a name that no folder can have
+    except (OSError, ValueError):  # e.g. an invalid folder name
         return []
     return [ending for name in names if (ending := Path(name).suffix).lower() in IMAGE_FILE_ENDINGS]
 
 
-def _stranger(
+def _unknown_configuration(
     files: Sequence[str], parts: Sequence[tuple[str, str | None]], names: Sequence[str], where: str
 ) -> InputError:
-    """A photograph whose configuration has no readings."""
+    """Error about an image whose configuration has no joint readings."""
     match = re.fullmatch(_regex(parts, "[^/]+?"), files[0])
     name = match["configuration"] if match else files[0]
     more = f" (one of {len(files)} such files)" if len(files) > 1 else ""
-    short = {reference_values.lstrip("0"): reference_values for reference_values in names}
+    short = {entry.lstrip("0"): entry for entry in names}
     next_step = "Add its readings to the table, or move the photograph away"
     if name.lstrip("0") in short:
         next_step = (

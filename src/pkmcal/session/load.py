@@ -1,7 +1,7 @@
-"""A session on disk: photographs, joint readings, cameras and the machine's drawing.
+"""Session: images, joint readings, cameras, tables and the machine's nominal model.
 
-`load_session` checks everything that can be checked without looking into the photographs, before
-any work is spent; each fault is an `InputError` with file, line and field.
+`load_session` checks everything that can be checked without decoding images. Each fault is an
+`InputError` with file, line and field.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanis
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
-from pkmcal.session.image_files import Photograph, find_photographs, label_of, photograph_header
+from pkmcal.session.image_files import Photograph, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
@@ -64,25 +64,27 @@ from pkmcal.wording import count, listed
 SESSION_FILE_NAME = "session.yaml"
 SESSION_FILE_VERSION = 1
 SHORTEST_PATH = 3
-"""Configurations without which nothing is straight or bent."""
-# A camera nearer to what it looks at than this has two equal points written, not a view.
+"""Fewest configurations of a straight path; two points are always on a line."""
+# Least distance between position and look_at; below it both are the same point.
 _NEAREST = 1e-6  # m
-# Under a degree between view and up, a rough up of a few digits leaves the roll to chance.
+# Least angle between view and up; below it, an up of a few digits does not determine the roll.
 _LEAST_ANGLE = np.deg2rad(1.0)
 
 
 @dataclass(frozen=True)
 class Station:
-    """One camera in one place.
+    """One camera at a fixed place.
 
-    camera_file : as session.yaml names it; made up where EXIF tells the camera.
-    T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None where not given.
-    photographs : by configuration and repeat.
-    observe : legs, board, or both, in this order. entry : its name in session.yaml, which is that
-    of many stations where the camera was held by hand, each of one photograph. handheld : whether.
-    from_exif : whether no more is known of the camera than what EXIF tells. response : how the
-    photographs code light; response_given : whether session.yaml says so, or their edges did, else
-    it is what is usual for files of their kind.
+    camera_file : as named in session.yaml; a made-up name if the camera comes from EXIF data.
+    T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None if not given.
+    photographs : images, sorted by configuration and repeat.
+    observe : legs, board, or both, in this order.
+    entry : name of the entry in session.yaml. A hand-held entry has one station for each image.
+    handheld : whether the camera was held by hand.
+    from_exif : whether only the EXIF focal length of the camera is known.
+    response : encoding of light in the images.
+    response_given : whether the response is stated in session.yaml or was determined from edges;
+        otherwise it is the usual one for the type of file.
     """
 
     name: str
@@ -102,8 +104,10 @@ class Station:
 
 @dataclass(frozen=True)
 class RejectedStation:
-    """A station whose images do not show where it stands. label : its name in messages. reason : in
-    words, that follow "for".
+    """Station whose images do not determine its pose.
+
+    label : name in messages.
+    reason : text that follows "for".
     """
 
     station: Station
@@ -112,7 +116,7 @@ class RejectedStation:
 
     @property
     def finding(self) -> Finding:
-        """The warning about it."""
+        """Warning about the rejected station."""
         return doubtful(
             "rejected.station", self.label, station=self.station.name, reason=self.reason
         )
@@ -120,21 +124,21 @@ class RejectedStation:
 
 @dataclass(frozen=True)
 class Session:
-    """A session, checked.
+    """A session, loaded and checked.
 
     configurations : K names, in the order of joints.csv.
     joints : (K, m) readings, m or rad, in the order of the machine's actuated legs.
     joint_noise : standard deviation of a reading, m or rad.
-    board : file that describes the calibration board, where a station observes one.
-    board_body : what the board is fixed to, base or platform.
-    document : session.yaml with defaults, readings and found photographs written out.
-    findings : what is not wrong but should be known.
-    trackers : what measured without photographs; in numbers of stations they follow these.
-    model : the machine's model by its name in the mechanism file, None for the file's own.
-    mechanism : where the machine came from, for other models of it.
-    workspace : where the tool is to be right, None where the file does not say.
-    rejected : stations that were taken out because their images do not show where they stand.
-    links : measurements that link two configurations, by kind.
+    board : file that describes the calibration board; None if no station observes one.
+    board_body : body to which the board is fixed, base or platform.
+    document : session.yaml with defaults, readings and image files written out.
+    findings : warnings about the session.
+    trackers : tables measured by trackers; in station numbers they follow the cameras' stations.
+    model : name of the machine's model in the mechanism file, None for the default.
+    mechanism : source of the machine, from which other models are loaded.
+    workspace : region in which the tool must be accurate; None if not stated.
+    rejected : stations that were removed because their images do not determine their poses.
+    links : measurements that depend on two configurations, by kind.
     """
 
     folder: Path
@@ -164,35 +168,37 @@ class Session:
 
     @property
     def called(self) -> str:
-        """``session mine`` by its folder, or by the one around it where it is called session."""
+        """Name of the session for messages: its folder's, or the parent's if the folder is named
+        session.
+        """
         folder = resolved(self.folder)
         return f"session {(folder if folder.name != 'session' else folder.parent).name}"
 
     @property
     def heights_alone(self) -> bool:
-        """Whether nothing but heights of a bed was measured."""
+        """Whether the session has only heights of a bed."""
         felt = bool(self.trackers) and all(table.kind == Heights.code for table in self.trackers)
         return felt and not self.stations and not self.links
 
     @property
     def station_names(self) -> tuple[str, ...]:
-        """Names of all stations, trackers last, as measurements number them."""
+        """Names of all stations, trackers last, in the order of station numbers."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
 
     @property
     def camera_of_station(self) -> Integers:
-        """Number of each station's camera file, in order of first use, (S,); a tracker has none,
-        and the first one's number moves nothing of what it measured.
+        """Index (S,) of each station's camera, in order of first use. Trackers have index 0, which
+        has no effect on their measurements.
         """
         cameras = numbered(station.camera_file for station in self.stations)
         return np.pad(cameras, (0, len(self.trackers)))
 
     def of_stations(self, numbers: Sequence[int]) -> Session:
-        """The session with some of its stations that have a camera."""
+        """Session with a subset of its camera stations."""
         return replace(self, stations=tuple(self.stations[k] for k in numbers))
 
     def without(self, reasons: Mapping[int, str]) -> Session:
-        """The session without some stations, by their numbers, each rejected for a reason."""
+        """Session with some stations rejected. reasons : by station number."""
         rejected = tuple(
             RejectedStation(self.stations[k], self.label(k), why) for k, why in reasons.items()
         )
@@ -204,11 +210,11 @@ class Session:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The findings' sentences."""
+        """Sentences of the findings."""
         return tuple(one.text for one in self.findings)
 
     def label(self, number: int) -> str:
-        """What a station is called in messages: a hand-held one by the file of its image."""
+        """Name of a camera station in messages: the image's file for a hand-held one."""
         station = self.stations[number]
         if not station.handheld:
             return station.name
@@ -216,18 +222,20 @@ class Session:
 
     @property
     def images_taken(self) -> int:
-        """Images of all stations, those of rejected ones among them."""
+        """Number of images of all stations, rejected stations included."""
         stations = (*self.stations, *(one.station for one in self.rejected))
         return sum(len(station.photographs) for station in stations)
 
     def other_model(self, name: str | None) -> Machine:
-        """Another model of the same machine."""
+        """Machine with another model from the same mechanism file."""
         return load_mechanism(self.mechanism, model=name)
 
 
 def session_folder(subject: str) -> Path | None:
-    """The folder of the session that a subject names, by itself or by its file; None where it is a
-    machine: a folder that is called like a built-in machine and holds no session is not meant.
+    """Folder of the session that a subject names, by its folder or its session.yaml; None if the
+    subject is a machine.
+
+    A folder that has the name of a built-in machine and contains no session counts as the machine.
     """
     path = Path(subject)
     folder = path.parent if path.name == SESSION_FILE_NAME else path
@@ -242,20 +250,21 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     Parameters
     ----------
     folder :
-        The session's folder; its session.yaml may be named instead.
+        The session's folder, or its session.yaml.
     model :
         One of the models that the mechanism file names.
     measured :
-        Whether images, or poses, of at least two configurations are required; a plan is made
-        before there are any.
+        Whether images, or poses, of at least two configurations are required. A plan is made
+        before any exist.
 
     Raises
     ------
     pkmcal.errors.InputError
-        A file is missing or wrong; the error names file, line and field.
+        A file is missing or invalid; the error names file, line and field.
 
     """
-    folder, document = _read(Path(folder))
+    # Session file and machine.
+    folder, document = _session_document(Path(folder))
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
     if not measured and not schema.stations:
@@ -266,8 +275,9 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             next_step="Where readings alone are calibrated from, spread the poses over all that the"
             " machine reaches",
         )
+    # Joint readings.
     if measured or (folder / schema.joints.file).exists():
-        path = _existing(folder, document, schema.joints.file, ("joints", "file"))
+        path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
         written = written_unit(document.data["joints"]["noise"])
         if written and written.kind not in machine.joint_units:
@@ -283,25 +293,27 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     else:
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
         table, findings = CsvTable(schema.joints.file, columns, (), none, ()), list[Finding]()
+    # Board, camera stations and trackers.
     board = _board(folder, document, schema)
-    findings += _of_little_use(document, schema)
+    findings += _unused_board(document, schema)
     stations = tuple(
-        made
+        camera_station
         for name, station in schema.cameras.items()
-        for made in _stations(folder, document, name, station, table.names, measured)
+        for camera_station in _stations(folder, document, name, station, table.names, measured)
     )
-    findings += _turned(folder, stations)
+    findings += _rotated_images(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
-        given, keys = station.tracker, ("stations", name, "tracker", "poses")
-        noise = given.noise.position, given.noise.rotation
-        if measured or (folder / given.poses).exists():
-            path = _existing(folder, document, given.poses, keys)
-            read = read_poses(path, given.poses, table.names, *noise, name, level=given.level)
+        tracker, keys = station.tracker, ("stations", name, "tracker", "poses")
+        noise = tracker.noise.position, tracker.noise.rotation
+        if measured or (folder / tracker.poses).exists():
+            path = _regular_file(folder, document, tracker.poses, keys)
+            read = read_poses(path, tracker.poses, table.names, *noise, name, level=tracker.level)
             trackers.append(read)
         else:
-            trackers.append(PoseTable.to_come(name, given.poses, *noise))
+            trackers.append(PoseTable.to_come(name, tracker.poses, *noise))
     links = _links(folder, document, schema, table.names, machine) if measured else ()
+    # Checks across files.
     if measured:
         _check_paths(document, schema, table)
     _check_distinct(document, stations)
@@ -309,7 +321,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and (schema.stations or links):
-        findings += _unphotographed(table, stations, tuple(trackers), links)
+        findings += _unmeasured(table, stations, tuple(trackers), links)
     return Session(
         folder=folder,
         machine=machine,
@@ -318,7 +330,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         joint_noise=schema.joints.noise,
         stations=stations,
         board=board,
-        document=_resolved(folder, schema, table, stations),
+        document=_resolved_document(folder, schema, table, stations),
         findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
         trackers=tuple(trackers),
@@ -330,11 +342,12 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
 
 
 def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
-    """Pose T_camera_base (4, 4) of a camera at `position` that sees `look_at` in its middle.
+    """Pose T_camera_base (4, 4) of a camera at `position` with `look_at` in the middle of its
+    image.
 
-    All in base coordinates, m. Camera axes: z forward, x right, y down; `up` points to the
-    image's upper edge and need not be square to the view. Raises `InputError` where the three do
-    not fix a pose.
+    Base coordinates, m. Camera axes: z forward, x right, y down. `up` points to the image's upper
+    edge and need not be orthogonal to the view.
+    Raises InputError if the three vectors do not determine a pose.
     """
     eye, target, above = (np.asarray(v, dtype=float) for v in (position, look_at, up))
     forward = target - eye
@@ -344,7 +357,7 @@ def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
             found=f"look_at {list(look_at)}",
             expected="a point in the middle of the image, away from position",
         )
-    # Lengths taken out first, so that the angle below is one between unit vectors.
+    # Normalise first: the angle below is between directions.
     forward = forward / np.linalg.norm(forward)
     above = above / max(float(np.abs(above).max()), np.finfo(float).tiny)
     right = np.cross(forward, above)
@@ -360,8 +373,8 @@ def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
     return pose(R_camera_base, -R_camera_base @ eye)
 
 
-def _read(folder: Path) -> tuple[Path, Document]:
-    """The session's folder and file; its version is looked at before anything else in it."""
+def _session_document(folder: Path) -> tuple[Path, Document]:
+    """Folder and session.yaml of a session, its format version checked before its content."""
     if folder.name == SESSION_FILE_NAME and folder.is_file():
         folder = folder.parent
     if not folder.is_dir():
@@ -394,8 +407,10 @@ def _read(folder: Path) -> tuple[Path, Document]:
     return folder, document
 
 
-def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
-    """The path of a file that session.yaml names, relative to it."""
+def _regular_file(folder: Path, document: Document, name: str, keys: Keys) -> Path:
+    """Path of a regular file named in session.yaml, relative to the session's folder; raises
+    InputError.
+    """
     path = folder / name
     try:
         check_regular(path, name)
@@ -408,7 +423,7 @@ def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
         ) from None
     except InputError as error:
         raise error.located(document.where(*keys)) from None
-    except OSError as error:  # such as a name that no file can have
+    except OSError as error:  # e.g. an invalid file name
         raise InputError(
             f"the file cannot be read ({error.strerror})", where=document.where(*keys), found=name
         ) from None
@@ -418,16 +433,20 @@ def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
 def _machine(
     folder: Path, document: Document, source: str, model: str | None
 ) -> tuple[Machine, Path | str]:
-    """The machine, and what to load other models of it from."""
+    """Machine, and the source from which its other models are loaded: a file's path or a built-in
+    name.
+    """
     looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
     if looks_like_path or len(source) > LONGEST_NAME or (folder / source).is_file():
-        path = _existing(folder, document, source, ("mechanism",))
+        path = _regular_file(folder, document, source, ("mechanism",))
         return load_mechanism(path, label=source, model=model), path
     return load_mechanism(source, label=document.where("mechanism"), model=model), source
 
 
 def _check_redundant(document: Document, machine: Machine) -> None:
-    """Without a station, readings have only each other to be held against."""
+    """Refuse sessions of readings alone for machines without redundant actuators: nothing
+    constrains the geometry.
+    """
     if machine.redundancy > 0:
         return
     raise InputError(
@@ -447,17 +466,19 @@ def _links(
     names: tuple[str, ...],
     machine: Machine,
 ) -> tuple[LinkSet, ...]:
-    """Tables of what links two configurations, by kind."""
+    """Measurements that depend on two configurations, by kind, read from their tables."""
     out: list[LinkSet] = []
     for code, node in schema.links().items():
         kind = kinds_of(LinkKind)[code]
-        path = _existing(folder, document, kind.table(node), (kind.key, "file"))
+        path = _regular_file(folder, document, kind.table(node), (kind.key, "file"))
         out.append(kind.read(node, path, names, machine))
     return tuple(out)
 
 
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:
-    """The board's file, and whether those that observe it can use it."""
+    """Path of the board's file, None without a board; raises InputError if stations cannot use the
+    board as stated.
+    """
     users = schema.observers("board")
     if schema.board is None:
         if users:
@@ -471,11 +492,15 @@ def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | 
         _check_base_board(document, schema, users)
     written = document.data["board"]
     keys: Keys = ("board",) if isinstance(written, str) else ("board", "file")
-    return _existing(folder, document, schema.board.file, keys)
+    return _regular_file(folder, document, schema.board.file, keys)
 
 
 def _check_base_board(document: Document, schema: SessionDocument, users: list[str]) -> None:
-    """A board on the base joins stations that observe legs; alone it tells nothing."""
+    """Refuse stations that observe only a board on the base.
+
+    Such a board relates stations that also observe legs; alone it has no information on the
+    machine.
+    """
     legs = schema.observers("legs")
     alone = [name for name in users if name not in legs]
     if not alone:
@@ -492,6 +517,7 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
 
 
 def _workspace(document: Document, schema: SessionDocument) -> Region | None:
+    """Region of the session, None if not stated; raises InputError with its location."""
     if schema.workspace is None:
         return None
     try:
@@ -500,8 +526,10 @@ def _workspace(document: Document, schema: SessionDocument) -> Region | None:
         raise error.located(document.where("workspace")) from None
 
 
-def _of_little_use(document: Document, schema: SessionDocument) -> list[Finding]:
-    """A board that is described, and serves nothing."""
+def _unused_board(document: Document, schema: SessionDocument) -> list[Finding]:
+    """Warnings about a board without effect: observed by no station, or on the base and observed by
+    a single fixed station.
+    """
     users = schema.observers("board")
     if schema.board is None:
         return []
@@ -523,21 +551,21 @@ def _stations(
     names: tuple[str, ...],
     measured: bool,
 ) -> list[Station]:
-    """An entry's station; where the camera was held by hand, one for each photograph."""
+    """Stations of an entry: one, or one for each image of a hand-held camera."""
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
-    photographs = find_photographs(folder, station.images, names, where, needed=measured)
+    images = find_images(folder, station.images, names, where, needed=measured)
     from_exif = station.camera == EXIF_CAMERA_WORD
     if from_exif:
         label = document.where(*keys, "camera")
-        camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in photographs], label)
+        camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in images], label)
         camera_file = f"exif/{name}.yaml"
     else:
         camera_file = station.camera
         _, inside = camera_path(folder / camera_file)
-        _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
+        _regular_file(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
         camera = load_camera(folder / camera_file, label=camera_file)
-    endings = {photo.path.suffix.lower() for photo in photographs}
+    endings = {image.path.suffix.lower() for image in images}
     usual: Response = "srgb" if endings and endings <= JPEG_FILE_ENDINGS else "linear"
     T_camera_base = None
     if station.handheld:
@@ -557,21 +585,21 @@ def _stations(
         except InputError as error:
             raise error.located(document.where(*keys, "pose")) from None
     whole = Station(
-        name, camera, camera_file, T_camera_base, photographs, station.observe, name,
+        name, camera, camera_file, T_camera_base, images, station.observe, name,
         station.handheld, from_exif, station.response or usual, station.response is not None,
     )  # fmt: skip
     if not station.handheld:
         return [whole]
-    check_count(len(photographs), MOST_HANDHELD_IMAGES, "photographs by hand", where)
+    check_count(len(images), MOST_HANDHELD_IMAGES, "photographs by hand", where)
     return [
-        replace(whole, name="-".join(filter(None, called)), photographs=(photo,))
-        for photo in photographs
-        for called in [(name, names[photo.configuration], photo.repeat)]
+        replace(whole, name="-".join(filter(None, called)), photographs=(image,))
+        for image in images
+        for called in [(name, names[image.configuration], image.repeat)]
     ]
 
 
 def _check_handheld(document: Document, name: str, station: StationDocument) -> None:
-    """What a camera that is held by hand cannot have."""
+    """Refuse a pose for a hand-held camera, and hand-held images of a board alone."""
     keys: Keys = ("stations", name)
     if station.pose is not None:
         raise InputError(
@@ -590,14 +618,14 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
 
 
-def _turned(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
-    """Photographs that were turned by a quarter after they were taken; raises `InputError` for one
-    of another size than its camera.
+def _rotated_images(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
+    """Warnings about images rotated by 90 degrees after they were taken; raises InputError for an
+    image whose size differs from its camera's.
     """
     turned: list[str] = []
-    for station, photo in ((s, photo) for s in stations for photo in s.photographs):
-        label, wanted = label_of(folder, photo.path), tuple(station.camera.image_size)
-        width, height = size = photograph_header(photo.path, label)
+    for station, image in ((s, image) for s in stations for image in s.photographs):
+        label, wanted = label_of(folder, image.path), tuple(station.camera.image_size)
+        width, height = size = image_header(image.path, label)
         if wanted not in (size, (height, width)):
             raise InputError(
                 "the photograph has another size than its camera",
@@ -615,23 +643,25 @@ def _turned(folder: Path, stations: tuple[Station, ...]) -> list[Finding]:
 
 
 def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
-    """The same photographs under two stations are a line copied and not changed."""
+    """Refuse the same images in two stations (for the same observation): a line was copied and not
+    edited.
+    """
     owners: dict[tuple[str, str], str] = {}
     for station in stations:
-        for photo in station.photographs:
-            path = os.path.realpath(photo.path)
+        for image in station.photographs:
+            path = os.path.realpath(image.path)
             others = {owners.setdefault((path, w), station.name) for w in station.observe}
             for other in others - {station.name}:
                 raise InputError(
                     f"station {station.name} has the photographs of station {other}",
                     where=document.where("stations", station.name, "images"),
-                    found=photo.path.name,
+                    found=image.path.name,
                     expected="its own photographs; a station is one camera in one place",
                 )
 
 
 def _check_tables_distinct(folder: Path, document: Document, schema: SessionDocument) -> None:
-    """The same table under two stations would be measured twice."""
+    """Refuse the same tracker table in two stations: its measurements would count twice."""
     owners: dict[str, str] = {}
     for name, station in schema.trackers.items():
         table = station.tracker.poses
@@ -646,8 +676,8 @@ def _check_tables_distinct(folder: Path, document: Document, schema: SessionDocu
 
 
 def _check_noise(document: Document, schema: SessionDocument, machine: Machine) -> None:
-    """Raise InputError for a noise in metres that is no smaller than the machine's parts."""
-    places: list[tuple[tuple[str, ...], float]] = [
+    """Refuse standard deviations of lengths that are not smaller than the machine's parts."""
+    noises: list[tuple[tuple[str, ...], float]] = [
         (("stations", name, "tracker", "noise", "position"), station.tracker.noise.position)
         for name, station in schema.trackers.items()
     ]
@@ -655,15 +685,15 @@ def _check_noise(document: Document, schema: SessionDocument, machine: Machine) 
         kind = kinds_of(LinkKind)[code]
         noise = kind.noise(node)
         if noise is not None and kind.unit == "m":
-            places.append(((kind.key, "noise"), noise))
+            noises.append(((kind.key, "noise"), noise))
     if "m" in machine.joint_units:
-        places.append((("joints", "noise"), schema.joints.noise))
-    for keys, value in places:
-        check_plausible(value, machine, document.where(*keys), "a standard deviation")
+        noises.append((("joints", "noise"), schema.joints.noise))
+    for keys, sigma in noises:
+        check_plausible(sigma, machine, document.where(*keys), "a standard deviation")
 
 
 def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:
-    """Straight paths lead through configurations that the readings' table has."""
+    """Refuse straight paths with unknown or fewer than SHORTEST_PATH configurations."""
     names = set(table.names)
     for name, members in (schema.paths or {}).items():
         for k, member in enumerate(members):
@@ -685,7 +715,7 @@ def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -
 
 
 def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) -> None:
-    """A photograph by hand is a station of its own, and must not have another one's name."""
+    """Refuse equal names of stations; each hand-held image is a station of its own."""
     many = Counter(station.name for station in stations)
     twice = next((name for name, count in many.items() if count > 1), None)
     if twice is not None:
@@ -698,25 +728,28 @@ def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) 
         )
 
 
-def _unphotographed(
+def _unmeasured(
     table: CsvTable,
     stations: tuple[Station, ...],
     trackers: tuple[PoseTable, ...],
     links: tuple[LinkSet, ...],
 ) -> list[Finding]:
-    taken = {photo.configuration for station in stations for photo in station.photographs}
-    taken |= {int(k) for tracker in trackers for k in tracker.configuration}
-    taken |= {int(k) for one in links for k in one.configuration.ravel()}
-    if len(taken) < 2:
+    """Warning about configurations without measurements; raises InputError if fewer than two have
+    any.
+    """
+    measured = {image.configuration for station in stations for image in station.photographs}
+    measured |= {int(k) for tracker in trackers for k in tracker.configuration}
+    measured |= {int(k) for one in links for k in one.configuration.ravel()}
+    if len(measured) < 2:
         raise InputError(
             "only one configuration was measured"
             if trackers or links
             else "only one configuration has photographs",
             where=table.label,
-            found=table.names[min(taken)],
+            found=table.names[min(measured)],
             expected="two at least; one cannot tell a joint's place from its offset",
         )
-    missing = [name for row, name in enumerate(table.names) if row not in taken]
+    missing = [name for row, name in enumerate(table.names) if row not in measured]
     if not missing:
         return []
     return [
@@ -731,12 +764,12 @@ def _unphotographed(
     ]
 
 
-def _resolved(
+def _resolved_document(
     folder: Path, schema: SessionDocument, table: CsvTable, stations: tuple[Station, ...]
 ) -> dict[str, Any]:
-    """session.yaml with everything that was found for it, in plain data."""
+    """Content of session.yaml as plain data, with columns, readings and image files written out."""
     document = schema.model_dump(mode="json")
-    for kind in kinds_of(LinkKind).values():  # a digest does not depend on which kinds there are
+    for kind in kinds_of(LinkKind).values():  # keep digests independent of unused kinds
         if document[kind.key] is None:
             del document[kind.key]
     document["joints"]["columns"] = list(table.columns)
@@ -744,29 +777,32 @@ def _resolved(
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
-        files = [label_of(folder, photo.path) for photo in station.photographs]
+        files = [label_of(folder, image.path) for image in station.photographs]
         entry["photographs"] = entry.get("photographs", []) + files
     return document
 
 
 def digests(session: Session) -> dict[str, list[str]]:
-    """Short digests of the photographs' files by configuration."""
+    """Short digests of the image files, by configuration."""
     out: dict[str, list[str]] = {}
     for station in session.stations:
-        for photo in station.photographs:
-            name = session.configurations[photo.configuration]
-            digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
+        for image in station.photographs:
+            name = session.configurations[image.configuration]
+            digest = blake2b(image.path.read_bytes(), digest_size=8).hexdigest()
             out.setdefault(name, []).append(digest)
     return out
 
 
 def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -> str:
-    """A short digest of everything that a result depends on: readings, drawing, cameras, board,
-    trackers' tables and photographs, by :func:`digests`.
+    """Short digest of everything that a result depends on: readings, nominal model, cameras, board,
+    tables of trackers and links, and images.
 
-    Of what the files say, not of their bytes: comments and the user's notes leave it as it is.
+    photographs : :func:`digests` of the session.
+
+    The digest is of values, not of the files' bytes (board and images excepted): comments and the
+    user's notes do not change it.
     """
-    words = {name: value for name, value in session.document.items() if name != "notes"}
+    entries = {name: value for name, value in session.document.items() if name != "notes"}
     cameras = {
         s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
         for s in session.stations
@@ -774,6 +810,13 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
     tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
     tables += [[one.configuration, one.value, one.sigma] for one in session.links]
     board = session.board.read_bytes() if session.board else b""
-    all_of_it = [words, session.machine.to_document(), session.model, cameras, tables, photographs]
+    all_of_it = [
+        entries,
+        session.machine.to_document(),
+        session.model,
+        cameras,
+        tables,
+        photographs,
+    ]
     text = json_text(all_of_it) + blake2b(board).hexdigest()
     return blake2b(text.encode("utf-8"), digest_size=8).hexdigest()

@@ -1,9 +1,9 @@
-"""poses.csv: what a laser tracker, a measuring machine or a probe saw of the platform.
+"""Tables of poses of the platform, measured by a laser tracker, a measuring machine or a probe.
 
-One row a configuration: whole poses (x, y, z and a quaternion qw, qx, qy, qz or a rotation vector
-rx, ry, rz), points (x, y, z), or heights above a flat bed (z). All in metres and radians, in the
-tracker's own frame, which may stand anywhere; the bed's frame has its z axis upwards, as the base.
-What is measured is a target fixed to the platform; where on it, the calibration finds out.
+One row for each configuration: poses (x, y, z and a quaternion qw, qx, qy, qz or a rotation vector
+rx, ry, rz), points (x, y, z), or heights above a flat bed (z). Lengths in metres and angles in
+radians, in the tracker's own frame, which is arbitrary; the bed's frame has its z axis upwards, as
+the base. The measured target is fixed to the platform; its place on the platform is estimated.
 """
 
 from __future__ import annotations
@@ -31,19 +31,24 @@ from pkmcal.measurements.tracker_poses import TrackerPoses
 from pkmcal.wording import listed
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
-"""By which a quaternion may be longer or shorter than one: three written digits leave as much."""
+"""Allowed deviation of a quaternion's length from one: the rounding of three digits."""
 OTHER_UNIT_SPREAD_FACTOR = 30.0
-"""Times the machine's own motion from which a table's lengths are in another unit."""
+"""Ratio of a table's spread to the machine's own motion above which its lengths are in another
+unit."""
 
 
 @dataclass(frozen=True)
 class PoseTable:
-    """A tracker's measurements.
+    """Measurements of one tracker.
 
-    name : of the station. kind : code of what was measured. configuration : (N,) rows of the
-    session's readings. T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z,
-    mean nothing. position, rotation : standard deviations, m and rad. level : its z axis is the
-    base's, exactly.
+    name : of the station.
+    label : the table's name in messages.
+    kind : code of the kind of measurement.
+    configuration : (N,) rows of the session's readings.
+    T : (N, 4, 4) T_tracker_target. The rotation of a point, and all but z of a height, are
+        placeholders.
+    position, rotation : standard deviations, m and rad.
+    level : whether the tracker's z axis is exactly the base's.
     """
 
     name: str
@@ -59,23 +64,29 @@ class PoseTable:
 
     @classmethod
     def to_come(cls, name: str, label: str, position: float, rotation: float | None) -> PoseTable:
-        """Of a tracker that has not measured yet: poses, or points where it tells no turn."""
+        """Empty table of a tracker that has not measured yet: of poses, or of points without
+        rotation noise.
+        """
         kind = TrackerPoints.code if rotation is None else TrackerPoses.code
         none = np.zeros(0, dtype=int)
         return cls(name, label, kind, none, np.zeros((0, 4, 4)), position, rotation)
 
     @property
     def target(self) -> type[TargetKind]:
-        """Its kind of measurement."""
+        """Kind of measurement."""
         return kinds_of(TargetKind)[self.kind]
 
     @property
     def whiten(self) -> Array:
-        """(6, 6) of one measurement, as of :class:`~pkmcal.measurements.PoseSet`."""
+        """Whitening matrix (6, 6) of a measurement, see :class:`~pkmcal.measurements.PoseSet`."""
         return self.target.whiten(self.position, self.rotation)
 
     def poses(self, station: int, mount: int) -> PoseSet:
-        """The measurements; what is not measured has rows of zeros."""
+        """Measurements as a set; components that are not measured have zero rows in the whitening
+        matrices.
+
+        station, mount : indices of the tracker's station and of the target.
+        """
         n = len(self.configuration)
         return PoseSet(
             station=np.full(n, station),
@@ -86,8 +97,8 @@ class PoseTable:
         )
 
     def start(self, T_base_platform: Array) -> Array | None:
-        """A first T_tracker_base (4, 4) from the platform's poses (K, 4, 4) by the drawing; None
-        for whole poses, which tell it themselves.
+        """Initial T_tracker_base (4, 4) from the platform's nominal poses (K, 4, 4); None for full
+        poses, which need none.
         """
         return self.target.start(self.T, T_base_platform[self.configuration, :3, 3])
 
@@ -102,10 +113,12 @@ def read_poses(
     *,
     level: bool = False,
 ) -> PoseTable:
-    """Read a table; every fault is an InputError with line and column.
+    """Read a table of a tracker; raises InputError with line and column.
 
-    names : the session's configurations. position, rotation_noise : standard deviations. name :
-    of the station. level : as of :class:`PoseTable`.
+    names : configurations of the session.
+    position, rotation_noise : standard deviations, m and rad.
+    name : of the station.
+    level : as in :class:`PoseTable`.
     """
     table = read_csv(path, label=label)
     kind = _kind(table)
@@ -128,9 +141,9 @@ def read_poses(
             expected=f"{kind.fewest_rows} at least",
         )
     column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
-    nothing = np.zeros(len(rows))
-    t = np.stack([column.get(axis, nothing) for axis in POINT_COLUMNS], axis=-1)
-    T = pose(_turn(table, column), t)
+    zeros = np.zeros(len(rows))
+    t = np.stack([column.get(axis, zeros) for axis in POINT_COLUMNS], axis=-1)
+    T = pose(_rotations(table, column), t)
     if level and not kind.levels:
         raise InputError(
             "only of heights can be said that the bed is level",
@@ -143,25 +156,25 @@ def read_poses(
 
 
 def _kind(table: CsvTable) -> type[TargetKind]:
-    """Which kind of measurement it is, by its header."""
-    actual_names, kinds = set(table.columns), kinds_of(TargetKind)
+    """Kind of measurement, from the table's header."""
+    header, kinds = set(table.columns), kinds_of(TargetKind)
     for kind in kinds.values():
-        if any(actual_names == set(columns) for columns in kind.headers):
+        if any(header == set(columns) for columns in kind.headers):
             return kind
     headers = sorted((h for kind in kinds.values() for h in kind.headers), key=len, reverse=True)
     names = sorted({name for columns in headers for name in columns})
-    strange = [name for name in table.columns if name not in names]
-    guess = closest(strange[0], names) if strange else None
+    unknown = [name for name in table.columns if name not in names]
+    guess = closest(unknown[0], names) if unknown else None
     raise InputError(
-        "this column is not known" if strange else "these columns together mean nothing",
+        "this column is not known" if unknown else "these columns together mean nothing",
         where=f"{table.label}, line 1",
-        found=strange[0] if strange else listed(table.columns, 12),
+        found=unknown[0] if unknown else listed(table.columns, 12),
         expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in headers),
     )
 
 
-def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
-    """Rotations (N, 3, 3); none for points."""
+def _rotations(table: CsvTable, column: dict[str, Array]) -> Array:
+    """Rotations (N, 3, 3) of the rows; identity for points and heights."""
     if "qw" in column:
         q = np.stack([column[name] for name in QUATERNION_COLUMNS], axis=-1)
         length = np.linalg.norm(q, axis=1)
@@ -191,20 +204,20 @@ def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
 
 
 def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
-    """Raise `InputError` where the table's lengths are not metres.
+    """Raise InputError if the table's lengths are not in metres.
 
-    T_base_platform : (K, 4, 4) by the drawing, NaN where it has none.
+    T_base_platform : (K, 4, 4) nominal poses, NaN where the nominal model has no solution.
     """
-    there = T_base_platform[table.configuration, :3, 3]
-    shifted = float(np.nanmax(np.nanstd(there, axis=0)))
+    nominal = T_base_platform[table.configuration, :3, 3]
+    motion = float(np.nanmax(np.nanstd(nominal, axis=0)))
     measured = table.target.lengths(table.T)
     spread = float(np.max(np.std(measured, axis=0)))
-    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(shifted, 1e-6):
+    if spread <= OTHER_UNIT_SPREAD_FACTOR * max(motion, 1e-6):
         return
     raise InputError(
         "the table's lengths look like millimetres",
         where=table.label,
         found=f"positions that vary by {spread:.4g}",
-        expected=f"metres; the platform itself moves by {shifted:.3g} by its readings",
+        expected=f"metres; the platform itself moves by {motion:.3g} by its readings",
         next_step="Divide x, y and z by 1000, or head them x [mm], y [mm], z [mm]",
     )

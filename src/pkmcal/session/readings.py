@@ -1,4 +1,4 @@
-"""Joint readings against their machine: columns, units, ranges, and whether the machine moved."""
+"""Checks of joint readings against their machine: columns, units, signs, ranges, movement."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from pkmcal.measurements import Effect, ModelViolation
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
-# A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
-# is out by less than this part of the stroke is told, and one that is further out is refused.
+# Margin beyond a joint's nominal range, as a share of its stroke. The range is no hard stop: homing
+# shifts it by the prior sigma of the offset. Readings within the margin give a warning, readings
+# beyond it are refused.
 _MARGIN = 0.05
-# Largest difference within K equal readings, in standard deviations: below 6 for any K under
-# a million, so more than this is movement.
+# Largest range of K repeated readings, in standard deviations: below 6 for any K under a million,
+# so a larger range is movement.
 _SAME_SIGMAS = 6.0
 _UNITS = {
     "m": (
@@ -37,15 +38,17 @@ _UNITS = {
         "Multiply them by pi/180, or head them motor1 [deg] and so on",
     ),
 }
+"""By SI unit: factor from the likely wrong unit, its name, the right one's name, and the remedy."""
 
 
 def check_readings(
     table: CsvTable, ranges: Array, noise: float, units: Sequence[str]
 ) -> list[Finding]:
-    """Raise `InputError` for readings that cannot be this machine's; return warnings.
+    """Raise InputError for readings that are impossible for the machine; return warnings.
 
-    ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
-    noise : standard deviation of a reading, m or rad. units : ``m`` or ``rad`` of each joint.
+    ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN if unknown.
+    noise : standard deviation of a reading, m or rad.
+    units : ``m`` or ``rad`` for each joint.
     """
     _check_columns(table, len(ranges))
     table.check_kinds(units)
@@ -64,17 +67,18 @@ def check_readings(
 
 
 def _check_columns(table: CsvTable, n_joints: int) -> None:
-    names = len(table.columns)
-    if names != n_joints:
+    """Check number and order of the columns."""
+    n_columns = len(table.columns)
+    if n_columns != n_joints:
         raise InputError(
             "another number of joint columns than the machine has actuated legs",
             where=f"{table.label}, line 1",
-            found=f"{names} ({', '.join(table.columns)})",
+            found=f"{n_columns} ({', '.join(table.columns)})",
             expected=str(n_joints),
         )
     numbers = [re.fullmatch(r"leg(\d+)", name) for name in table.columns]
     order = [int(match[1]) for match in numbers if match]
-    if len(order) == names and order != sorted(order):
+    if len(order) == n_columns and order != sorted(order):
         raise InputError(
             "the columns are not in the order of the machine's legs",
             where=f"{table.label}, line 1",
@@ -86,7 +90,7 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 
 
 def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
+    """Refuse readings in mm or degrees: most are out of range, and in range after conversion."""
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
         finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
         if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
@@ -105,7 +109,9 @@ def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
 
 
 def _check_signs(table: CsvTable, ranges: Array) -> None:
-    """A joint whose readings are out of range, and in range with the other sign."""
+    """Refuse a joint whose readings are mostly out of range and all in range with the opposite
+    sign.
+    """
     here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
     wrong = np.flatnonzero((here.mean(axis=0) < 0.5) & there.all(axis=0))
     if not wrong.size:
@@ -125,31 +131,31 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
 
 
 def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Most readings of all joints, or of some, out of range, and all in it after one constant
-    shift: counted from another place, not so many mistakes.
+    """Refuse readings with another zero point: readings of all joints, or of some, that are mostly
+    out of range and are all in range after one constant shift.
     """
-    inside, loosely = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
-    if loosely.all():
+    inside, near = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
+    if near.all():
         return
-    few = inside.mean(axis=0) < 0.5
+    outside = inside.mean(axis=0) < 0.5
     for unit in dict.fromkeys(units):
         same = np.array(units) == unit
-        for which in (same, same & few):
-            if not which.any() or inside[:, which].mean() > 0.5 or not loosely[:, ~which].all():
+        for which in (same, same & outside):
+            if not which.any() or inside[:, which].mean() > 0.5 or not near[:, ~which].all():
                 continue
             low, high = ranges[which].T
-            values, slack = table.values[:, which], _MARGIN * (high - low)
-            # fmax, fmin: a range that is not known allows any shift
-            least = float(np.fmax.reduce(low - slack - values.min(axis=0)))
-            most = float(np.fmin.reduce(high + slack - values.max(axis=0)))
+            readings, slack = table.values[:, which], _MARGIN * (high - low)
+            # fmax and fmin ignore NaN: an unknown range allows any shift
+            least = float(np.fmax.reduce(low - slack - readings.min(axis=0)))
+            most = float(np.fmin.reduce(high + slack - readings.max(axis=0)))
             if least <= most:
-                raise _shifted(table, ranges, which, (least, most), unit)
+                raise _shift_error(table, ranges, which, (least, most), unit)
 
 
-def _shifted(
+def _shift_error(
     table: CsvTable, ranges: Array, which: Booleans, shift: tuple[float, float], unit: str
 ) -> InputError:
-    """The error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
+    """Error about joints ``which`` (m,) whose readings are in range after a shift (least, most)."""
     column = int(np.flatnonzero(which)[0])
     low, high = ranges[column]
     scale, name = DISPLAY_UNITS[unit]
@@ -169,6 +175,9 @@ def _shifted(
 
 
 def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
+    """Refuse readings beyond the margin of their range; return a warning about those within the
+    margin.
+    """
     far = np.argwhere(~_inside(table.values, ranges))
     if len(far):
         row, column = far[0]
@@ -202,12 +211,14 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
 
 
 def unmoved_readings(joints: Array, noise: float) -> Booleans:
-    """(m,) which of the readings (K, m) never move by more than their noise."""
+    """Whether each column of readings (K, m) varies by no more than its noise, (m,)."""
     return np.ptp(joints, axis=0) <= _SAME_SIGMAS * noise
 
 
 def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
-    """The error about readings that never moved, where the data contradict the readings."""
+    """Error about readings that never change, for data that contradict the readings; None if all
+    change.
+    """
     still = np.flatnonzero(unmoved_readings(joints, noise)).tolist() if len(joints) else []
     if not still:
         return None
@@ -227,12 +238,15 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
 def reading_violations(
     joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
 ) -> tuple[list[ModelViolation], list[ModelViolation]]:
-    """What may be otherwise with readings (K, m): of each its scale, beyond its tolerance, and its
-    play, by which it differs with the way from which its motor came, in the order of the table.
+    """Model violations of readings (K, m): for each joint a scale beyond its prior sigma, and a
+    play (backlash) that depends on the motor's last direction of motion in the order of the table.
 
-    units : (m,). present : (m,) the scales of the estimate, over the drawing's. A scale that is
-    free beside its tolerance leaves that one to the drawing again, so the value that fits is all of
-    the difference, as the present scale counts it.
+    units : (m,).
+    present : (m,) estimated scales relative to the nominal model.
+
+    A score-tested scale has no prior, so its estimate is the full difference from the nominal
+    scale, expressed relative to the present scale; the fact ``value`` is relative to the nominal
+    one.
     """
     direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
     scales: list[ModelViolation] = []
@@ -256,7 +270,7 @@ def reading_violations(
 
 
 def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
-    """A single reading that is wrong."""
+    """Model violation of one reading; its column is added by the caller."""
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {
@@ -271,6 +285,7 @@ def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
+    """Refuse readings of which none changes; return a warning about joints that do not move."""
     still = unmoved_readings(table.values, noise)
     if still.all():
         raise InputError(
@@ -283,16 +298,17 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
         )
     if not still.any():
         return []
-    names = [name for name, similar in zip(table.columns, still, strict=True) if similar]
+    names = [name for name, is_still in zip(table.columns, still, strict=True) if is_still]
     return [doubtful("readings.unmoved", table.label, columns=names)]
 
 
 def same_pose(joints: Array, noise: float) -> Integers:
-    """(K,) of each of the readings (K, m) the first row whose readings differ from its own by no
-    more than noise explains: rows of one pose share it.
+    """Row (K,) of the first reading vector that equals each row of readings (K, m) within noise.
+
+    Rows of one pose share this index.
     """
     owner = np.full(len(joints), -1)
-    # by the reading that spreads most, so that each row is held against few others
+    # Sort by the joint with the largest range, so that each row is compared with few others.
     spread = joints[:, np.argmax(np.ptp(joints, axis=0))]
     order = np.argsort(spread, kind="stable")
     far = np.searchsorted(
@@ -307,12 +323,13 @@ def same_pose(joints: Array, noise: float) -> Integers:
 
 
 def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Finding]]:
-    """The table with rows of one pose made one, at their mean, and a sentence about them.
+    """Table with the rows of one pose replaced by their mean, and a warning about them.
 
-    For readings that are calibrated by themselves. What the model leaves out, a belt that sags or a
-    hook that is no point, is alike in all repeats of a pose; as so many measurements they would
-    promise too much. Rows are of one pose where no reading differs by more than noise explains.
-    Over so small a step the closures are straight, so a mean of rows is what the mean pose reads.
+    Used for self-calibration from readings alone. Model errors, such as a belt that sags or a hook
+    that is no point, are the same in all repeats of a pose; counted as independent measurements,
+    the repeats would make sigma too small. Rows belong to one pose if no reading differs by more
+    than noise. Over such small steps the closure equations are linear, so the mean of the rows is a
+    reading of the mean pose.
     """
     first, group = np.unique(same_pose(table.values, noise), return_inverse=True)
     if len(first) == len(group):
@@ -330,8 +347,10 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
 
 
 def _inside(values: Array, ranges: Array, margin: float = _MARGIN) -> np.ndarray:
-    """(K, m) True where a reading lies in its range widened by `margin` of it, or has none."""
+    """Whether each reading (K, m) is inside its range, widened by `margin` of the stroke; True for
+    unknown ranges.
+    """
     low, high = ranges[:, 0], ranges[:, 1]
     slack = margin * (high - low)
-    # Negated, so that NaN, a range that is not known, counts as inside.
+    # Negated, so that NaN (an unknown range) counts as inside.
     return ~((values < low - slack) | (values > high + slack))

@@ -1,4 +1,4 @@
-"""The form of session.yaml; what it means, and whether it holds together, is `session`'s."""
+"""Schema of session.yaml; consistency across fields and files is checked by `session.load`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pkmcal.files import MOST_STATIONS, Metres, Point, Radians, Reading, Schema,
 from pkmcal.measurements.contract import NOISE_FIELD_RANGE, LinkKind, kinds_of
 
 BoardBody = Literal["base", "platform"]
-"""What a board may be fixed to."""
+"""Bodies to which a board can be fixed."""
 Vector = tuple[float, float, float]
 OBSERVE_WORDS = ("legs", "board")
-"""What a station can observe, in the order in which it is written back."""
+"""Objects that a station can observe, in the order of output."""
 
 
 class JointsDocument(Schema):
-    """``joints``: where the readings are, and how good."""
+    """Entry ``joints``: file and noise of the readings."""
 
     file: str = Field(description="the readings' file, for example joints.csv")
     noise: Annotated[Reading, NOISE_FIELD_RANGE] = Field(
@@ -28,15 +28,15 @@ class JointsDocument(Schema):
 
 
 class PoseDocument(Schema):
-    """``pose``: a rough camera pose, by hand, in metres in the base frame."""
+    """Entry ``pose``: rough camera pose in the base frame, m."""
 
     position: Point = Field(description="the camera's place in the base frame, [x, y, z] in m")
     look_at: Point = Field(description="a point in the image's middle, base frame, [x, y, z] in m")
     up: Vector = (0.0, 0.0, 1.0)
 
 
-def _words(value: Any) -> tuple[str, ...]:
-    """``legs``, ``board`` or a list of them, as a tuple without order."""
+def _observe_words(value: Any) -> tuple[str, ...]:
+    """Normalise ``observe``: one word or a list, as a tuple in the order of OBSERVE_WORDS."""
     words: list[Any] = value if isinstance(value, list) else [value]
     if not words:
         raise ValueError("the list is empty; a station observes legs, board, or [legs, board]")
@@ -53,11 +53,11 @@ def _words(value: Any) -> tuple[str, ...]:
 
 
 class StationDocument(Schema):
-    """One entry of ``stations``: a camera in one place, or by hand, one place a photograph."""
+    """Entry of ``stations``: a camera at one place, or hand-held at one place for each image."""
 
     camera: str = Field(description="the camera's file, for example cameras/front.yaml, or exif")
     images: str = Field(description="a pattern such as images/front/{configuration}.png")
-    observe: Annotated[tuple[str, ...], BeforeValidator(_words)] = Field(
+    observe: Annotated[tuple[str, ...], BeforeValidator(_observe_words)] = Field(
         description="legs, board, or [legs, board]"
     )
     pose: PoseDocument | None = None
@@ -70,7 +70,7 @@ class StationDocument(Schema):
 
 
 class NoiseDocument(Schema):
-    """``noise`` of a tracker, one standard deviation."""
+    """Entry ``noise`` of a tracker: standard deviations."""
 
     position: Annotated[Metres, NOISE_FIELD_RANGE] = Field(
         description="the standard deviation of a coordinate in metres, such as 2.0e-5"
@@ -81,7 +81,7 @@ class NoiseDocument(Schema):
 
 
 class TrackerDocument(Schema):
-    """``tracker``: a laser tracker, a measuring machine or a probe instead of a camera."""
+    """Entry ``tracker``: a laser tracker, a measuring machine or a probe instead of a camera."""
 
     poses: str = Field(description="the table of what it measured, for example poses.csv")
     noise: NoiseDocument = Field(description="noise: {position: 2.0e-5, rotation: 1.0e-4}")
@@ -89,13 +89,13 @@ class TrackerDocument(Schema):
 
 
 class TrackerStationDocument(Schema):
-    """One entry of ``stations``: a tracker in one place."""
+    """Entry of ``stations`` with a tracker at one place."""
 
     tracker: TrackerDocument
 
 
-def _station(value: Any) -> str:
-    """Which of the two an entry of ``stations`` is."""
+def _station_tag(value: Any) -> str:
+    """Tag of an entry of ``stations``: with a tracker or with a camera."""
     tracker = "tracker" in value if isinstance(value, dict) else hasattr(value, "tracker")
     return "with a tracker" if tracker else "with a camera"
 
@@ -103,24 +103,24 @@ def _station(value: Any) -> str:
 AnyStation = Annotated[
     Annotated[StationDocument, Tag("with a camera")]
     | Annotated[TrackerStationDocument, Tag("with a tracker")],
-    Discriminator(_station),
+    Discriminator(_station_tag),
 ]
 
 
 class BoardDocument(Schema):
-    """``board``: its file, and what it is fixed to."""
+    """Entry ``board``: its file, and the body it is fixed to."""
 
     file: str = Field(description="the board's file, for example board.yaml")
     fixed_to: BoardBody = "platform"
 
 
-def _board(value: Any) -> Any:
-    """A file alone stands for a board on the platform."""
+def _board_entry(value: Any) -> Any:
+    """Normalise ``board``: a file name alone means a board on the platform."""
     return {"file": value} if isinstance(value, str) else value
 
 
 class WorkspaceDocument(Schema):
-    """``workspace``: where the tool is to be right."""
+    """Entry ``workspace``: region in which the tool must be accurate."""
 
     x: tuple[Metres, Metres] | None = Field(default=None, description="[lowest, highest] x in m")
     y: tuple[Metres, Metres] | None = Field(default=None, description="[lowest, highest] y in m")
@@ -131,9 +131,7 @@ class WorkspaceDocument(Schema):
 
 
 class SessionDocument(Schema):
-    """session.yaml but for the keys of kinds of measurement that have their own; see
-    :func:`session_schema`.
-    """
+    """session.yaml without the keys of kinds of measurement; see :func:`session_schema`."""
 
     pkmcal: Literal[1] = Field(description="the line pkmcal: 1, the format's version")
     mechanism: str = Field(description="a mechanism's file, or a built-in's name")
@@ -143,7 +141,7 @@ class SessionDocument(Schema):
         max_length=MOST_STATIONS,
         description="one entry a camera, or a tracker, in one place",
     )
-    board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
+    board: Annotated[BoardDocument | None, BeforeValidator(_board_entry)] = None
     paths: dict[str, list[str]] | None = Field(
         default=None, description="straight paths by configurations, paths: {line: [c01, c02, c03]}"
     )
@@ -151,28 +149,28 @@ class SessionDocument(Schema):
     notes: str | None = Field(default=None, description="your own words, as text")
 
     def observers(self, word: str) -> list[str]:
-        """Names of the stations that observe legs, or the board."""
+        """Names of the stations that observe ``word``, legs or board."""
         return [name for name, station in self.cameras.items() if word in station.observe]
 
     @property
     def cameras(self) -> dict[str, StationDocument]:
-        """The stations with a camera."""
+        """Stations with a camera."""
         return {k: s for k, s in self.stations.items() if isinstance(s, StationDocument)}
 
     @property
     def trackers(self) -> dict[str, TrackerStationDocument]:
-        """The stations without one."""
+        """Stations with a tracker."""
         return {k: s for k, s in self.stations.items() if isinstance(s, TrackerStationDocument)}
 
     def links(self) -> dict[str, Schema]:
-        """What stands under the keys of measurements that link configurations, by their kinds."""
-        results = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
-        return {code: node for code, node in results.items() if node is not None}
+        """Entries of measurements that depend on two configurations, by kind, if present."""
+        nodes = {code: getattr(self, kind.key, None) for code, kind in kinds_of(LinkKind).items()}
+        return {code: node for code, node in nodes.items() if node is not None}
 
 
 @cache
 def session_schema() -> type[SessionDocument]:
-    """The whole of session.yaml, with the keys of all kinds of measurement."""
+    """Schema of the whole session.yaml, with the keys of all kinds of measurement."""
     fields: dict[str, Any] = {
         kind.key: (kind.schema | None, None) for kind in kinds_of(LinkKind).values()
     }

@@ -1,4 +1,4 @@
-"""Cameras and trackers that did not stand still while they measured."""
+"""Model violations of stations that moved during the measurement."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from pkmcal.measurements import Effect, ModelViolation
 from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
-"""Configurations on either side of a movement: fewer are outliers."""
+"""Fewest configurations before and after a movement; fewer are treated as outliers."""
 MOVEMENT_MOMENTS_TRIED = 12
-"""Times at most, spread over a station's configurations, at which it may have moved."""
+"""Most moments of movement tested for each station, spread over its configurations."""
 
 
 def movement_violations(
     station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
 ) -> Iterator[ModelViolation]:
-    """That a station stands elsewhere from some configuration on.
+    """Model violations: the station has another pose from some configuration on, one for each
+    moment tested.
 
-    station, name : its number and name. used : configurations of which it measured something, in
-    their order. what : stands there.
+    station, name : number and name of the station.
+    used : rows of the configurations that the station measured, in order.
+    configurations : names of all configurations.
+    what : camera, or another noun for messages.
     """
     few = FEWEST_BESIDE_MOVEMENT
     times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * few + 1)
@@ -45,9 +48,9 @@ def movement_violations(
 
 
 def how_far(change: Array) -> str:
-    """How far a pose moved, as the end of a sentence.
+    """Size of a pose change as the end of a sentence.
 
-    change : (omega, tau), rad and m; NaN where the data do not determine it.
+    change : (6,) omega and tau, rad and m; NaN for components that the data do not determine.
     """
     turn, shift = change[:3], change[3:]
     sizes = [

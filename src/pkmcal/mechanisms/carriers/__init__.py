@@ -1,1 +1,1 @@
-"""What carries a limb's two ends: one kind a file, behind the contract of ``contract.py``."""
+"""Kinds of limb ends: one file for each kind of joint, behind the contract of `contract`."""

@@ -1,7 +1,7 @@
-"""The H4's nacelle: two side bars, hinged on a centre bar that turns ([C] fig. 3).
+"""Side bars of the H4's nacelle, hinged on a rotating centre bar ([C] fig. 3).
 
-Where the forearms are ideal parallelograms the side bars keep their direction: ``bar``. Where
-each rod counts on its own they turn a little, freely about their hinges: ``hinged-bar``.
+With ideal parallelograms as forearms the side bars keep their direction: ``bar``. With each rod
+modelled on its own, they rotate slightly about their hinges: ``hinged-bar``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ Centre = Annotated[Point, Field(description="a point [x, y, z] in metres")]
 
 
 FOLDED_BARS_CLAUSE = "its side bars lie on each other"
-"""Where the platform has turned by a right angle."""
+"""Obstacle to a rotation of the platform by a right angle."""
 
 
 class BarDocument(Schema):
-    """``{joint: bar, center: [0, 0.06, 0], hinge: [0.06, 0, 0], bar: 1}``: metres."""
+    """Bar in a file, ``{joint: bar, center: [0, 0.06, 0], hinge: [0.06, 0, 0], bar: 1}``: m."""
 
     joint: Literal["bar"]
     center: Centre
@@ -47,7 +47,9 @@ class BarDocument(Schema):
 
 
 class HingedBarDocument(Schema):
-    """``{joint: hinged-bar, center: [...], hinge: [...], axis: [0, 0, 1], bar: 1}``: metres."""
+    """Hinged bar in a file, ``{joint: hinged-bar, center: [...], hinge: [...], axis: [0, 0, 1],
+    bar: 1}``: metres.
+    """
 
     joint: Literal["hinged-bar"]
     center: Centre
@@ -58,9 +60,12 @@ class HingedBarDocument(Schema):
 
 @final
 class Bar(PlatformCarrier):
-    """``B = t + R hinge + center``: the hinge turns with the platform, the bar does not.
+    """Joint on a bar of constant direction, ``B = t + R hinge + center``: the hinge rotates with
+    the platform, the bar does not.
 
-    hinge : platform frame. center : the joint from the hinge, along the base frame's axes.
+    hinge : platform frame.
+    center : from the hinge to the joint, along the base frame's axes.
+
     [C] fig. 3: hinge (s h, 0, 0), center (0, t d, 0).
     """
 
@@ -79,7 +84,7 @@ class Bar(PlatformCarrier):
 
     @classmethod
     def check(cls, node: BarDocument, site: Site) -> None:
-        """Bars keep their direction where the platform only turns with them."""
+        """Refuse spatial motion: bars keep their direction only if the platform does not tilt."""
         super().check(node, site)
         if site.motion == "spatial":
             raise InputError(
@@ -94,7 +99,7 @@ class Bar(PlatformCarrier):
     def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> tuple[Array, Array]:
-        """B, and the turned hinge: the bar does not turn."""
+        """B, with the rotated hinge as lever arm: the bar does not rotate."""
         del internal
         arm = turned(T_base_platform[..., :3, :3], parameters[..., 3:])
         return arm + T_base_platform[..., :3, 3] + parameters[..., :3], arm
@@ -112,13 +117,15 @@ class Bar(PlatformCarrier):
 
     @classmethod
     def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """The bar turns with the base frame, the hinge moves with the platform frame."""
+        """Parameters in new frames: the bar rotates with the base frame, the hinge moves with the
+        platform frame.
+        """
         parts = moved_direction(parameters[..., :3], e), moved_point(parameters[..., 3:], f)
         return np.concatenate(parts, axis=-1)
 
     @classmethod
     def by_frames(cls, parameters: Array) -> Array:
-        """E's columns for the bar, F's for the hinge."""
+        """Derivatives by E for the bar, by F for the hinge."""
         bar = direction_by_frame(parameters[..., :3])
         hinge = point_by_frame(parameters[..., 3:])
         none = np.zeros_like(bar)
@@ -128,21 +135,21 @@ class Bar(PlatformCarrier):
 
     @classmethod
     def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """Turns."""
+        """Rotations of both."""
         del parameters
         return turned_blocks(6, (0, e), (3, f))
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
-        """From the hinge's place on the platform along the base frame's axes."""
+        """Floating arm from the hinge, along the base frame's axes."""
         center, hinge = parameters[..., :3], parameters[..., 3:]
         return Chain("float", hinge, np.zeros_like(center), center)
 
 
 @final
 class HingedBar(PlatformCarrier):
-    """``B = t + R (hinge + Exp(phi w) center)``, w the hinge's unit axis, all in the platform
-    frame; phi is the bar's internal coordinate (errata, [C] "Rods").
+    """Joint on a hinged bar, ``B = t + R (hinge + Exp(phi w) center)``, with the hinge's unit axis
+    w, all in the platform frame; phi is the bar's internal coordinate (errata, [C] "Rods").
     """
 
     body: ClassVar = "bar"
@@ -162,7 +169,7 @@ class HingedBar(PlatformCarrier):
 
     @classmethod
     def check(cls, node: HingedBarDocument, site: Site) -> None:
-        """A bar that turns freely lets the platform tilt."""
+        """Refuse motions other than spatial: a bar that rotates freely lets the platform tilt."""
         super().check(node, site)
         if site.motion != "spatial":
             raise InputError(
@@ -175,7 +182,7 @@ class HingedBar(PlatformCarrier):
     def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> tuple[Array, Array]:
-        """B, and all of it but t."""
+        """B, with B - t as lever arm."""
         center, axis = parameters[..., :3], parameters[..., 6:]
         w = axis / np.sqrt(dot(axis, axis))[..., None]
         cos, sin = _cos_sin(internal)
@@ -187,7 +194,7 @@ class HingedBar(PlatformCarrier):
     def by_parameters(
         cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
-        """In the parameters' order."""
+        """Derivatives in the parameters' order: center, hinge, axis."""
         rot = T_base_platform[..., :3, :3]
         center, axis = parameters[..., :3], parameters[..., 6:]
         size = np.sqrt(dot(axis, axis))[..., None]
@@ -208,7 +215,9 @@ class HingedBar(PlatformCarrier):
 
     @staticmethod
     def upright(parameters: Array, T_base_platform: Array) -> Array:
-        """Minus the platform's turn about the hinge: of the turn's quaternion the part about w."""
+        """Minus the platform's rotation about the hinge: the part about w of the rotation's
+        quaternion.
+        """
         axis, rot = parameters[..., 6:], T_base_platform[..., :3, :3]
         along = dot(axial(rot), axis) / np.sqrt(dot(axis, axis))
         return -2 * np.arctan2(along, 1 + np.trace(rot, axis1=-2, axis2=-1))
@@ -227,10 +236,11 @@ class HingedBar(PlatformCarrier):
 
     @staticmethod
     def slid(parameters: Array, shift: Array, turn: Array) -> Array:
-        """The same bar with its hinge's point moved along the axis and its joints told turned.
+        """Same bar with the hinge's point moved along the axis, and the zero of phi rotated.
 
-        parameters (..., n), shift (...,) m, turn (...,) rad; internal coordinates become less by
-        the turn.
+        parameters : (..., n).
+        shift : (...,) m.
+        turn : (...,) rad; internal coordinates decrease by it.
         """
         axis = parameters[..., 6:]
         w = axis / np.sqrt(dot(axis, axis))[..., None]
@@ -241,7 +251,7 @@ class HingedBar(PlatformCarrier):
 
     @staticmethod
     def by_slide(parameters: Array) -> Array:
-        """First-order change (..., n, 2) by shift and turn."""
+        """Derivatives (..., n, 2) of :meth:`slid` by shift and turn."""
         axis = parameters[..., 6:]
         w = axis / np.sqrt(dot(axis, axis))[..., None]
         out = np.zeros((*parameters.shape, 2))
@@ -251,12 +261,13 @@ class HingedBar(PlatformCarrier):
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
-        """About w, through the hinge's place on the platform."""
+        """Rotation about w through the hinge's point on the platform."""
         axis = parameters[..., 6:]
         w = axis / np.sqrt(dot(axis, axis))[..., None]
         return Chain("turn", parameters[..., 3:6], w, parameters[..., :3])
 
 
 def _cos_sin(internal: Array | None) -> tuple[Array, Array]:
+    """Cosine and sine (..., 1) of the internal coordinate, which is zero by default."""
     phi = np.zeros(1) if internal is None else internal[..., None]
     return np.cos(phi), np.sin(phi)

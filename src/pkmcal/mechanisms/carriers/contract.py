@@ -1,12 +1,12 @@
-"""What a carrier of limb ends offers; a new kind is one file in this folder.
+"""Contract of the carriers of limb ends; a new kind of joint is one file in this folder.
 
-A limb is a rod between a point A on the base side and a point B on the platform side,
-``|B(X; theta) - A(q; theta)| = length(q; theta)``. The base carrier gives A, the platform
-carrier gives B. A carrier names the joint kinds it serves in mechanism files, the schema of
-its fields, its parameters, and the point with its exact derivatives, for any number of legs
-and configurations at once. Kinematics needs the point and how it moves, ``place``; identification
-also its derivatives by the parameters. All but ``place`` has an answer here that any carrier can
-live with; a carrier gives its own where that is faster, or where it knows better.
+A limb is a rod between a point A on the base side and a point B on the platform side, ``|B(X;
+theta) - A(q; theta)| = length(q; theta)``. The base carrier defines A, the platform carrier defines
+B. A carrier states the joint names it serves in mechanism files, the schema of its fields, its
+parameters, and the point with exact derivatives, for any number of legs and configurations at once.
+Kinematics needs ``place``, the point with its derivative by the reading or pose; identification
+needs derivatives by the parameters too. All methods but ``place`` have defaults that are valid for
+any carrier; a carrier overrides them with faster or more specific ones.
 """
 
 from __future__ import annotations
@@ -29,29 +29,32 @@ from pkmcal.files import Metres, Radians, Schema
 from pkmcal.geometry.rigid import apply, dot, skew
 
 SHORTEST_AXIS_LENGTH = 1e-6
-"""An axis shorter than this is a row of zeros, not a direction."""
+"""Length below which an axis is a row of zeros, not a direction."""
 READING_NEWTON_STEPS = 40
-"""Newton's for a reading; from mid-range they take five."""
+"""Most Newton steps for a reading; from mid-range five are enough."""
 ROD_LENGTH_ROUNDING = 1e-15
+"""Relative rounding of a rod's length, at which Newton's method for a reading stops."""
 ROD_CLOSED_SHARE = 1e-9
-"""Of a rod's length, what is left when its reading is found, and what may be at most: where the
-rod stands square to the motion, only half of the digits can be had."""
+"""Largest closure error, as a share of the rod's length, with which a reading counts as found. If
+the rod is orthogonal to the motion, only half of the digits are attainable."""
 COMPLEX_STEP_SIZE = 1e-30
+"""Step of derivatives by complex steps."""
 PLANAR_MOTIONS = ("planar", "planar-translation")
 """Motions in planes z = const of the base frame."""
 IN_PLANE = 1e-6
-"""Metres out of a plane, and radians off its normal, that rounding in a file explains."""
+"""Distance from a plane (m), or angle from its normal (rad), due to rounding in a file."""
 
 AxisRole = Literal["square", "twist"]
-"""What a joint's axis adds to a spatial machine: the limb is square to it, or, where both ends'
-axes do so, the limb does not twist between them."""
+"""Equation that a joint's axis adds to a spatial machine: the limb is orthogonal to it (square),
+or, if both ends have this role, the limb does not twist between the axes (twist)."""
 
 
 def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Validate and normalise a direction."""
     length = hypot(*axis)
     if length < SHORTEST_AXIS_LENGTH:
         raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
-    if abs(length - 1) < 1e-12:  # read back what was written, to the last digit
+    if abs(length - 1) < 1e-12:  # keep written unit axes to the last digit
         return axis
     x, y, z = (c / length for c in axis)
     return x, y, z
@@ -61,25 +64,29 @@ Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
 
 
 def _rising(value: tuple[float, float]) -> tuple[float, float]:
+    """Validate a range of readings."""
     if not value[0] < value[1]:
         raise ValueError("should be two increasing readings [min, max]")
     return value
 
 
 Stroke = Annotated[tuple[Metres, Metres], AfterValidator(_rising)]
-"""Smallest and largest reading of a motor that goes, m."""
+"""Smallest and largest reading of a linear motor, m."""
 Sweep = Annotated[tuple[Radians, Radians], AfterValidator(_rising)]
-"""Smallest and largest reading of a motor that turns, rad."""
+"""Smallest and largest reading of a rotary motor, rad."""
 
 
 class ParameterKind(NamedTuple):
-    """One parameter of a part: path below the part, unit, and the drawing's tolerance for it.
+    """Kind of parameter of a carrier.
 
-    Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
-    a machine whose file does. Without a tolerance's name it is a constant of the drawing.
-    label : what people call it, where its side and path say too little. part : what of a leg it
-    changes, where that is not simply the joint on its side: ``zero`` of the reading (added to it),
-    or an ``arm``, a ``hinge``, any word for a piece that can slip or be exchanged by itself.
+    path : below the part in the mechanism file.
+    unit : m, rad, 1 for components of directions, empty for ratios.
+    tolerance : name of the prior sigma; empty for a constant, which is not a parameter.
+    otherwise : value if the file omits the field, which is then no parameter.
+    label : name for people, if side and path are not clear enough.
+    part : part of the leg that the parameter changes, if not simply the joint on its side: ``zero``
+        of the reading (added to it), or an ``arm``, a ``hinge``, any word for a piece that can slip
+        or be exchanged by itself.
     """
 
     path: str
@@ -91,11 +98,12 @@ class ParameterKind(NamedTuple):
 
 
 class NamedMotion(NamedTuple):
-    """Changes of one leg's carrier that people can picture, should data leave them open.
+    """Change of a leg's carrier parameters with a name, for unidentifiable directions.
 
-    columns : (n, m) changes of the carrier's n parameters. one, several : what is open, of one leg
-    and of several; together : of all legs, where only some combinations are open. Sentences without
-    a full stop, with the places that :class:`pkmcal.identify.motions.NamedChanges` lists.
+    columns : (n, m) changes of the carrier's n parameters.
+    one, several : text for one leg and for several legs; together : for all legs, if only some
+        combinations are unidentifiable. Sentences without a full stop, with the placeholders of
+        :class:`pkmcal.identify.motions.NamedChanges`.
     """
 
     columns: Array
@@ -105,8 +113,12 @@ class NamedMotion(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Where a carrier stands in a mechanism file: leg from 1, ``base`` or ``platform``, the file's
-    motion, and what names the place of one of the part's keys, or of the whole part.
+    """Location of a carrier in a mechanism file.
+
+    leg : number from 1.
+    side : ``base`` or ``platform``.
+    motion : of the file.
+    where : function that returns the location of one of the part's keys, or of the part.
     """
 
     leg: int
@@ -121,15 +133,15 @@ class Site(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """The one elementary joint that carries a limb's end, for programs of bodies and joints.
+    """Elementary joint that carries a limb's end, for programs that model bodies and joints.
 
-    motion : what the arm does by the reading (base side) or by the platform (platform side):
-        ``fixed`` it stands on its body, ``slide`` it goes along the axis, ``turn`` it turns about
-        it, by the right-hand rule, ``float`` it keeps its direction where the platform turns.
-    point : (..., 3) m, where the arm stands: on the axis, if there is one; in the body's frame.
-    axis : (..., 3) unit, in the body's frame; zeros where the motion has none.
-    arm : (..., 3) m, from the point to the limb's end at reading or internal coordinate zero; in
-        the body's frame, of a floating one along the base frame's axes.
+    motion : motion of the arm by the reading (base side) or by the platform (platform side):
+        ``fixed`` to its body, ``slide`` along the axis, ``turn`` about it by the right-hand rule,
+        ``float`` with a constant direction while the platform rotates.
+    point : (..., 3) m, foot of the arm, on the axis if there is one; body's frame.
+    axis : (..., 3) unit, body's frame; zeros without an axis.
+    arm : (..., 3) m, from the point to the limb's end at reading or internal coordinate zero;
+        body's frame, for ``float`` along the base frame's axes.
     """
 
     motion: Literal["fixed", "slide", "turn", "float"]
@@ -139,14 +151,17 @@ class Chain(NamedTuple):
 
 
 class Carrier(ABC):
-    """What both sides share: words in files, schema, parameters, and changes of the frames.
+    """Common part of both sides: names in files, schema, parameters, and changes of the frames.
 
-    joints : the words. schema : their fields; the first three parameters are ``center``.
+    joints : names in mechanism files.
+    schema : their fields.
+    parameters : the first three are ``center``.
     shared : fields that legs on one motor, or on one body of the platform, have in common.
-    called : the limb's ends on this side, where sentences speak of all of them.
-    held_in_plane : fields that are no unknowns on a planar machine, which they would tilt.
-    side : of a leg. ways : fields of three lengths that lead from one point to another; others of
-    three lengths are points, those without a unit directions.
+    called : noun for the limb's ends on this side, in sentences about all of them.
+    held_in_plane : fields that are fixed on a planar machine, which they would tilt.
+    side : of the leg.
+    ways : fields of three lengths that are differences of points. Other fields of three lengths are
+        points, those without a unit directions.
 
     Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
     :mod:`pkmcal.identify.gauge`.
@@ -164,10 +179,10 @@ class Carrier(ABC):
 
     @classmethod
     def check(cls, node: Any, site: Site) -> None:
-        """Raise InputError for what the schema lets pass and no machine can be.
+        """Raise InputError for a part that the schema allows and the machine's motion does not.
 
-        On a planar machine an ``axis`` is what the part turns about, unless its carrier says
-        otherwise.
+        By default an ``axis`` is the part's axis of rotation, which on a planar machine must be the
+        plane's normal.
         """
         axis = getattr(node, "axis", None)
         if site.planar and axis is not None and hypot(axis[0], axis[1]) > IN_PLANE:
@@ -180,13 +195,13 @@ class Carrier(ABC):
 
     @staticmethod
     def axis_role(node: Any) -> AxisRole | None:
-        """What the ``axis`` of a part adds to the closure of a spatial machine."""
+        """Equation that the ``axis`` of a part adds to the closure of a spatial machine."""
         del node
         return None
 
     @staticmethod
     def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
-        """What of a leg's numbers (n,) data may leave open together, and has a name of its own.
+        """Named combinations of a leg's parameters (n,) that data may not determine.
 
         readings : (K,) of the leg's motor at the poses of a session, NaN on the platform side.
         """
@@ -196,7 +211,7 @@ class Carrier(ABC):
     @classmethod
     @cache
     def _vectors(cls) -> tuple[tuple[slice, bool], ...]:
-        """Places of the fields with three numbers, and which of them are points."""
+        """Slices of the fields with three numbers, and whether each is a point."""
         return tuple(
             (slice(k, k + 3), p.unit == "m" and p.path.removesuffix(".x") not in cls.ways)
             for k, p in enumerate(cls.parameters)
@@ -205,9 +220,9 @@ class Carrier(ABC):
 
     @classmethod
     def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """The parameters (..., n) told in the new frames, e and f (..., 4, 4).
+        """Parameters (..., n) in new frames, e and f (..., 4, 4).
 
-        Points and directions of the side's own body, as here, move with its frame.
+        By default, points and directions move with the frame of the side's own body.
         """
         own = e if cls.side == "base" else f
         shape = np.broadcast_shapes(parameters.shape[:-1], own.shape[:-2])
@@ -219,7 +234,7 @@ class Carrier(ABC):
 
     @classmethod
     def by_frames(cls, parameters: Array) -> Array:
-        """Their first-order change by E's and F's six numbers, (..., n, 12)."""
+        """First-order change (..., n, 12) of the parameters by the six numbers each of E and F."""
         out = np.zeros((*parameters.shape, 12))
         own = slice(0, 6) if cls.side == "base" else slice(6, 12)
         for at, is_point in cls._vectors():
@@ -235,18 +250,20 @@ class Carrier(ABC):
 
     @staticmethod
     def chain(parameters: Array) -> Chain | None:
-        """The same end as an elementary joint, for parameters (..., n), which exports build from;
-        None where it is none, and then C, MuJoCo and the firmwares refuse the machine.
+        """Limb's end as an elementary joint, for parameters (..., n), from which exports are built.
+        None if it is not elementary; C, MuJoCo and firmware exports then refuse the machine.
         """
         del parameters
         return None
 
 
 class BaseCarrier(Carrier, ABC):
-    """Gives A, the limb's end on the base side, as a function of the joint reading.
+    """Carrier of A, the limb's end on the base side, as a function of the joint reading.
 
-    driven : the reading moves A; the rod then has a length of its own. unit : of the reading, m or
-    rad. A driven carrier's schema may have ``motor``, the reading's column from 1, and ``range``,
+    driven : whether the reading moves A; the rod then has constant length.
+    unit : of the reading, m or rad.
+
+    The schema of a driven carrier may have ``motor``, the reading's column from 1, and ``range``,
     its smallest and largest reading.
     """
 
@@ -258,14 +275,18 @@ class BaseCarrier(Carrier, ABC):
     @staticmethod
     @abstractmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
-        """A and its derivative by the reading, (..., 3) each, for parameters (..., n) and readings
-        (...,) (m or rad). What the readings do not change needs not have their shape. Complex
-        parameters give complex points, unless the carrier has derivatives of its own.
+        """Point A and its derivative by the reading, (..., 3) each.
+
+        parameters : (..., n).
+        readings : (...,) m or rad.
+
+        A result that does not depend on the readings need not have their shape. Complex parameters
+        give complex points, unless the carrier overrides ``by_parameters``.
         """
 
     @classmethod
     def by_parameters(cls, parameters: Array, readings: Array) -> Array:
-        """Derivatives (..., 3, n) of A by the parameters: here exactly, by complex steps."""
+        """Derivatives (..., 3, n) of A by the parameters, by default exact by complex steps."""
         shape = (*np.broadcast_shapes(parameters.shape[:-1], readings.shape), 3)
         return complex_steps(
             lambda p: np.broadcast_to(cls.place(p, readings)[0], shape), parameters
@@ -273,14 +294,15 @@ class BaseCarrier(Carrier, ABC):
 
     @classmethod
     def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
-        """Readings (...,) that put A at a distance (...,) from B (..., 3), m.
+        """Readings (...,) for which A is at a distance (...,) from B (..., 3), m; NaN if out of
+        reach.
 
-        Of two the one nearest to ``near`` (...,); NaN where B is out of reach. Here the one to
-        which Newton's steps lead from there, ``(|B - A|^2 - length^2) / (2 length) = 0``.
+        Of two solutions the one nearest to ``near`` (...,). By default Newton's method from there
+        on ``(|B - A|^2 - length^2) / (2 length) = 0``.
         """
         shape = np.broadcast_shapes(parameters.shape[:-1], point_b.shape[:-1], near.shape)
         q, off = np.array(np.broadcast_to(near, shape), dtype=float), np.full(shape, np.inf)
-        with np.errstate(all="ignore"):  # what is out of reach goes anywhere
+        with np.errstate(all="ignore"):  # rows out of reach diverge
             for _ in range(READING_NEWTON_STEPS):
                 a, by_reading = cls.place(parameters, q)
                 line = point_b - a
@@ -294,11 +316,11 @@ class BaseCarrier(Carrier, ABC):
 
     @classmethod
     def skeleton(cls, parameters: Array, readings: Array) -> Array:
-        """Points (..., k, 3) along the arm that carries A, from where the motor holds it to A
-        itself, for pictures; m, base frame.
+        """Points (..., k, 3) along the arm that carries A, from the motor to A, for drawings; m,
+        base frame.
 
-        Of a carrier that turns, by its chain, from its axis straight to A. A alone has no arm: it
-        stands still, or runs along a guide, wherever its readings take it.
+        A rotary carrier's arm is drawn from its axis straight to A, by its chain. Others have no
+        arm, only A, which is fixed or moves along a guide.
         """
         a, chain = cls.place(parameters, readings)[0], cls.chain(parameters)
         points = (chain.point, a) if chain is not None and chain.motion == "turn" else (a,)
@@ -306,14 +328,14 @@ class BaseCarrier(Carrier, ABC):
 
 
 class PlatformCarrier(Carrier, ABC):
-    """Gives B, the limb's end on the platform side, as a function of the platform's pose.
+    """Carrier of B, the limb's end on the platform side, as a function of the platform's pose.
 
-    body : the field whose number says on which body of an articulated platform the leg ends.
-    turns : B also turns about a hinge, by an internal coordinate of the pose that no reading
-    knows; legs on the same body share it.
-    floats : ``center`` is told along the base frame's axes.
-    most_turn : how far the platform turns about z to either side, rad, until something is in the
-    way; ``obstacle`` says what.
+    body : name of the field with the number of the body of an articulated platform.
+    turns : whether B also rotates about a hinge, by an internal coordinate of the pose without a
+        reading; legs on the same body share it.
+    floats : whether ``center`` is along the base frame's axes.
+    most_turn : largest rotation of the platform about z to either side, rad.
+    obstacle : text that states what limits this rotation.
     """
 
     side: ClassVar = "platform"
@@ -329,24 +351,27 @@ class PlatformCarrier(Carrier, ABC):
     def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> tuple[Array, Array]:
-        """B and the arm that turns with the platform, (..., 3) m each, base frame: by the pose's
-        left perturbation B moves by ``omega x arm + tau``.
+        """Point B and its lever arm, (..., 3) m each, base frame: B changes by
+        ``omega x arm + tau`` under the pose's left perturbation.
 
-        For parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad. Complex
-        parameters give complex points, unless the carrier has derivatives of its own.
+        parameters : (..., n).
+        T_base_platform : (..., 4, 4).
+        internal : (...,) rad.
+
+        Complex parameters give complex points, unless the carrier overrides ``by_parameters``.
         """
 
     @classmethod
     def by_parameters(
         cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
-        """Derivatives (..., 3, n) of B by the parameters: here exactly, by complex steps."""
+        """Derivatives (..., 3, n) of B by the parameters, by default exact by complex steps."""
         return complex_steps(lambda p: cls.place(p, T_base_platform, internal)[0], parameters)
 
     @staticmethod
     def upright(parameters: Array, T_base_platform: Array) -> Array:
-        """Internal coordinates (...,) that leave a bar's direction as it is, about: a start for the
-        search for the right ones.
+        """Approximate internal coordinates (...,) that keep a bar's direction: the start of inverse
+        kinematics.
         """
         shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
         return np.zeros(shape)
@@ -371,7 +396,7 @@ def complex_steps(function: Callable[[Array], Array], parameters: Array) -> Arra
 
 
 def by_pose(arm: Array) -> Array:
-    """Change (..., 3, 6) of a platform's point by the pose, its turned arm (..., 3) given."""
+    """Derivative (..., 3, 6) of a platform's point by the pose, from its lever arm (..., 3)."""
     out = np.zeros((*arm.shape, 6))
     out[..., :3] = -skew(arm)
     out[..., 3:] = np.eye(3)
@@ -381,7 +406,7 @@ def by_pose(arm: Array) -> Array:
 def vectors(
     name: str, unit: str, tolerance: str, label: str = "", part: str = ""
 ) -> tuple[ParameterKind, ...]:
-    """The three components of a field."""
+    """Parameter kinds of the three components of a field."""
     return tuple(
         ParameterKind(
             f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}", part=part
@@ -391,8 +416,8 @@ def vectors(
 
 
 def of_part(node: Any, kind: ParameterKind) -> float | None:
-    """What a part of a mechanism file says of a parameter, None where it is silent;
-    ``center.y`` is the second number of ``center``.
+    """Value of a parameter in a part of a mechanism file, None if absent; ``center.y`` is the
+    second number of ``center``.
     """
     field, _, axis = kind.path.partition(".")
     value = getattr(node, field)
@@ -402,27 +427,29 @@ def of_part(node: Any, kind: ParameterKind) -> float | None:
 
 
 def moved_point(p: Array, transform: Array) -> Array:
-    """A body's point (..., 3) in its new frame."""
+    """Body's point (..., 3) in a new frame."""
     return apply(transform, p)
 
 
 def moved_direction(d: Array, transform: Array) -> Array:
-    """A body's direction (..., 3) in its new frame."""
+    """Body's direction (..., 3) in a new frame."""
     return (transform[..., :3, :3] @ d[..., None])[..., 0]
 
 
 def point_by_frame(p: Array) -> Array:
-    """Change (..., 3, 6) of a body's point by its frame's six numbers."""
+    """Derivative (..., 3, 6) of a body's point by its frame's six numbers."""
     return by_pose(p)
 
 
 def direction_by_frame(d: Array) -> Array:
-    """Change (..., 3, 6) of a body's direction by its frame's six numbers."""
+    """Derivative (..., 3, 6) of a body's direction by its frame's six numbers."""
     return np.concatenate([-skew(d), np.zeros((*d.shape, 3))], axis=-1)
 
 
 def turned_blocks(n: int, *blocks: tuple[int, Array]) -> Array:
-    """Identity (..., n, n) but for 3x3 turns of a transform (..., 4, 4) at the given rows."""
+    """Identity matrix (..., n, n) with the rotation of a transform (..., 4, 4) as 3x3 diagonal
+    block at each given row.
+    """
     shape = np.broadcast_shapes(*(t.shape[:-2] for _, t in blocks))
     out = np.zeros((*shape, n, n))
     out[...] = np.eye(n)
@@ -432,21 +459,22 @@ def turned_blocks(n: int, *blocks: tuple[int, Array]) -> Array:
 
 
 def base_carriers() -> dict[str, type[BaseCarrier]]:
-    """The base carrier of every joint kind known to mechanism files: of the modules beside this
-    one, of those that ``PKMCAL_CARRIERS`` names, and of any module imported before.
+    """Base carriers by joint name: of the modules in this folder, of those named in
+    ``PKMCAL_CARRIERS``, and of any module imported before.
     """
     _import_all()
     return {joint: cls for cls in BaseCarrier.__subclasses__() for joint in cls.joints}
 
 
 def platform_carriers() -> dict[str, type[PlatformCarrier]]:
-    """The platform carrier of every joint kind known to mechanism files, as for the base."""
+    """Platform carriers by joint name, from the same modules as :func:`base_carriers`."""
     _import_all()
     return {joint: cls for cls in PlatformCarrier.__subclasses__() for joint in cls.joints}
 
 
 @cache
 def _import_all() -> None:
+    """Import the modules in this folder and those named in ``PKMCAL_CARRIERS``."""
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")

@@ -1,4 +1,4 @@
-"""A crank on the base, turned by a motor: A is the end of its arm (H4, delta, 6-RUS)."""
+"""Crank on the base, turned by a motor: A is the end of its arm (H4, delta, 6-RUS)."""
 
 from __future__ import annotations
 
@@ -28,13 +28,17 @@ from pkmcal.mechanisms.carriers.contract import (
 )
 
 CRANK_VERTICAL = np.array([0.0, 0.0, 1.0])
+"""Vertical direction, from which e0 is derived without ``zero``."""
 SLANTED_FROM_AXIS = 1e-3
-"""A direction nearer to the axis than this (rad) shows no angle about it."""
+"""Least angle (rad) between the zero direction and the axis; below it the direction does not define
+an angle about the axis."""
 CRANK_ZERO_KINDS = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")
 
 
 class CrankDocument(Schema):
-    """``{joint: crank, center: [x, y, z], axis: [x, y, z], arm: 0.26}``: m, rad, base frame."""
+    """Crank in a file, ``{joint: crank, center: [x, y, z], axis: [x, y, z], arm: 0.26}``: m, rad,
+    base frame.
+    """
 
     joint: Literal["crank"]
     center: Annotated[
@@ -54,8 +58,13 @@ class CrankDocument(Schema):
 
 
 class _Frame(NamedTuple):
-    """A crank's own axes: unit axis v, e0 and side = v x e0, (..., 3) each; twist (..., 3), the
-    turn of e0 about v by a change of v; n : by a change of ``zero`` it turns side / n.
+    """Frame of a crank, and its derivatives.
+
+    v : (..., 3) unit axis.
+    e0, side : (..., 3) direction at angle zero, and v x e0.
+    twist : (..., 3) rotation of e0 about v by a change of v.
+    n : (..., 1) length that normalises e0; a change of ``zero`` rotates e0 by side / n.
+    drawn : (..., 1) whether the file states ``zero``.
     """
 
     v: Array
@@ -68,11 +77,12 @@ class _Frame(NamedTuple):
 
 @final
 class Crank(BaseCarrier):
-    """``A = center + along v + radial e0 + arm (cos Q e0 + sin Q v x e0)``, Q = reading + angle.
+    """End of a crank's arm, ``A = center + along v + radial e0 + arm (cos Q e0 + sin Q v x e0)``
+    with Q = reading + angle.
 
-    v is the unit axis. e0 is the file's ``zero`` made square to v, or the horizontal ``v x z``
-    where the file has none; [C] eq. 1 and 4 then, with Q = q - q0. ``radial`` moves the axis
-    out along e0 and ``along`` the arm along the axis.
+    v is the unit axis. e0 is the file's ``zero`` made orthogonal to v, or without it the horizontal
+    ``v x z``, which gives [C] eq. 1 and 4 with Q = q - q0. ``radial`` moves the axis out along e0,
+    ``along`` moves the arm along the axis.
     """
 
     driven: ClassVar = True
@@ -93,7 +103,7 @@ class Crank(BaseCarrier):
 
     @classmethod
     def check(cls, node: CrankDocument, site: Site) -> None:
-        """The direction from which the crank's angle counts is one."""
+        """Refuse a zero direction (the vertical by default) that is parallel to the axis."""
         super().check(node, site)
         direction = node.zero if node.zero is not None else (0.0, 0.0, 1.0)
         if np.linalg.norm(np.cross(direction, node.axis)) > SLANTED_FROM_AXIS:
@@ -113,7 +123,7 @@ class Crank(BaseCarrier):
 
     @staticmethod
     def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
-        """The axis tilts, and its point moves along it."""
+        """Tilt of the axis, and position of the arm along it."""
         del readings
         tilt = np.zeros((parameters.size, 4))
         tilt[3:6, :3] = np.eye(3)
@@ -131,22 +141,22 @@ class Crank(BaseCarrier):
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
-        """A, and the arm's direction ahead times its length."""
+        """A, and its derivative: the arm's length times its direction of motion."""
         frame = _frame(parameters)
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, ahead = _turned(frame, parameters, readings)
+        out, ahead = _arm_directions(frame, parameters, readings)
         value = parameters[..., :3] + along * frame.v + radial * frame.e0 + arm * out
         return value, arm * ahead
 
     @classmethod
     def by_parameters(cls, parameters: Array, readings: Array) -> Array:
-        """In the parameters' order."""
+        """Derivatives in the parameters' order."""
         frame = _frame(parameters)
         v, e0, side = frame.v, frame.e0, frame.side
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, ahead = _turned(frame, parameters, readings)
+        out, ahead = _arm_directions(frame, parameters, readings)
         by_reading = arm * ahead
-        # the frame turns by the twist about v, and v itself pulls e0 and side after it
+        # A change of v rotates the frame by the twist about v, and tilts e0 and side with v.
         swing = radial * side + by_reading
         pull = radial * e0 + arm * out
         by_v = along[..., None] * np.eye(3) + _outer(swing, frame.twist) - _outer(v, pull)
@@ -161,8 +171,9 @@ class Crank(BaseCarrier):
 
     @classmethod
     def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
-        """Errata, Model 31: ``Q = atan2(s, p) -+ acos(g / |(p, s)|)``, d = B - center,
-        p = d . e0, s = d . (v x e0), g = (|d|^2 + arm^2 - length^2) / (2 arm).
+        """Closed-form readings, errata, Model 31: ``Q = atan2(s, p) -+ acos(g / |(p, s)|)``, d = B
+        - center - along v - radial e0, p = d . e0, s = d . (v x e0), g = (|d|^2 + arm^2 - length^2)
+        / (2 arm).
         """
         frame = _frame(parameters)
         arm, angle, along, radial = (parameters[..., k] for k in range(6, 10))
@@ -179,22 +190,26 @@ class Crank(BaseCarrier):
 
     @classmethod
     def reframed(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """Centre and axis move with the base frame; ``zero`` and the vertical stay, so that the
-        angle takes up what e0 turns against them.
+        """Parameters in new frames: centre and axis move with the base frame.
+
+        ``zero`` and the vertical do not change, so the angle takes up the rotation of e0 against
+        them.
         """
         del f
-        out = np.array(np.broadcast_to(parameters, (*_lead(parameters, e), parameters.shape[-1])))
+        out = np.array(
+            np.broadcast_to(parameters, (*_leading_shape(parameters, e), parameters.shape[-1]))
+        )
         out[..., :3] = moved_point(parameters[..., :3], e)
         out[..., 3:6] = moved_direction(parameters[..., 3:6], e)
         carried, now = moved_direction(_frame(parameters).e0, e), _frame(out)
-        # radial goes along e0, so its turn is a shift of the centre
+        # radial is along e0, whose rotation shifts the centre
         out[..., :3] += parameters[..., 9, None] * (carried - now.e0)
         out[..., 7] += np.arctan2(dot(carried, now.side), dot(carried, now.e0))
         return out
 
     @classmethod
     def by_frames(cls, parameters: Array) -> Array:
-        """E's columns; the angle turns by ``v - v x twist``."""
+        """Derivatives by E; the angle changes by ``v - v x twist``."""
         frame = _frame(parameters)
         out = np.zeros((*parameters.shape, 12))
         out[..., :3, :6] = point_by_frame(parameters[..., :3])
@@ -206,14 +221,16 @@ class Crank(BaseCarrier):
 
     @classmethod
     def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
-        """Turns, and how much more an error of the axis twists e0 here than there."""
+        """Rotations of centre and axis, and the change of the twist of e0 between the frames."""
         before, after = _frame(parameters), _frame(Crank.reframed(parameters, e, f))
         rot = e[..., :3, :3]
         n = parameters.shape[-1]
-        shape = (*_lead(parameters, e), n, n)
+        shape = (*_leading_shape(parameters, e), n, n)
         out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), shape))
+        # The angle takes up the change of the twist.
         twist = before.twist[..., None, :] - after.twist[..., None, :] @ rot
         out[..., 7:8, 3:6] = _by_axis(twist, before.v, parameters)
+        # The centre takes up the change of radial e0.
         lag = rot @ _turn_of_e0(before) - _turn_of_e0(after) @ rot
         lag = parameters[..., 9, None, None] * lag
         out[..., :3, 3:6] = _by_axis(lag, before.v, parameters)
@@ -222,16 +239,16 @@ class Crank(BaseCarrier):
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
-        """The arm as at reading zero, about v; its foot is ``center + along v + radial e0``."""
+        """Arm at reading zero, turning about v; its foot is ``center + along v + radial e0``."""
         frame = _frame(parameters)
         arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        out, _ = _turned(frame, parameters, np.zeros(parameters.shape[:-1]))
+        out, _ = _arm_directions(frame, parameters, np.zeros(parameters.shape[:-1]))
         foot = parameters[..., :3] + along * frame.v + radial * frame.e0
         return Chain("turn", foot, frame.v, arm * out)
 
 
 def _frame(parameters: Array) -> _Frame:
-    """The crank's own axes and how they change with its parameters."""
+    """Frame of the crank with its derivatives by the parameters."""
     axis, zero = parameters[..., 3:6], parameters[..., 10:13]
     drawn = np.isfinite(zero[..., :1])
     zero = np.where(drawn, zero, CRANK_VERTICAL)
@@ -245,27 +262,29 @@ def _frame(parameters: Array) -> _Frame:
     return _Frame(v, e0, side, twist, n, drawn)
 
 
-def _turned(frame: _Frame, parameters: Array, readings: Array) -> tuple[Array, Array]:
-    """The arm's direction and, square to it, the one in which its end moves, (..., 3) each."""
+def _arm_directions(frame: _Frame, parameters: Array, readings: Array) -> tuple[Array, Array]:
+    """Arm's direction, and the direction in which its end moves, (..., 3) each."""
     turn = readings[..., None] + parameters[..., 7, None]
     c, s = np.cos(turn), np.sin(turn)
     return c * frame.e0 + s * frame.side, c * frame.side - s * frame.e0
 
 
 def _outer(a: Array, b: Array) -> Array:
+    """Outer products (..., m, n) of vectors."""
     return a[..., :, None] * b[..., None, :]
 
 
-def _lead(parameters: Array, transform: Array) -> tuple[int, ...]:
+def _leading_shape(parameters: Array, transform: Array) -> tuple[int, ...]:
+    """Leading shape of parameters and transforms, broadcast."""
     return np.broadcast_shapes(parameters.shape[:-1], transform.shape[:-2])
 
 
 def _turn_of_e0(frame: _Frame) -> Array:
-    """Change (..., 3, 3) of e0 by v."""
+    """Derivative (..., 3, 3) of e0 by v."""
     return _outer(frame.side, frame.twist) - _outer(frame.v, frame.e0)
 
 
 def _by_axis(by_v: Array, v: Array, parameters: Array) -> Array:
-    """Derivatives (..., k, 3) by the unit axis, as those by the file's axis of any length."""
+    """Derivatives (..., k, 3) by the file's axis, of any length, from those by the unit axis."""
     size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None, None]
     return (by_v - (by_v @ v[..., None]) * v[..., None, :]) / size

@@ -1,8 +1,8 @@
-"""A joint at a limb's end as it stands in the file: a centre, and perhaps an axis.
+"""Joint at a limb's end as stated in the file: a centre, possibly with an axis.
 
-A spherical joint has a centre. A universal joint has its first axis, fixed to the body that it
-stands on; a revolute joint has one axis, and the limb turns about it. It stands on the base, where
-the reading does not move it, or on a platform that is one rigid body.
+A spherical joint has a centre. A universal joint has its first axis, fixed to the body it is
+mounted on. A revolute joint has one axis, about which the limb rotates. The joint is on the base
+and not moved by the reading, or on a platform that is one rigid body.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pkmcal.mechanisms.carriers.contract import (
 
 
 class JointDocument(Schema):
-    """``{joint: revolute, center: [x, y, z], axis: [x, y, z]}``: metres, the body's frame."""
+    """Joint in a file, ``{joint: revolute, center: [x, y, z], axis: [x, y, z]}``: m, body frame."""
 
     joint: Literal["spherical", "universal", "revolute"]
     center: Point
@@ -36,7 +36,7 @@ class JointDocument(Schema):
 
 
 class JointEnd(Carrier):
-    """A limb's end at such a joint; ``center`` in metres, in the frame of what it stands on."""
+    """Limb's end at a joint; ``center`` in metres, in the frame of its body."""
 
     joints: ClassVar = ("spherical", "universal", "revolute")
     schema: ClassVar = JointDocument
@@ -44,7 +44,9 @@ class JointEnd(Carrier):
 
     @classmethod
     def check(cls, node: JointDocument, site: Site) -> None:
-        """An axis where the joint has one, and none where not."""
+        """Refuse an axis on a spherical joint, and a revolute joint of a spatial machine without
+        one.
+        """
         if node.joint == "spherical" and node.axis is not None:
             raise InputError(
                 f"leg {site.leg} has a spherical joint with an axis",
@@ -62,8 +64,8 @@ class JointEnd(Carrier):
 
     @staticmethod
     def axis_role(node: Any) -> AxisRole | None:
-        """A revolute joint's limb is square to its axis; a universal joint with an axis holds
-        twist.
+        """Square for a revolute joint, whose limb is orthogonal to the axis; twist for a universal
+        joint with an axis.
         """
         if node.joint == "revolute":
             return "square"
@@ -71,7 +73,7 @@ class JointEnd(Carrier):
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
-        """The centre, without a joint that a motor moves."""
+        """Fixed centre."""
         none = np.zeros_like(parameters)
         return Chain("fixed", parameters, none, none)
 
@@ -82,7 +84,7 @@ class FixedPoint(JointEnd, BaseCarrier):
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
-        """A is the centre itself, (..., 3), whatever the reading."""
+        """A is the centre (..., 3), for any reading."""
         del readings
         return parameters, np.zeros_like(parameters)
 
@@ -101,7 +103,7 @@ class RigidPlatform(JointEnd, PlatformCarrier):
     def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> tuple[Array, Array]:
-        """B = R b + t, the arm R b."""
+        """B = R b + t, with lever arm R b."""
         del internal
         arm = turned(T_base_platform[..., :3, :3], parameters)
         return arm + T_base_platform[..., :3, 3], arm
@@ -110,7 +112,7 @@ class RigidPlatform(JointEnd, PlatformCarrier):
     def by_parameters(
         cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
-        """R."""
+        """Rotation R."""
         del internal
         shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
         return np.broadcast_to(T_base_platform[..., :3, :3], (*shape, 3, 3))

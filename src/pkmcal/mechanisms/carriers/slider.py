@@ -1,4 +1,4 @@
-"""A slider on the base, moved by a motor: A runs along a guide (linear delta, hexaglide)."""
+"""Slider on the base, moved by a motor: A moves along a guide (linear delta, hexaglide)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from pkmcal.mechanisms.carriers.contract import (
 
 
 class SliderDocument(Schema):
-    """``{joint: slider, center: [x, y, z], axis: [x, y, z]}``: metres, base frame."""
+    """Slider in a file, ``{joint: slider, center: [x, y, z], axis: [x, y, z]}``: metres, base
+    frame.
+    """
 
     joint: Literal["slider"]
     center: Annotated[
@@ -38,7 +40,7 @@ class SliderDocument(Schema):
 
 @final
 class Slider(BaseCarrier):
-    """``A = center + reading * v``, v the unit axis."""
+    """Joint on a carriage, ``A = center + reading * v``, with the unit axis v."""
 
     driven: ClassVar = True
     joints: ClassVar = ("slider",)
@@ -52,7 +54,7 @@ class Slider(BaseCarrier):
 
     @classmethod
     def check(cls, node: SliderDocument, site: Site) -> None:
-        """A planar machine's guides lie in its plane."""
+        """Refuse guides that leave the plane of a planar machine."""
         if site.planar and abs(node.axis[2]) > IN_PLANE:
             raise InputError(
                 f"the slider of leg {site.leg} leaves the plane of a planar machine",
@@ -62,7 +64,7 @@ class Slider(BaseCarrier):
 
     @staticmethod
     def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
-        """The guide leans about the middle of where its carriage was."""
+        """Tilt of the guide about the mean position of its carriage."""
         del parameters
         lean = np.zeros((6, 3))
         lean[3:] = np.eye(3)
@@ -80,14 +82,14 @@ class Slider(BaseCarrier):
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
-        """A, and v."""
+        """A, and its derivative v."""
         axis = parameters[..., 3:]
         v = axis / np.sqrt(dot(axis, axis))[..., None]
         return parameters[..., :3] + readings[..., None] * v, v
 
     @classmethod
     def by_parameters(cls, parameters: Array, readings: Array) -> Array:
-        """Identity for the centre; the axis's length changes nothing."""
+        """Identity for the centre; rotation only for the axis, whose length has no effect."""
         axis = parameters[..., 3:]
         size = np.sqrt(dot(axis, axis))[..., None]
         v, q = axis / size, readings[..., None]
@@ -100,7 +102,9 @@ class Slider(BaseCarrier):
 
     @classmethod
     def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
-        """``q = d . v -+ sqrt(length^2 - |d|^2 + (d . v)^2)``, d = B - center."""
+        """Readings ``q = d . v -+ sqrt(length^2 - |d|^2 + (d . v)^2)`` in closed form, with d = B -
+        center and v the unit axis.
+        """
         axis = parameters[..., 3:]
         v = axis / np.sqrt(dot(axis, axis))[..., None]
         d = point_b - parameters[..., :3]
@@ -112,7 +116,7 @@ class Slider(BaseCarrier):
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
-        """A slide from the centre along v."""
+        """Slide from the centre along v."""
         center, axis = parameters[..., :3], parameters[..., 3:]
         return Chain(
             "slide", center, axis / np.sqrt(dot(axis, axis))[..., None], np.zeros_like(center)

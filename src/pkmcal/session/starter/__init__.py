@@ -1,7 +1,7 @@
-"""A session to fill in: the files that ``pkmcal new`` writes, each with comments for a newcomer.
+"""Starter session: the files that ``pkmcal new`` writes, each with comments for a newcomer.
 
-The starter session is a hexapod seen by its legs from one place; one of another machine, or with a
-board, or from several places, is made of it.
+The template is a hexapod whose legs one camera observes from one station. Sessions of other
+machines, with a board, or with several stations are derived from it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pkmcal.outcome.finding import Finding, doubtful
 
 ObservedChoice = Literal["legs", "board", "both", "readings"]
 OBSERVED_CHOICES: tuple[ObservedChoice, ...] = ("legs", "board", "both", "readings")
+"""Observations that a starter session can have."""
 SESSION_TEMPLATE_FOLDER = Path(__file__).parent / "session"
 TO_FILL = {
     "mechanism.yaml": "write the drawing of your machine into it",
@@ -30,7 +31,7 @@ TO_FILL = {
     "joints.csv": "write one row of readings for each configuration into it",
     "board.yaml": "write down which board it is, and measure its squares",
 }
-"""What a person still has to do in each file."""
+"""Task that remains for the user in each file."""
 STARTER_PLACE_NAMES = ("front", "left", "right", "back")
 OBSERVE_ENTRY_VALUES = {"legs": "legs", "board": "board", "both": "[legs, board]"}
 STARTER_BOARD_TEXT = """\
@@ -44,7 +45,7 @@ dictionary: DICT_5X5_100
 tolerance: 0.1 %          # how well you measured: paper changes its size by as much
 """
 STARTER_SQUARE_SIDE, STARTER_SQUARE_CHOICES = 30, range(8, 31)
-"""mm, of the board's squares as they are, and as they can be asked for."""
+"""Side of the board's squares, mm: the default and the values that can be chosen."""
 ON_PLATFORM = """\
 
 board:
@@ -62,7 +63,7 @@ READINGS_ALONE_TEXT = """\
 # Spread the configurations over all that it reaches.
 """
 EXAMPLE_UNIT_FACTORS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
-"""Units of example readings by the mark in a column's head."""
+"""Factors from SI units to those named in the headers of example readings."""
 LEGS_TEXT = " - The machine stands still."
 BOARD_TEXT = """\
  - The machine stands still. The board sharp, whole in the picture, neither white nor black, and
@@ -80,19 +81,19 @@ def write_session(
     what: ObservedChoice | None = None,
     places: int = 1,
 ) -> tuple[str, ...]:
-    """Write a session into a new or empty folder; returns its files.
+    """Write a starter session into a new or empty folder; returns the names of its files.
 
-    machine : a built-in machine's name or a mechanism file; without one a hexapod to be changed.
-    what : what the camera sees of it; the legs unless told, or a board where the drawing gives them
-    no cylinders, or nothing where readings alone tell the geometry. places : that the camera stands
-    in, one after another. Raises InputError for a folder that is not empty, and for legs that
-    cannot be seen.
+    machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
+    what : what the camera observes; by default the legs, or a board if the nominal model has no
+        tubes, or nothing if readings alone determine the geometry.
+    places : number of stations of the camera.
+    Raises InputError for a folder that is not empty, and for legs without tubes.
     """
     return write_texts(folder, session_texts(machine, what, places))
 
 
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
-    """Write a session's files, by their names, into a new or empty folder, whole or not at all."""
+    """Write a session's files, by name, into a new or empty folder, atomically."""
     folder = Path(folder)
     if entries(folder):
         raise InputError(
@@ -111,7 +112,7 @@ def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
 def session_texts(
     machine: str | None = None, what: ObservedChoice | None = None, places: int = 1
 ) -> dict[str, str]:
-    """The session's files by their names, as of :func:`write_session`."""
+    """Texts of a session's files by name; arguments as for :func:`write_session`."""
     files = sorted(path for path in SESSION_TEMPLATE_FOLDER.rglob("*") if path.is_file())
     texts = {
         path.relative_to(SESSION_TEMPLATE_FOLDER).as_posix(): path.read_text("utf-8")
@@ -119,41 +120,44 @@ def session_texts(
     }
     turns = False
     if machine is not None:
-        drawn = load_mechanism(machine)
-        visible = any(leg.tubes for leg in drawn.document.legs)
-        if not visible and what in ("legs", "both"):
+        model = load_mechanism(machine)
+        has_tubes = any(leg.tubes for leg in model.document.legs)
+        if not has_tubes and what in ("legs", "both"):
             raise InputError(
-                f"the drawing of {drawn.name} has no cylinders that a camera could see",
+                f"the drawing of {model.name} has no cylinders that a camera could see",
                 where=machine,
                 expected="a board on the platform, or tubes on its legs",
                 next_step="Ask for a board alone, or give the legs of a copy of the drawing tubes",
             )
-        if what is None and not visible:
-            what = "readings" if drawn.redundancy > 0 else "board"
+        if what is None and not has_tubes:
+            what = "readings" if model.redundancy > 0 else "board"
         texts["mechanism.yaml"] = read_text(catalogue().get(machine, Path(machine)))
-        texts["joints.csv"] = example_readings(drawn)
-        turns = set(drawn.joint_units) == {"rad"}
+        texts["joints.csv"] = example_readings(model)
+        turns = set(model.joint_units) == {"rad"}
     what = what or "legs"
-    texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, what, places)
+    texts["session.yaml"] = _session_text(
+        texts["session.yaml"], machine is None, turns, what, places
+    )
     if what in ("board", "both"):
         texts["board.yaml"] = board_text()
-    where_to = texts.pop("images/front/README.txt")
+    readme = texts.pop("images/front/README.txt")
     if what == "board":
-        where_to = where_to[: where_to.index(LEGS_TEXT)] + BOARD_TEXT
+        readme = readme[: readme.index(LEGS_TEXT)] + BOARD_TEXT
     if what == "readings":
         del texts["cameras/front.yaml"]
         return texts
-    for name in _places(places):
-        texts[f"images/{name}/README.txt"] = where_to.replace('"front"', f'"{name}"')
+    for name in _station_names(places):
+        texts[f"images/{name}/README.txt"] = readme.replace('"front"', f'"{name}"')
     return texts
 
 
 def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
-    """board.yaml of the example, with squares of so many millimetres."""
+    """Text of the example board.yaml. square : mm."""
     return STARTER_BOARD_TEXT.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
 
 
-def _places(count: int) -> list[str]:
+def _station_names(count: int) -> list[str]:
+    """Names of the stations."""
     return [
         *STARTER_PLACE_NAMES,
         *(f"place{k + 1}" for k in range(len(STARTER_PLACE_NAMES), count)),
@@ -161,12 +165,14 @@ def _places(count: int) -> list[str]:
 
 
 def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> str:
-    """Two rows of joints.csv: the home pose's, and one's beside it. heads : of the columns, such as
-    ``stepper_a [mm]``, in mm or degrees where they say so; the joints' names unless told.
+    """Two rows of joints.csv: readings of the home pose, and of a pose beside it.
+
+    heads : headers of the columns, such as ``stepper_a [mm]``, with values in mm or degrees if they
+        name these; by default the joints' names.
     """
     poses = np.repeat(machine.home()[None], 2, axis=0)
     lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
-    # along the last of its motions that is no turn, by a part of its size
+    # Shift the second pose along the motion's last translation, by a part of the machine's size.
     motions = MOTION_DIRECTIONS[machine.document.motion]
     slide = next(c for c in motions.T[::-1] if not c[:3].any())[3:]
     poses[1, :3, 3] += slide * np.abs(lengths).max() / 30
@@ -183,8 +189,8 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
     return csv_text(heads, ["0001", "0002"], rows.round(4))
 
 
-def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
-    """The starter session.yaml for another machine, another thing that is seen, more places."""
+def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places: int) -> str:
+    """Text of session.yaml for another machine, another observation, or more stations."""
     if turns:
         start, end = text.index("  # Standard deviation"), text.index("\n# One entry")
         text = text[:start] + DRIVE_NOISE_TEXT + text[end:]
@@ -194,51 +200,53 @@ def _session(text: str, hexapod: bool, turns: bool, what: ObservedChoice, places
     first = f"    observe: {OBSERVE_ENTRY_VALUES[what]}\n"
     if what == "legs":
         first += text[start:end].partition("\n")[2]
-    shifted = [
+    further = [
         MOVED_STATION_TEXT.format(name=n, observe=OBSERVE_ENTRY_VALUES[what])
-        for n in _places(places)[1:]
+        for n in _station_names(places)[1:]
     ]
     rest = text[end:] if places == 1 and what == "legs" and hexapod else ""
     board = "" if what == "legs" else ON_PLATFORM
-    return text[:start] + first + "".join(shifted) + rest + board
+    return text[:start] + first + "".join(further) + rest + board
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
-    """Warnings about the files of a session that are still as `write_session` left them."""
+    """Warnings about files of a session that are still as `write_session` wrote them."""
     return tuple(
         doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
-        if _untouched(Path(folder) / name, name)
+        if _is_untouched(Path(folder) / name, name)
     )
 
 
-def _untouched(path: Path, name: str) -> bool:
-    """Compared by lines: an editor may change the line ends of a file that it only looked at."""
+def _is_untouched(path: Path, name: str) -> bool:
+    """Whether a file equals any starter text, compared by lines because editors may change line
+    ends.
+    """
     try:
         lines = path.read_text("utf-8").splitlines() if path.is_file() else []
     except (OSError, UnicodeDecodeError):
         return False
-    # readings of a machine in motion are many: only examples have two rows
+    # of readings, only examples have two rows
     if not lines or (name == "joints.csv" and len(lines) != 3):
         return False
-    examples = _examples(name)
+    examples = _starter_texts(name)
     if name == "joints.csv":
-        examples = (*examples, *_of_the_drawing(path.parent, lines[0].split(",")[1:]))
+        examples = (*examples, *_readings_of_machine(path.parent, lines[0].split(",")[1:]))
     return any(lines == text.splitlines() for text in examples)
 
 
-def _of_the_drawing(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
-    """The example readings of a folder's own drawing, where it can be read."""
+def _readings_of_machine(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
+    """Example readings of the folder's own machine; none if its file is invalid."""
     try:
         machine = load_mechanism(folder / "mechanism.yaml")
         return (example_readings(machine, heads),) if len(heads) == machine.n_joints else ()
-    except PkmcalError:  # told elsewhere, with its line
+    except PkmcalError:  # reported when the session is loaded
         return ()
 
 
 @cache
-def _examples(name: str) -> tuple[str, ...]:
-    """Every text that a file of a new session can begin as."""
+def _starter_texts(name: str) -> tuple[str, ...]:
+    """All texts that a file of a starter session can have."""
     if name == "board.yaml":
         return tuple(board_text(square) for square in STARTER_SQUARE_CHOICES)
     template = (SESSION_TEMPLATE_FOLDER / name).read_text("utf-8")
@@ -248,7 +256,7 @@ def _examples(name: str) -> tuple[str, ...]:
         return template, *(example_readings(load_mechanism(machine)) for machine in catalogue())
     if name == "session.yaml":
         return tuple(
-            _session(template, *given)
+            _session_text(template, *given)
             for given in product(
                 (True, False),
                 (True, False),
