@@ -1,10 +1,10 @@
-"""Simulated calibrations of many machines by the joint estimate, and how far their results are off.
+"""Simulated calibrations of many machines by the joint estimate, and their errors.
 
-True machines are drawn from the drawing's tolerances, cameras' edge shifts and tubes' shading from
-what the estimate takes them for: so its stated deviations, which use all of these as knowledge,
-should hold. Measurements are edges and boards' poses with the noise that they state. The estimate
-is that of ``calibrate``: robust, with the noise's scale and the shading found from the data, from
-the drawing on; stations start as the search in photographs leaves them.
+True machines are drawn from the prior sigmas of the nominal model, cameras' edge shifts and tubes'
+shading from the priors of the estimate, so the stated standard deviations, which use all of these
+priors, should hold. Measurements are edges and board poses with their stated noise. The estimate is
+that of ``calibrate``: robust, with the scale of the noise and the shading estimated from the data,
+started from the nominal model; stations start with the errors that localization leaves.
 
 Axes: B runs, K configurations, N edges, V views of a board, W poses of the workspace.
 """
@@ -61,19 +61,21 @@ from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 JOINT_ESTIMATE_KEY: Key = ("joint",)
 CALIBRATIONS_A_BATCH = 10
-"""Runs that are solved at once, and that share a plan of photographs."""
+"""Number of runs that are solved together and share one capture plan."""
 UNSHARED_SHADING_VARIANCE = 1e-9
-"""Of a variance, what two edges with the same normal are shaded by each for itself; a covariance of
-equal rows has no root."""
+"""Part of the unit variance of the shading that is independent for each edge: the correlation
+matrix of edges with equal normals would have no Cholesky factor without it.
+"""
 STATION_START_SIGMAS = np.repeat([np.deg2rad(1.0), 0.01], 3)
-"""rad and m, standard deviations by which stations start off: so far is what a search for the drawn
-machine in photographs leaves, as the drawing's own errors do."""
+"""Standard deviations (rad, rad, rad, m, m, m) of the stations' starting poses: the errors that
+localization leaves, which come from those of the nominal model.
+"""
 TOOL_ERROR_POSES = 20
-"""Poses at which the tool's error is told."""
+"""Number of poses at which the tool's error is evaluated."""
 TIMES_MACHINES_REDRAWN = 20
-"""Times that a machine is drawn again which cannot take the plan's readings."""
+"""Number of attempts to draw a machine that can take the readings of the plan."""
 PHOTOGRAPH_PLAN_STREAM, TOOL_POSES_STREAM = 1, 2
-"""Uses of a batch's draws, besides the simulation."""
+"""Random streams of a batch, besides 0 of the simulation."""
 CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
     "position": Quantity("rms", 1e3, "mm"),
     "orientation": Quantity("rms", 1e3, "mrad"),
@@ -87,10 +89,10 @@ CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
 
 @dataclass(frozen=True)
 class SimulatedSessions:
-    """One batch of simulated sessions, ready to be calibrated.
+    """Batch of simulated sessions, ready to be calibrated.
 
-    capture : their plan. theta (B, P), poses (B, K, 4, 4), internal (B, K, n) : the truth.
-    assembled : the least-squares problem of all runs. start : where it begins.
+    capture : their common plan. theta (B, P), poses T_base_platform (B, K, 4, 4), internal (B, K,
+    n) hinges : the truth. assembled : least-squares problem of all runs. start : initial state.
     """
 
     capture: Capture
@@ -103,7 +105,7 @@ class SimulatedSessions:
 
 @dataclass(frozen=True)
 class SimulatedCalibrations:
-    """Calibrations of machines by one design. batch : runs that share a plan."""
+    """Study of calibrations of machines by one design. batch : number of runs that share a plan."""
 
     design: Design
     batch: int = CALIBRATIONS_A_BATCH
@@ -113,21 +115,23 @@ class SimulatedCalibrations:
 
     @cached_property
     def gauge(self) -> Gauge:
-        """Frames of the result, as a calibration chooses them."""
+        """Gauge of the result, the default of a calibration."""
         return default_gauge(self.design.machine_with_cylinders)
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
-        """Names and units of the parameters that errors are told of, (P,)."""
+        """Names and units of the parameters whose errors are reported, (P,)."""
         table = self.design.machine_with_cylinders.parameters
         return tuple(zip(table.names, table.units, strict=True))
 
     def populations(self, runs: int) -> list[Population]:
-        """All runs alike."""
+        """A single population with all runs."""
         return [Population("machine", runs, self.batch)]
 
     def draw(self, batch: Batch) -> SimulatedSessions:
-        """True machines, their poses at the plan's readings, and what is measured of them."""
+        """Draw true machines, compute their poses at the plan's readings, and simulate the
+        measurements.
+        """
         design, rng = self.design, batch.generator(0)
         capture = captured(design, batch.generator(PHOTOGRAPH_PLAN_STREAM))
         theta, poses, internal = _machines(design, capture, batch.runs, rng)
@@ -149,13 +153,14 @@ class SimulatedCalibrations:
         assembled = replace(one, problem=problem)
         start = _start(capture, assembled, stations, readings)
         mounts = np.array(one.priors) == "mount"
-        there = problem.prior_values(start).mean(axis=0)  # a metre's knowledge: one for all runs
+        # the prior is a metre wide: the same for all runs
+        there = problem.prior_values(start).mean(axis=0)
         target = np.where(mounts, there, problem.prior_target)
         assembled = replace(one, problem=replace(problem, prior_target=target))
         return SimulatedSessions(capture, theta, poses, internal, assembled, start)
 
     def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
-        """The joint estimate, told in the result's frames."""
+        """Joint estimate of all runs, in the gauge of the result."""
         problem = data.assembled.problem
         value = solve_batch(problem, data.start)
         n, own = batch.runs, problem.layout.own_motion.shape[1]
@@ -182,7 +187,7 @@ class SimulatedCalibrations:
     def _in_gauge(
         self, data: SimulatedSessions, value: BatchResult, run: int
     ) -> tuple[Array, Array]:
-        """Parameters (P,) in the result's frames, and their covariance (P, P)."""
+        """Parameters (P,) in the result's gauge and their covariance (P, P)."""
         machine, p = data.capture.machine, data.theta.shape[1]
         state = state_of(
             data.assembled, take(value.solution.state, np.array([run])), _truth(data, run)
@@ -195,7 +200,7 @@ class SimulatedCalibrations:
     def judge(
         self, batch: Batch, data: SimulatedSessions, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
-        """Errors of parameters and tool, and what is stated of them."""
+        """Errors of the parameters and of the tool, with their stated standard deviations."""
         machine, fit = data.capture.machine, fits[JOINT_ESTIMATE_KEY]
         by_board = "legs" not in self.design.observe
         joints = draw_configurations(
@@ -209,7 +214,7 @@ class SimulatedCalibrations:
     def _judged(
         self, data: SimulatedSessions, fit: Fitted, run: int, joints: Array, *, every: bool
     ) -> tuple[Array, Array]:
-        """One run's errors and their stated deviations, of the parameters (2, P) and of the tool
+        """Errors and stated standard deviations of one run: of the parameters (2, P) and the tool
         (2, W, 6).
         """
         machine, true = data.capture.machine, _truth(data, run)
@@ -224,10 +229,11 @@ class SimulatedCalibrations:
 
 
 def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
-    """A sample of calibrations, each with all that a study tells of it.
+    """Sample of calibrations with all their figures.
 
-    parameters : (2, B, n) errors and stated deviations in m or rad, NaN of what is no unknown of
-    its own. tool : (2, B, W, 6) the same of the tool's pose (omega, tau).
+    parameters : (2, B, n) errors and stated standard deviations in m or rad; NaN for parameters
+    that are not unknowns of their own. tool : (2, B, W, 6) the same for the tool's pose (omega,
+    tau).
     """
     size, stated = _sizes(tool[0]), _sizes(tool[1])
     values = {
@@ -249,24 +255,27 @@ def tool_error_and_sigma(
     *,
     every: bool,
 ) -> tuple[Array, Array]:
-    """By how much a calibrated machine's poses differ from the true one's at the same readings, and
-    the standard deviations that the calibration states of that: (W, 6) each, (omega, tau).
+    """Errors of a calibrated machine's poses at given readings, and their stated standard
+    deviations.
 
-    theta (P,), covariance (P, P) : of the result. joints (W, m). Frames of the truth are laid over
-    the result's as :func:`pkmcal.identify.tool.tool_error` has it; every : as where no legs were
-    seen. NaN where a machine cannot take the readings.
+    theta (P,), covariance (P, P) : of the result. joints : (W, m) readings. The frames of the truth
+    are registered to those of the result as in :func:`pkmcal.identify.tool.tool_error`; every : as
+    if no legs were observed. Returns two arrays (W, 6) of (omega, tau); NaN where a machine cannot
+    take the readings.
     """
     n = len(theta)
-    # the best fit is that of the truth on the result, not on the drawing
+    # register the truth to the result rather than to the nominal model
     value = replace(machine, parameters=replace(machine.parameters, drawing=theta), values=theta)
     over = changed_frames(machine.layout, true, *alignment(value, true, BestFit()))
     there = replace(true, theta=theta)
     keep = transformation(value, there, BestFit())[:n, :n]
+    # Forward kinematics of the result and of the truth at the same readings.
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
     drawn = forward(machine.layout, machine.parameters.drawing, joints, home)
     one = forward(machine.layout, theta, joints, drawn.T_base_platform, drawn.internal)
     other = forward(machine.layout, over.theta, joints, one.T_base_platform, one.internal)
     good = one.converged & other.converged
+    # Error and its covariance, both without the components that are changes of frames.
     poses = one.T_base_platform[good]
     by = pose_by_parameters(value, joints[good], poses) @ keep
     by = without_frames(value, poses, by, every=every)
@@ -275,13 +284,15 @@ def tool_error_and_sigma(
     variance = np.einsum("kip,pq,kiq->ki", by, covariance, by)
     out = np.full((2, len(joints), 6), np.nan)
     out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
-    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # no motion in this direction
+    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # the machine cannot move in this direction
     return out[0], out[1]
 
 
 def _along_axes(machine: Machine) -> Integers:
-    """Positions of each axis's largest component, which follows from the other two: an axis is a
-    direction, and what turns it moves that component by the turn's square alone.
+    """Indices of each axis's largest component.
+
+    That component follows from the other two: an axis is a unit vector, and a rotation of it
+    changes its largest component only to second order.
     """
     axes = machine.parameters.axes
     largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
@@ -289,7 +300,9 @@ def _along_axes(machine: Machine) -> Integers:
 
 
 def _sizes(tool: Array) -> tuple[Array, Array]:
-    """Root mean squares (B,) over the workspace of turns (rad) and displacements (m)."""
+    """Root mean square (B,) rotations (rad) and displacements (m) of the tool over the
+    workspace.
+    """
     squares = np.nansum(tool.reshape(*tool.shape[:2], 2, 3) ** 2, axis=-1)
     there = np.asarray(np.isfinite(tool).any(axis=-1))
     squares = np.where(there[..., None], squares, np.nan)
@@ -298,7 +311,7 @@ def _sizes(tool: Array) -> tuple[Array, Array]:
 
 
 def _truth(data: SimulatedSessions, run: int) -> State:
-    """What is true of a run."""
+    """True state of a run."""
     capture = data.capture
     return State(
         data.theta[run],
@@ -315,8 +328,11 @@ def _truth(data: SimulatedSessions, run: int) -> State:
 def _machines(
     design: Design, capture: Capture, runs: int, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """True machines (B, P) as they might be built, their poses (B, K, 4, 4) and hinges at the
-    plan's readings.
+    """Draw true machines (B, P) by the prior sigmas, with their poses (B, K, 4, 4) and hinges at
+    the plan's readings.
+
+    A machine that cannot take the readings is drawn again; ResultError after TIMES_MACHINES_REDRAWN
+    attempts.
     """
     machine, table = capture.machine, capture.machine.parameters
     tolerance, free = design.tolerance * table.tolerances_free(), table.free_matrix()
@@ -355,7 +371,7 @@ def _measured_edges(
     internal: Array,
     rng: np.random.Generator,
 ) -> EdgeData:
-    """The edges of all runs at their places in the problem."""
+    """Edge measurements of all runs, at their places in the problem."""
     machine, edges, at = capture.machine, capture.edges, one.places.edges
     blocks, runs, n = one.problem.blocks, len(theta), len(capture.edges)
     ends = limb_ends(machine.layout, theta[:, None], capture.joints, poses, internal)
@@ -370,6 +386,7 @@ def _measured_edges(
             for e in (ends.a, ends.b)
         )
         u, m = line_through(a, b)
+        # Exact edge normals, and their rotations by a shift and a tilt of one pixel.
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
         along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
@@ -385,6 +402,7 @@ def _measured_edges(
         normal[:, own], basis[:, own], first[:, own] = exact, frame, middle
         by_shift[:, own] = shift.reshape(runs, -1, 2)
         by_tilt[:, own] = tilt.reshape(runs, -1, 2)
+    # Errors in px: independent noise, the camera's edge shift, and the shading of the tube's side.
     error = design.edge_noise * rng.standard_normal((2, runs, n))
     camera = blocks.camera[at.row, at.place]
     outward = SHIFT_SIGMA * rng.standard_normal((runs, one.problem.unknowns.n_cameras))[:, camera]
@@ -397,6 +415,7 @@ def _measured_edges(
     normal = normal + (basis @ turn[..., None])[..., 0]
     normal = normal / np.sqrt(dot(normal, normal))[..., None]
     basis = tangent_basis(normal, first)
+    # Whitening by the noise that the estimate assumes.
     parts = design.edge_noise * np.stack([by_shift, by_tilt], axis=-1)
     whiten = np.linalg.inv(np.linalg.cholesky(parts @ parts.mT))
 
@@ -412,8 +431,9 @@ def _measured_edges(
 
 
 def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
-    """What edges (n,) are shaded by one by one, of unit variance, (runs, n): alike where normals
-    (n, 3) of the same line are near.
+    """Individual shading of edges (n,), (runs, n) of unit variance.
+
+    It is correlated between edges of the same line by the angle between their normals (n, 3).
     """
     out = rng.standard_normal((runs, len(line)))
     for number in range(int(line.max(initial=-1)) + 1):
@@ -432,7 +452,7 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
 def _measured_boards(
     design: Design, capture: Capture, one: Assembled, poses: Array, rng: np.random.Generator
 ) -> PoseData:
-    """The board's poses of all runs, with the covariance that their corners' noise gives."""
+    """Board poses of all runs, with the covariance that follows from the noise of the corners."""
     if capture.board is None or capture.T_platform_board is None:
         return one.problem.pose_data
     at, (station, row) = one.places.poses, capture.views.T
@@ -466,7 +486,9 @@ def _measured_boards(
 def _start(
     capture: Capture, assembled: Assembled, T_camera_base: Array, readings: Array
 ) -> BatchState:
-    """Where all runs begin: the drawing, poses by its forward kinematics, boards from the poses."""
+    """Initial state of all runs: nominal parameters, platform poses by forward kinematics, mounts
+    from the platform poses.
+    """
     machine, problem = capture.machine, assembled.problem
     runs, u = len(readings), problem.unknowns
     reached = machine.forward_result(capture.joints, capture.T_base_platform)

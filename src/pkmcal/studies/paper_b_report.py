@@ -1,4 +1,4 @@
-"""[B] V computed again: Figs. 6 to 10, 12 mm and 8 mm, beside the paper's figures."""
+"""Report on [B] V: Figs. 6 to 10, 12 mm and 8 mm, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ PAPER_B_COLUMNS = [
     Column("cad", 1, 1),
 ]
 DRAWN_EDGE_PLACES = 9
-"""Places along an edge that is drawn."""
+"""Number of points of a plotted edge."""
 DRAWN_ERROR_ENLARGEMENT = 10.0
-"""Times that errors are drawn enlarged."""
+"""Factor by which plotted errors are enlarged."""
 EXAMPLE_RUNS = 0
-"""The run whose joints are drawn: the first, not the best."""
+"""Index of the run whose joints are plotted: the first, not the best."""
 CONTROL_CURVE_STYLES = {
     "true": ("True geometry", "--quiet", "dot"),
     E1: ("E1: drawing, fitted", "--good", "dash"),
@@ -98,7 +98,7 @@ HexapodByLegsStudy = StudyResult[HexapodByLegs]
 
 
 def reproduce(options: Options) -> Outcome:
-    """The whole reproduction."""
+    """Reproduce [B] V."""
     began = perf_counter()
     study = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
     options.progress("Control by the edges", 0.9)
@@ -110,7 +110,7 @@ def reproduce(options: Options) -> Outcome:
 
 
 def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Outcome:
-    """The reproduction that a study and the controlled runs give. elapsed : s, of both."""
+    """Outcome of a study and the controlled runs. elapsed : duration of both in s."""
     words = _words(study, ran, elapsed)
     return words.reproduction(
         (
@@ -145,7 +145,7 @@ def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: 
 
 
 def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Words:
-    """All that is said, with the figures that it names."""
+    """Text of the report with its values."""
     true, estimated = _joints(s, MIRROR_VIEW)
     project = views_by_name()[MIRROR_VIEW].camera.project
     visible = ran.eye.camera.project
@@ -178,7 +178,7 @@ def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Wor
 
 
 def _tables(s: HexapodByLegsStudy) -> list[Table]:
-    """A table a camera."""
+    """Table for each camera."""
     out: list[Table] = []
     for view in PAPER_B_VIEW_NAMES:
         rows = [Row("The paper", ("", "", "", number(1e3 * CAD_MEDIAN_ERROR[view], 0)), "paper")]
@@ -198,7 +198,7 @@ def _tables(s: HexapodByLegsStudy) -> list[Table]:
 
 
 def _control_table(ran: ControlledHexapod) -> Table:
-    """[B] Fig. 10 in figures."""
+    """Table of [B] Fig. 10."""
     rows = [
         Row(
             title,
@@ -225,13 +225,13 @@ def _control_table(ran: ControlledHexapod) -> Table:
 
 
 def _joints(s: HexapodByLegsStudy, view: str, case: str = "shifted") -> tuple[Array, Array]:
-    """True and linearly estimated base joints (L, 3) of the run that is drawn, camera frame, m."""
+    """True and linearly estimated base joints (L, 3) of the plotted run, camera frame, m."""
     key = (view, case, ROBUST_REGRESSION)
     return s.values("truth", *key)[EXAMPLE_RUNS], s.values("centres", *key)[EXAMPLE_RUNS]
 
 
 def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
-    """Error by the share of wrong edges, through the mirror."""
+    """Plot of the error by the share of wrong edges, for the catadioptric camera."""
     data: list[dict[str, Any]] = []
     for method, colour in PAPER_B_METHOD_COLOURS.items():
         cases = {
@@ -250,8 +250,9 @@ def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
 def _picture(
     s: HexapodByLegsStudy, view: str, ran: ControlledHexapod | None = None
 ) -> dict[str, Any]:
-    """[B] Figs. 6 and 8: joints in the picture, and the legs of the drawing at home; ran : where
-    joints by hand are drawn, too.
+    """Plots of [B] Figs. 6 and 8: joints in the image, and the nominal legs in the home pose.
+
+    ran : source of the joints by a camera pose measured by hand; not plotted without it.
     """
     camera, T = views_by_name()[view]
     machine = hexapod_with_cylinder_legs()
@@ -267,7 +268,7 @@ def _picture(
         data.append(_marks("true joints", true, "--ink", "x-thin", 11))
     else:
         data.append(_marks("true joints", true, "--ink", "circle", 4))
-        # of the machine that is controlled, laid where this run's is by its own true joints
+        # offset of the controlled machine's joints, applied to the true joints of this run
         off = camera.project(ran.centres["hand"][EXAMPLE_RUNS]) - camera.project(
             ran.centres["true"][EXAMPLE_RUNS]
         )
@@ -277,7 +278,7 @@ def _picture(
 
 
 def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict[str, Any]:
-    """A plot whose axes are a picture's, framed, with y downwards."""
+    """Plot with the axes of an image: framed, with y downwards."""
     width, height = image_size
     layout = plane("x, pixels", "y, pixels")
     framed = {"showline": True, "mirror": True, "constrain": "domain"}
@@ -287,7 +288,7 @@ def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict
 
 
 def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
-    """[B] Fig. 7."""
+    """Section on [B] Fig. 7."""
     drawing = hexapod_with_cylinder_legs().base_centers()
     sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
     passes = (
@@ -296,7 +297,8 @@ def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
     )
     for view, colour, symbol in passes:
         true, estimated = _joints(s, view)
-        # the run's own machine is the drawing's here, so that its errors are the method's alone
+        # the run's machine is replaced by the nominal one, so that only the method's errors are
+        # plotted
         fitted = register(true, estimated)
         off = apply(inverse(fitted), estimated) - true
         turned = views_by_name()[view].T_camera_base[:3, :3]
@@ -315,7 +317,7 @@ def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
 
 
 def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
-    """[B] Fig. 9: the camera's picture at readings (m,); nearer legs before those behind them."""
+    """Plot of [B] Fig. 9: the camera's image at readings (m,), nearer legs in front of others."""
     machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
     pose = machine.forward(readings)
     edges = (
@@ -340,7 +342,7 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
 
 
 def _errors(ran: ControlledHexapod) -> dict[str, Any]:
-    """[B] Fig. 10: the norm of e against time."""
+    """Plot of [B] Fig. 10: norm of e against time."""
     data: list[dict[str, Any]] = []
     for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         runs = ran.trials[name].runs
@@ -353,7 +355,7 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
 
 
 def _beside(ran: ControlledHexapod) -> dict[str, Any]:
-    """How far the platform is from where the true geometry has it, against time."""
+    """Plot of the platform's distance from its path with the true geometry, against time."""
     ideal = ran.trials["true"].runs
     points = hexapod_with_cylinder_legs().platform_centers()
     there = apply(ideal.T_base_platform[:, :, None], points)
@@ -376,7 +378,7 @@ def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> d
 
 
 def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> dict[str, Any]:
-    """Everything for programs, m, px and s."""
+    """Figures for programs, m, px and s."""
     return {
         "runs": s.runs,
         "seed": s.seed,
