@@ -1,4 +1,6 @@
-"""Rigs: of a session as it stands, or of a machine and a camera that somebody thinks of."""
+"""Subjects of a plan: the rig of a session, or of a machine with a hypothetical camera or
+tracker.
+"""
 
 from __future__ import annotations
 
@@ -50,20 +52,21 @@ from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
 PLAN_PHOTOGRAPHS_A_STATION = 12
-"""Of a station, whose edges are measured, and twice as many of all together: a plan is made once,
-and a few edges tell shading badly."""
+"""Maximum number of a station's images whose edges are measured; twice as many of all stations
+together. A plan is made once, and few edges determine the shading badly.
+"""
 BOARD_MOUNT_NAME = "board"
 LAST_CALIBRATION_FOLDER = "calibration"
-"""Where calibrate writes, inside a session."""
+"""Output folder of `calibrate` inside a session."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a plan is made for.
+    """Subject of a plan.
 
-    rig : what measures. prior : what an earlier calibration knows. columns : of joints.csv.
-    names : of the configurations that there are already. words : where its numbers come from, in
-    sentences. board : fields of the board's file, if one is seen.
+    rig : machine and instruments. prior : of an earlier calibration. columns : of joints.csv. names
+    : of existing configurations. words : sentences on the sources of its numbers. board : fields of
+    the board's file, if a board is observed.
     """
 
     rig: Rig
@@ -87,10 +90,12 @@ def as_it_stands(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """A session to be planned for, as far as it was measured.
+    """Subject of a session with its existing measurements.
 
-    after : what is known already, the usable calibration in its folder unless given or
-    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.subject_of_session`.
+    after : earlier calibration; by default the usable one in the session's folder, none with
+    ``from_drawing``. Others as for :func:`~pkmcal.planning.subject.subject_of_session`. Raises
+    InputError if the given calibration is not usable, or if ``same_place`` is set without a
+    calibration.
     """
     saved: SavedCalibration | None = None
     if (
@@ -99,7 +104,7 @@ def as_it_stands(
         and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
         after = load(session.folder / LAST_CALIBRATION_FOLDER)
-        if not after.verdict.usable:  # it says of itself not to be used
+        if not after.verdict.usable:  # a default must not be an unusable calibration
             after = None
     if after is not None:
         saved, session = read_same_machine(after, session)
@@ -139,11 +144,11 @@ def of_machine(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """Of a machine and the camera, or tracker, that somebody thinks of.
+    """Subject with a machine and a hypothetical camera or tracker.
 
-    cameras : one a place. board : on the platform, instead of the legs. tracker : standard
-    deviations of its positions (m) and turns (rad; None where it measures points), instead of
-    cameras. edge, corner : px, how far edges and corners are off.
+    cameras : one for each station. board : on the platform, observed instead of the legs. tracker :
+    standard deviations of its positions (m) and turns (rad; None if it measures points), instead of
+    cameras. edge, corner : standard deviations, px.
     """
     rng = np.random.default_rng(seed)
     noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
@@ -190,13 +195,13 @@ def of_machine(
 def _bracket(
     machine: Machine, board: Board, cameras: tuple[Camera, ...], T: Array, rng: np.random.Generator
 ) -> Array:
-    """Where a board on the platform is seen best."""
+    """T_platform_board (4, 4) at which a board on the platform is visible best."""
     poses, joints = draw_configurations(machine, 12, 0.5, rng)
     return place_board(machine, board, "platform", cameras, T, poses, joints, rng)
 
 
 def check_tubes(machine: Machine, where: str) -> None:
-    """Raise `InputError` for a machine whose legs have no edges; where : their place in a file."""
+    """Raise `InputError` for a machine whose legs have no edges. where : their place in a file."""
     if len(tubes_of(machine)):
         return
     raise InputError(
@@ -208,7 +213,7 @@ def check_tubes(machine: Machine, where: str) -> None:
 
 
 def _tracked(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
-    """A tracker in the base frame, with its target at the platform's origin."""
+    """Rig of a tracker in the base frame, with its target at the platform's origin."""
     position, turn = noise
     whiten = np.diag([0.0 if turn is None else 1 / turn] * 3 + [1 / position] * 3)
     target = TargetFrom(0, np.eye(4), np.eye(4), whiten)
@@ -230,13 +235,13 @@ def subject_of_session(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """Of a session: from its drawing, its first photographs, or an earlier calibration.
+    """Subject of a session, by its nominal model, its first images, or an earlier calibration.
 
-    saved : of this machine; its values, its stations' places and what it knows are used.
-    same_place : whether its cameras still stand where they stood. anywhere : that places of its
-    first camera are to be chosen, so that nobody has to say where any stands. edge, corner : px,
-    where no photograph tells how good edges and corners are.
-    Raises InputError where nothing tells where a station stands.
+    saved : calibration of this machine, the source of its values, stations and prior. same_place :
+    whether cameras still have the poses of that calibration. anywhere : whether poses of its first
+    camera are to be chosen, so that none must be given. edge, corner : px, standard deviations for
+    a session without images. Raises InputError if the pose of a station is not known, or for
+    hand-held cameras.
     """
     if anywhere:
         session = _one_camera(session)
@@ -274,8 +279,9 @@ def _rig(
     corner: float,
     seed: int,
 ) -> tuple[Rig, Board | None, list[str]]:
-    """What a session's stations and trackers measure with, the board on the platform, and where the
-    noise is known from, in words. As :func:`subject_of_session`; T_camera_base : (S, 4, 4).
+    """Rig of a session, the board on its platform, and sentences on the sources of the noise.
+
+    Arguments as for :func:`subject_of_session`; T_camera_base : (S, 4, 4).
     """
     words: list[str] = []
     instruments: list[Instrument] = []
@@ -327,7 +333,9 @@ def _rig(
 
 
 def _one_camera(session: Session) -> Session:
-    """The session with its first camera alone, on a tripod; a hand's photographs tell no place."""
+    """Session with its first camera only, on a tripod; hand-held images do not determine a
+    station.
+    """
     if not session.stations:
         raise InputError(
             "there is no camera whose place could be chosen",
@@ -341,8 +349,9 @@ def _one_camera(session: Session) -> Session:
 
 
 class _Photographed(NamedTuple):
-    """What photographs a session has: of legs, and the boards in them; where stations were found
-    (S, 4, 4), None where nothing was.
+    """Images of legs of a session, the boards in them, and the localized stations (S, 4, 4).
+
+    T_camera_base : None without images, or with a calibration that has the stations.
     """
 
     photographs: list[Any]
@@ -363,7 +372,7 @@ class _Photographed(NamedTuple):
 
 
 def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
-    """(S, 4, 4) of all stations in a calibration; None where one is not in it."""
+    """Poses (S, 4, 4) of all stations in a calibration; None if one is missing."""
     there = {station.name: inverse(station.T_base_camera) for station in saved.stations}
     if not all(name in there for name in session.station_names):
         return None
@@ -377,9 +386,10 @@ def _places(
     anywhere: bool,
     seed: int,
 ) -> Array:
-    """Where all stations stand, (S, 4, 4), by the first that tells: the calibration, the
-    photographs, a pose by hand; a tracker in the base frame. anywhere : where nothing tells, any
-    usual place serves.
+    """Poses (S, 4, 4) of all stations by the first source: calibration, localization, pose in
+    session.yaml; trackers are in the base frame.
+
+    anywhere : use a default pose for a station without a source, instead of raising InputError.
     """
     reference_values = None if saved is None else _saved_places(session, saved)
     if reference_values is None:
@@ -409,9 +419,7 @@ def _places(
 def _edge_noise(
     session: Session, legs: list[int], in_view: _Photographed, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
-    """How many pixels are one where each station's edges are looked for, what these tell, the
-    shading, and where that comes from.
-    """
+    """Binning and pools of each station with legs, the shading, and a sentence on their source."""
     why = "no photograph tells it yet"
     if len(in_view.photographs) == len(legs):
         rows = [
@@ -422,21 +430,21 @@ def _edge_noise(
             poses = platform_poses(session)
             first = first_edges(session, in_view.photographs, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
-            # `check` and `calibrate` tell what is wrong with them; here they serve nothing
+            # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
             why = "the photographs that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
             pixels = tuple(p.binning for p in in_view.photographs)
             return pixels, first.pools, first.estimate.statistics.shading, words
-    # how sharp they will be nobody has seen
+    # without images their sharpness is not known
     pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
     pools = (nominal_pools(session.machine, edge),) * len(legs)
     return pixels, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
-    """Px of a board's corner, and where that comes from."""
+    """Standard deviation of a board's corner in px, and a sentence on its source."""
     sigma = [
         float(np.hypot(np.median(s.views.views.sigma[s.views.views.visible]), s.views.poses.noise))
         for s in boards.stations.values()
@@ -449,7 +457,7 @@ def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
 
 
 def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
-    """T_platform_target (4, 4) of a calibration."""
+    """T_platform_target (4, 4) in a calibration; None if there is none."""
     targets: list[dict[str, Any]] = [] if saved is None else saved.document.get("targets", [])
     for target in targets:
         if target["name"] == name and target.get("T_platform_target"):
@@ -465,7 +473,7 @@ def _board_place(
     T_camera_base: Array,
     seed: int,
 ) -> Array:
-    """T_platform_board (4, 4): as calibrated, as photographed, or where it would be seen best."""
+    """T_platform_board (4, 4): as calibrated, from images, or where the board is visible best."""
     reference_values = _saved_target(saved, BOARD_MOUNT_NAME)
     if reference_values is not None:
         return reference_values
